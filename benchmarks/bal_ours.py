@@ -22,10 +22,10 @@ import numpy as np  # noqa: E402
 
 import jaxbundle  # noqa: E402
 from jaxbundle.choices import REDUCTIONS  # noqa: E402
+from jaxbundle.leastsquares.iterations.solver import minimise  # noqa: E402
+from jaxbundle.leastsquares.iterations.stopping import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS  # noqa: E402
 from jaxbundle.leastsquares.problem import make_solver, pad_data  # noqa: E402
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards  # noqa: E402
-from jaxbundle.leastsquares.solver import minimise  # noqa: E402
-from jaxbundle.leastsquares.stopping import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS  # noqa: E402
 
 ATOL = 1e-5
 

@@ -27,7 +27,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.bundle.minimum import minimise
-from jaxbundle.leastsquares.datum import move_to_datum
+from jaxbundle.leastsquares.datum.conditions import move_to_datum
 from jaxbundle.leastsquares.problem import pad_values
 from jaxbundle.network.check import check_network
 from jaxbundle.planning.simulate import Simulation, simulate_with_truth

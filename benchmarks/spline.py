@@ -63,9 +63,9 @@ def main() -> int:
     import numpy as np
 
     import jaxbundle
-    from jaxbundle.leastsquares.normal import normal_equations
+    from jaxbundle.leastsquares.equations.normal import normal_equations
+    from jaxbundle.leastsquares.indexing.rows import lay_out_data
     from jaxbundle.leastsquares.problem import pad_data
-    from jaxbundle.leastsquares.rows import lay_out_data
 
     jaxbundle.enable_x64()
     given = network(options.columns, options.rows, options.images)

@@ -18,9 +18,9 @@ from jaxbundle.cameras import get_model, residual
 from jaxbundle.choices import ESTIMATORS
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.results.result_json import result_dict
-from jaxbundle.leastsquares import robust, snooping
-from jaxbundle.leastsquares.robust import residual_lengths, robust_scale
-from jaxbundle.leastsquares.snooping import Removed, _passing, _Touched, _worst, without
+from jaxbundle.leastsquares.quality import robust, snooping
+from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
+from jaxbundle.leastsquares.quality.snooping import Removed, _passing, _Touched, _worst, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.report import text
 from jaxbundle.statistics.inspection import Inspection

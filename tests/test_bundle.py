@@ -13,8 +13,8 @@ from jaxbundle.bundle.minimum import minimise
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results.result_json import result_dict, result_text, without_nan
 from jaxbundle.io.text import csv_tables
-from jaxbundle.leastsquares.distributions import tau_quantile
-from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.leastsquares.quality.distributions import tau_quantile
+from jaxbundle.leastsquares.quality.names import undetermined
 from jaxbundle.network.tables import EXTERIOR
 
 SIGMA = 0.002

@@ -7,7 +7,7 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.implicit import differentiable_once, implicit_root, solve_dense
-from jaxbundle.leastsquares.reduced import cholesky_of_lower
+from jaxbundle.leastsquares.equations.reduced import cholesky_of_lower
 
 
 def misclosure(x, fixed, data):

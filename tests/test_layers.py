@@ -104,6 +104,22 @@ def test_imports_go_up(imported):
     assert refused(imported, wrong) == []
 
 
+def test_rooms_of_the_engine_go_up(imported):
+    """Among themselves; declarations, spaces, problems and solutions stand beside them."""
+    rooms = ("indexing", "equations", "iterations", "datum", "quality")
+    engine = PACKAGE / "leastsquares"
+    assert {p.name for p in engine.iterdir() if (p / "__init__.py").exists()} == set(rooms)
+
+    def wrong(path, module, _):
+        parts = module.split(".")
+        if engine not in path.parents or parts[:2] != ["jaxbundle", "leastsquares"]:
+            return False
+        of = [room for room in (path.parent.name, *parts[2:3]) if room in rooms]
+        return len(of) == 2 and rooms.index(of[1]) > rooms.index(of[0])
+
+    assert refused(imported, wrong) == []
+
+
 def test_every_room_has_its_place():
     assert {layer_of(path) for path in FILES} == set(LAYERS)
 

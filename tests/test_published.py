@@ -15,7 +15,7 @@ import jaxbundle
 from jaxbundle.adjustment import make_problem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.minimum import minimise
-from jaxbundle.leastsquares.stopping import converged
+from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.network.check import check_network
 
 pytestmark = pytest.mark.slow

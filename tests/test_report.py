@@ -15,8 +15,8 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import FAMILIES, MODEL_NAMES, get_model
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.io.results.result_json import result_dict
-from jaxbundle.leastsquares.names import Name
-from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, STUCK
+from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, STUCK
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns

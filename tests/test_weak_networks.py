@@ -214,7 +214,7 @@ def test_vertical_images_name_the_principal_distance(monkeypatch):
     assert VAGUE * c["sigma"] > c["value"]
     # The directions of a factor give what the cofactors give.
     given = result.weakness
-    monkeypatch.setattr("jaxbundle.leastsquares.weakness.SMALL", 0)
+    monkeypatch.setattr("jaxbundle.leastsquares.quality.weakness.SMALL", 0)
     found = weakness(Inspection(result.problem, result.values), result.sigma0)
     assert found.unknowns == given.unknowns
     assert found.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-3)

@@ -7,10 +7,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.indexing.rows import in_given_order, lay_out_data
+from jaxbundle.leastsquares.indexing.rows import residuals as residuals_of_parts
 from jaxbundle.leastsquares.problem import pad_data, pad_values
-from jaxbundle.leastsquares.rows import in_given_order, lay_out_data
-from jaxbundle.leastsquares.rows import residuals as residuals_of_parts
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.declare import Rows
 

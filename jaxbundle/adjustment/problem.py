@@ -13,9 +13,9 @@ from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
+from jaxbundle.leastsquares.datum.defect import CannotHold
+from jaxbundle.leastsquares.datum.motions import SEVEN
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.defect import CannotHold
-from jaxbundle.leastsquares.motions import SEVEN
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import Layout, declare, order_cameras

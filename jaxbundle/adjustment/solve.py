@@ -4,8 +4,8 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import one_of, shown
 from jaxbundle.choices import METHODS
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares import derivatives
-from jaxbundle.leastsquares.search import SEARCHES
+from jaxbundle.leastsquares.iterations.search import SEARCHES
+from jaxbundle.leastsquares.quality import derivatives
 from jaxbundle.network.arrays import Data, Values
 
 
@@ -30,7 +30,7 @@ def solve(
       `problem.origin`.
     - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
       `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation, first order only); see
-      `jaxbundle.leastsquares.derivatives`.
+      `jaxbundle.leastsquares.quality.derivatives`.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
 
     **Returns:** `Values`; all NaN, including derivatives, if the solver did not converge, so that a

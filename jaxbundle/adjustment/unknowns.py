@@ -15,7 +15,7 @@ from jaxbundle.geometry import (
     omega_phi_kappa_near,
     retract_quaternion,
 )
-from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR

@@ -47,7 +47,7 @@ from jaxbundle.geometry import (
     matrix_from_rotation_vector,
     omega_phi_kappa_from_matrix,
 )
-from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.configuration import available_cores
 
 OF_A_START = ("quaternion", "shift")

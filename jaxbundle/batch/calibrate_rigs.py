@@ -18,7 +18,7 @@ from jaxbundle.cameras import CameraModel
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
-from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.build import make_further
 from jaxbundle.network.columns import did_you_mean
 

@@ -1,7 +1,7 @@
 """Levenberg–Marquardt for one camera calibrated from many views of known points.
 
 It has its own layout of the normal equations (`normal.py`) and the iterations of the engine
-(`leastsquares/loop.py`).
+(`leastsquares/iterations/loop.py`).
 """
 
 import equinox as eqx
@@ -18,9 +18,9 @@ from jaxbundle.batch.normal import (
     retract,
     step,
 )
-from jaxbundle.leastsquares import stopping
-from jaxbundle.leastsquares.loop import iterate
-from jaxbundle.leastsquares.stopping import Tolerance
+from jaxbundle.leastsquares.iterations import stopping
+from jaxbundle.leastsquares.iterations.loop import iterate
+from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
 STATUS = (
     "converged", "iteration limit", "singular", "not finite", "too few points", "weak", "misfit"

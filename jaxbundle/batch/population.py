@@ -22,7 +22,7 @@ from jaxtyping import Float
 from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
 from jaxbundle.batch.misfit import OF_DEVIATION
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.distributions import f_tail
+from jaxbundle.leastsquares.quality.distributions import f_tail
 from jaxbundle.network.columns import Columns, as_columns
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.columns import numbers

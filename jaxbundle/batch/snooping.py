@@ -12,8 +12,8 @@ so large that they mask each other.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.leastsquares.distributions import critical_w
-from jaxbundle.leastsquares.snooping import TOGETHER
+from jaxbundle.leastsquares.quality.distributions import critical_w
+from jaxbundle.leastsquares.quality.snooping import TOGETHER
 
 TESTS = ("pope",)
 MEDIAN = 1.0518

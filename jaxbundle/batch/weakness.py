@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.batch.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
-from jaxbundle.leastsquares.weakness import VAGUE
+from jaxbundle.leastsquares.quality.weakness import VAGUE
 
 PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""

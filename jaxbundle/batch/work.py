@@ -30,7 +30,7 @@ from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.networks.settings import apply_overrides
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.io.writing.fingerprints import of_input
-from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import search_alone
 from jaxbundle.photographs.opencv import need_opencv

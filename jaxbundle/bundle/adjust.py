@@ -26,10 +26,10 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.search import SEARCHES
-from jaxbundle.leastsquares.snooping import check_test
-from jaxbundle.leastsquares.solver import Minimum
-from jaxbundle.leastsquares.stopping import converged
+from jaxbundle.leastsquares.iterations.search import SEARCHES
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import split_check_points

@@ -37,8 +37,8 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.similarity import compose, helmert_point
-from jaxbundle.leastsquares.distributions import f_tail, level_of_one
-from jaxbundle.leastsquares.motions import SEVEN
+from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, data_frame, some
 from jaxbundle.network.tables import EXTERIOR

@@ -17,8 +17,8 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.minimum import adjusted_cameras, minimise, solved
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import FARTHEST, is_at_infinity
-from jaxbundle.leastsquares.solver import History, Minimum
-from jaxbundle.leastsquares.stopping import LIMIT
+from jaxbundle.leastsquares.iterations.solver import History, Minimum
+from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.network.arrays import Values
 from jaxbundle.orientation.many import matrices_of_quaternions
 from jaxbundle.orientation.sights import sights

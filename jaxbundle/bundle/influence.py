@@ -1,8 +1,8 @@
 """The influence of every measurement on a result.
 
 One σ of a measurement l changes the result f by σ·∂f/∂l = −σ·λᵀ·∂g/∂l, H·λ = ∂f/∂y, exactly to
-first order (`leastsquares/response.py`): one solution for each result, whatever the number of
-measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares of the
+first order (`leastsquares/quality/response.py`): one solution for each result, whatever the number
+of measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares of the
 influences, in the σ of the result, add up to 1: each is the share of a measurement.
 """
 
@@ -18,7 +18,7 @@ from jaxbundle.bundle.sensitivity import looked_at
 from jaxbundle.bundle.tables import observations
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.response import pull_back
+from jaxbundle.leastsquares.quality.response import pull_back
 from jaxbundle.network.columns import data_frame
 from jaxbundle.report.layout import significant, table
 from jaxbundle.statistics.results import CAMERAS, Asked, ask

@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.solver import History, Minimum
+from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.network.columns import some
 
 SAME_SIGMA0 = 1e-6

@@ -10,10 +10,10 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
+from jaxbundle.leastsquares.quality.names import undetermined
 from jaxbundle.leastsquares.solution import find_minimum
-from jaxbundle.leastsquares.solver import Minimum
-from jaxbundle.leastsquares.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Camera

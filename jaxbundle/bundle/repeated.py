@@ -12,10 +12,15 @@ from jaxbundle.bundle.minimum import require_solved, solved
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.components import ROUNDS, Component, estimate, variance_components
-from jaxbundle.leastsquares.names import Name
-from jaxbundle.leastsquares.robust import residual_lengths, reweight, robust_scale
-from jaxbundle.leastsquares.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.quality.components import (
+    ROUNDS,
+    Component,
+    estimate,
+    variance_components,
+)
+from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.leastsquares.quality.robust import residual_lengths, reweight, robust_scale
+from jaxbundle.leastsquares.quality.snooping import Removed, snoop, without
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.blunders import image_points_removed, name_removed

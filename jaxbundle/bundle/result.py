@@ -29,14 +29,14 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
-from jaxbundle.leastsquares.components import Component, variance_components
-from jaxbundle.leastsquares.indices import rounded
-from jaxbundle.leastsquares.names import Name
-from jaxbundle.leastsquares.reduction import FACTORS
-from jaxbundle.leastsquares.robust import Reweighted, residual_lengths, robust_scale
-from jaxbundle.leastsquares.solver import Minimum
-from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
-from jaxbundle.leastsquares.stopping import converged as reached_minimum
+from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
+from jaxbundle.leastsquares.iterations.stopping import converged as reached_minimum
+from jaxbundle.leastsquares.quality.components import Component, variance_components
+from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import data_frame, some
 from jaxbundle.network.declare import LEAST_IMAGES

@@ -2,8 +2,8 @@
 
 An error of one σ in a held quantity (a K3 fixed at 0, a lever arm, the flatness of a board, a fixed
 control point) moves the solution by dx = −H⁻¹·(∂g/∂θ)·σ, exactly to first order
-(`leastsquares/response.py`). Independent errors add in squares, with each other and with the σ of
-the result, which contains only the measurements:
+(`leastsquares/quality/response.py`). Independent errors add in squares, with each other and with
+the σ of the result, which contains only the measurements:
 
     total² = σ² + Σ effect²
 """
@@ -20,8 +20,8 @@ from jaxbundle.arguments import shown
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.reduction import FACTORS
-from jaxbundle.leastsquares.response import follow
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.quality.response import follow
 from jaxbundle.network.columns import data_frame
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER

@@ -16,7 +16,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
-from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.further import KINDS
 from jaxbundle.network.tables import (
     Camera,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.network.declare import Rows
 from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR

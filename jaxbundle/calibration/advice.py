@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
-from jaxbundle.leastsquares.weakness import VAGUE
+from jaxbundle.leastsquares.quality.weakness import VAGUE
 
 FEW_VIEWS = 8
 TURNED = 60.0

@@ -46,7 +46,7 @@ from jaxtyping import Float, Int
 from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.distributions import f_tail
+from jaxbundle.leastsquares.quality.distributions import f_tail
 
 SIGNIFICANCE = 0.01
 """Level of the test."""

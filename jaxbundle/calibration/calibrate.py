@@ -32,7 +32,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards

@@ -38,7 +38,7 @@ from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.distributions import chi2_tail, f_tail
+from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 

@@ -29,7 +29,7 @@ from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.display import data_set, shows_itself
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
-from jaxbundle.leastsquares.small import minimise
+from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.types import Numbers
 
 SAME_RAY = 1e-6

@@ -80,7 +80,7 @@ def adjust(
     from jaxbundle.cli.progress import iterating
     from jaxbundle.io import read_network
     from jaxbundle.io.writing.fingerprints import of_input
-    from jaxbundle.leastsquares.snooping import check_test
+    from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.report.page import UNKNOWN
 
     jaxbundle.use_cores(cores)

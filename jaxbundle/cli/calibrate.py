@@ -98,7 +98,7 @@ def calibrate(
     )
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.results.result_json import unsolved_text
-    from jaxbundle.leastsquares.snooping import check_test
+    from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.measure.views import photographs
     from jaxbundle.photographs.opencv import need_opencv
     from jaxbundle.report.page import UNKNOWN, compose_failure

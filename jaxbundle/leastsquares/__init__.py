@@ -6,17 +6,17 @@ photographs.
 
 from jaxbundle.leastsquares.adjust import Result as Result
 from jaxbundle.leastsquares.adjust import adjust as adjust
+from jaxbundle.leastsquares.datum.motions import shift as shift
+from jaxbundle.leastsquares.datum.motions import similarity as similarity
+from jaxbundle.leastsquares.datum.motions import similarity_of_plane as similarity_of_plane
 from jaxbundle.leastsquares.declarations import Kind as Kind
 from jaxbundle.leastsquares.declarations import Motions as Motions
 from jaxbundle.leastsquares.declarations import Observations as Observations
 from jaxbundle.leastsquares.declarations import Table as Table
-from jaxbundle.leastsquares.derivatives import solve as solve
-from jaxbundle.leastsquares.motions import shift as shift
-from jaxbundle.leastsquares.motions import similarity as similarity
-from jaxbundle.leastsquares.motions import similarity_of_plane as similarity_of_plane
-from jaxbundle.leastsquares.precision import precision as precision
 from jaxbundle.leastsquares.problem import Problem as Problem
 from jaxbundle.leastsquares.problem import make_problem as make_problem
+from jaxbundle.leastsquares.quality.derivatives import solve as solve
+from jaxbundle.leastsquares.quality.precision import precision as precision
 from jaxbundle.leastsquares.spaces import Direction as Direction
 from jaxbundle.leastsquares.spaces import Pose as Pose
 from jaxbundle.leastsquares.spaces import PoseValue as PoseValue

@@ -21,19 +21,24 @@ from jaxbundle.arguments import one_of, truth, whole
 from jaxbundle.choices import ESTIMATORS, METHODS
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.leastsquares.components import Component, Group, estimate, variance_components
+from jaxbundle.leastsquares.datum.motions import likely_motions
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
-from jaxbundle.leastsquares.motions import likely_motions
-from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.search import SEARCHES
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, converged
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_factor
-from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
-from jaxbundle.leastsquares.robust import Suspect, reweight
-from jaxbundle.leastsquares.rows import Values
-from jaxbundle.leastsquares.search import SEARCHES
-from jaxbundle.leastsquares.snooping import Removed, check_test, snoop
+from jaxbundle.leastsquares.quality.components import (
+    Component,
+    Group,
+    estimate,
+    variance_components,
+)
+from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.quality.robust import Suspect, reweight
+from jaxbundle.leastsquares.quality.snooping import Removed, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
-from jaxbundle.leastsquares.solver import Minimum
-from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS, converged
 
 DATUMS = ("given", "inner", "minimal")
 FEW = 60

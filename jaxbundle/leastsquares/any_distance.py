@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.geometry import transform_point
-from jaxbundle.leastsquares.motions import Together
+from jaxbundle.leastsquares.datum.motions import Together
 from jaxbundle.leastsquares.spaces import tangent_basis
 
 FARTHEST = 1e8

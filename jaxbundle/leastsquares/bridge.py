@@ -19,13 +19,20 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from jaxbundle.leastsquares.datum import zeros_of_tables
-from jaxbundle.leastsquares.elimination import damp, factorise, solve
-from jaxbundle.leastsquares.normal import Normal, normal_equations, zero_tangent
-from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.datum.conditions import zeros_of_tables
+from jaxbundle.leastsquares.equations.elimination import damp, factorise, solve
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Values,
+    fill_places,
+    lay_out_data,
+    residuals,
+)
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, without_filling
-from jaxbundle.leastsquares.retraction import changes_of_tables
-from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data, residuals
 from jaxbundle.leastsquares.spaces import Space
 
 

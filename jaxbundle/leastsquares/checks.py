@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.leastsquares.normal import normal_equations
+from jaxbundle.leastsquares.equations.normal import normal_equations
+from jaxbundle.leastsquares.indexing.rows import Data, Values, lay_out_data
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
-from jaxbundle.leastsquares.retraction import changes_of_tables
-from jaxbundle.leastsquares.rows import Data, Values, lay_out_data
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import present
 

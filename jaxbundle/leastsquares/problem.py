@@ -15,16 +15,23 @@ from jaxbundle.arguments import one_of
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
+from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
-from jaxbundle.leastsquares.defect import find_open_motions, make_datum, survey_motions
-from jaxbundle.leastsquares.indices import common, finish, rounded
-from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.planner import make_plan
-from jaxbundle.leastsquares.reduction import FACTORS
-from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data, Declared, Values, diagonal_of, evaluate, scalars
-from jaxbundle.leastsquares.solver import LeastSquares
-from jaxbundle.leastsquares.stopping import Tolerance
+from jaxbundle.leastsquares.indexing.indices import common, finish, rounded
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.planner import make_plan
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Values,
+    diagonal_of,
+    evaluate,
+    scalars,
+)
+from jaxbundle.leastsquares.iterations.retraction import retract
+from jaxbundle.leastsquares.iterations.solver import LeastSquares
+from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
 LARGE = 200_000
 """Problems with more observations are compiled for their exact sizes."""

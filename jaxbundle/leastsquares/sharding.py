@@ -21,12 +21,12 @@ from jaxtyping import Int
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.declarations import Table
-from jaxbundle.leastsquares.indices import common, finish
-from jaxbundle.leastsquares.plan import Datum, Plan
-from jaxbundle.leastsquares.planner import make_plan
+from jaxbundle.leastsquares.indexing.indices import common, finish
+from jaxbundle.leastsquares.indexing.plan import Datum, Plan
+from jaxbundle.leastsquares.indexing.planner import make_plan
+from jaxbundle.leastsquares.indexing.rows import Data, Values
+from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, minimise
 from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
-from jaxbundle.leastsquares.rows import Data, Values
-from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
 from jaxbundle.types import present
 
 AXIS = "devices"

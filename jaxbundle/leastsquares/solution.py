@@ -13,23 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.by_table import directions_of_motions, move_into_datum
-from jaxbundle.leastsquares.cofactors import Cofactors, blocks_of_tables, cofactors, propagate
-from jaxbundle.leastsquares.datum import move_to_datum, of_groups
-from jaxbundle.leastsquares.elimination import PIVOT, Factor, factorise, solve
-from jaxbundle.leastsquares.linearise import differentiate
-from jaxbundle.leastsquares.normal import Normal, normal_equations
-from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.problem import (
-    Problem,
-    make_solver,
-    open_at,
-    pad_data,
-    pad_values,
-    without_filling,
-)
-from jaxbundle.leastsquares.reliability import Reliability, reliability
-from jaxbundle.leastsquares.rows import (
+from jaxbundle.leastsquares.datum.by_table import directions_of_motions, move_into_datum
+from jaxbundle.leastsquares.datum.conditions import move_to_datum, of_groups
+from jaxbundle.leastsquares.equations.elimination import PIVOT, Factor, factorise, solve
+from jaxbundle.leastsquares.equations.linearise import differentiate
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,
     Values,
@@ -38,9 +28,24 @@ from jaxbundle.leastsquares.rows import (
     prepare,
     residuals,
 )
+from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
+from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.problem import (
+    Problem,
+    make_solver,
+    open_at,
+    pad_data,
+    pad_values,
+    without_filling,
+)
+from jaxbundle.leastsquares.quality.cofactors import (
+    Cofactors,
+    blocks_of_tables,
+    cofactors,
+    propagate,
+)
+from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
-from jaxbundle.leastsquares.solver import LeastSquares, Minimum, find
-from jaxbundle.leastsquares.stopping import converged
 
 HERE = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""

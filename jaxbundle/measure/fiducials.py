@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
-from jaxbundle.leastsquares.small import adjust
+from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.types import AnyArray
 

@@ -19,10 +19,10 @@ from jaxbundle.cameras import get_model
 from jaxbundle.geometry.rotations import quaternion_from_omega_phi_kappa
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
-from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.rows import Data as EngineData
+from jaxbundle.leastsquares.indexing.rows import Values as Tables
 from jaxbundle.leastsquares.problem import observed_weights
-from jaxbundle.leastsquares.rows import Data as EngineData
-from jaxbundle.leastsquares.rows import Values as Tables
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jaxbundle import cameras
 from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.any_distance import move_at_any_distance
+from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Kind, Local
-from jaxbundle.leastsquares.motions import similarity
 from jaxbundle.leastsquares.spaces import Posed, turn_by
 from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
 from jaxbundle.types import present

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.normal import Tangent, total
-from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.retraction import changes_of_tables, retract
-from jaxbundle.leastsquares.rows import Declared, Values
+from jaxbundle.leastsquares.equations.normal import Tangent, total
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.kinds import ImagePoint
 

@@ -30,14 +30,14 @@ from jaxbundle.choices import AIMS
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
 from jaxbundle.geometry.quaternions import quaternion_from_rotation_vector
-from jaxbundle.leastsquares.normal import zero_tangent
-from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.precision import covariances, redundancy
+from jaxbundle.leastsquares.equations.normal import zero_tangent
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.rows import Data as EngineData
+from jaxbundle.leastsquares.indexing.rows import Declared, diagonal_of
+from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.problem import pad_data, without_filling
-from jaxbundle.leastsquares.reduction import FACTORS
-from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data as EngineData
-from jaxbundle.leastsquares.rows import Declared, diagonal_of
+from jaxbundle.leastsquares.quality.precision import covariances, redundancy
 from jaxbundle.network.arrays import Values
 from jaxbundle.types import AnyArray
 

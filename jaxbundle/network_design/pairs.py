@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.indexing.rows import Data as EngineData
 from jaxbundle.leastsquares.problem import fill_data
-from jaxbundle.leastsquares.rows import Data as EngineData
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.tables import Network, Observations, Source, require_network

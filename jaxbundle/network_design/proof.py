@@ -14,9 +14,9 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import whole
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
-from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, of_interest
 

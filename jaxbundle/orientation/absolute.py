@@ -18,7 +18,7 @@ from jaxbundle.geometry import (
     rotation_vector_from_quaternion,
     transform_point,
 )
-from jaxbundle.leastsquares.small import inverse
+from jaxbundle.leastsquares.iterations.small import inverse
 from jaxbundle.orientation.linear import extent, normalisation, ones_unless
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxbundle.leastsquares.small import adjust
+from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of

@@ -16,7 +16,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from jaxbundle.leastsquares.small import adjust
+from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray

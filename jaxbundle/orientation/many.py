@@ -18,7 +18,7 @@ from jaxbundle.geometry import (
     rotation_vector_from_matrix,
     transform_point,
 )
-from jaxbundle.leastsquares.small import minimise
+from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.orientation.intersection import intersection, misclosure
 from jaxbundle.orientation.pose import Pose

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
 from jaxbundle.geometry.vectors import dot, read, turned, turned_back, unpacked
-from jaxbundle.leastsquares.small import finish, minimise
+from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.essential import eight_points, five_solutions, orientations
 from jaxbundle.orientation.homography import apply_homography, homography

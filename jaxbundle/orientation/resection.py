@@ -15,7 +15,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from jaxbundle.leastsquares.small import finish, minimise
+from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.linear import extent, normalisation, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of

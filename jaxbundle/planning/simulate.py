@@ -27,7 +27,7 @@ from jaxbundle.cameras import default_parameters, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import rounded
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice
 from jaxbundle.network.tables import (

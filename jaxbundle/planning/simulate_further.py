@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from jaxbundle.arguments import whole
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
-from jaxbundle.leastsquares.rows import evaluate, scalars
+from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 from jaxbundle.network.declare import declare
 from jaxbundle.network.further import RollingShutter
 from jaxbundle.network.tables import Network, require_network

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import turned
-from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import rounded
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
 from jaxbundle.types import AnyArray

@@ -17,7 +17,12 @@ from jaxtyping import Float
 
 from jaxbundle.display import shows_itself
 from jaxbundle.leastsquares.checks import determine
-from jaxbundle.leastsquares.rows import fill_places, in_given_order, lay_out_data, residuals
+from jaxbundle.leastsquares.indexing.rows import (
+    fill_places,
+    in_given_order,
+    lay_out_data,
+    residuals,
+)
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
 from jaxbundle.refinement.inspection import Inspection, Shared

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Table
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
-from jaxbundle.leastsquares.rows import Values
 from jaxbundle.network.declare import declare as declare_network
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 from jaxbundle.refinement import kinds

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, with_data
-from jaxbundle.leastsquares.rows import Values
-from jaxbundle.leastsquares.snooping import snoop
+from jaxbundle.leastsquares.quality.snooping import snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.refinement.declare import Declared
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed

@@ -37,7 +37,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import rounded
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, given_pose, moved_pose

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbundle.leastsquares.reliability import minimal_detectable
+from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.refining import Refinement
 
 STRONG = 0.9

@@ -11,8 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbundle.leastsquares.names import kept_unknowns, place_of, scaled_system, undetermined
 from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.leastsquares.quality.names import (
+    kept_unknowns,
+    place_of,
+    scaled_system,
+    undetermined,
+)
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Declared
 

@@ -6,7 +6,7 @@ precision of an image coordinate is σ0 times its a priori σ, in the unit of th
 
 import numpy as np
 
-from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
+from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ROLES

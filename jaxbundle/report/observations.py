@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.distributions import normal_quantile, tau_quantile
+from jaxbundle.leastsquares.quality.distributions import normal_quantile, tau_quantile
 from jaxbundle.network.columns import count
 from jaxbundle.report.head import span
 from jaxbundle.report.layout import (

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.leastsquares import robust, snooping
+from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.types import present
 
 

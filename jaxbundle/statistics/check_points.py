@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.problem import shifted_problem
 from jaxbundle.display import shows_itself
 from jaxbundle.leastsquares.checks import determine
-from jaxbundle.leastsquares.components import rescale
+from jaxbundle.leastsquares.quality.components import rescale
 from jaxbundle.network.tables import Distances, Observations, Points
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.network.check import check_network
 from jaxbundle.network.tables import Network
 from jaxbundle.statistics.inspection import Inspection

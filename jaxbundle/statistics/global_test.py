@@ -1,6 +1,6 @@
 """The global test of an adjustment."""
 
-from jaxbundle.leastsquares.distributions import chi2_quantile
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
 
 def chi_squared_test(vtpv: float, redundancy: int, significance: float = 0.05) -> dict:

@@ -17,8 +17,8 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.leastsquares.declarations import Table
-from jaxbundle.leastsquares.response import Change
-from jaxbundle.leastsquares.rows import Values
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.response import Change
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
 from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.further.base import ANGLES

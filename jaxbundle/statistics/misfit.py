@@ -1,12 +1,12 @@
 """Comparison of σ0 and the median residual with the a priori σ.
 
-A few blunders do not change the robust scale of the residuals (`leastsquares/robust.py`), too small
-σ do; σ0 is changed by both, which separates the two causes.
+A few blunders do not change the robust scale of the residuals (`leastsquares/quality/robust.py`),
+too small σ do; σ0 is changed by both, which separates the two causes.
 """
 
 import math
 
-from jaxbundle.leastsquares.distributions import chi2_quantile
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
 CONTRADICTED = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is also significant."""

@@ -1,6 +1,6 @@
 """The precision of a design: all σ as a differentiable function of the design.
 
-    C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`leastsquares/datum.py`)
+    C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`leastsquares/datum`)
 
 Nothing is adjusted, and no measurements are used. J is evaluated at the given values (`Data.start`:
 stations, targets, cameras) with predicted image coordinates, so that it is a function of the design
@@ -25,10 +25,10 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, named, value_of
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.precision import precision as engine_precision
-from jaxbundle.leastsquares.precision import redundancy as engine_redundancy
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.problem import given_data
-from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.quality.precision import precision as engine_precision
+from jaxbundle.leastsquares.quality.precision import redundancy as engine_redundancy
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.declare import Rows

@@ -15,7 +15,7 @@ from jaxbundle.adjustment.unknowns import angles_near, value_of
 from jaxbundle.arguments import shown
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.declare import Tables
 from jaxbundle.network.tables import EXTERIOR

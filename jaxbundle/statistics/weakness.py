@@ -1,7 +1,7 @@
 """Poorly determined unknowns of a network, with the remedy.
 
-The reference that a σ is compared with (`leastsquares/weakness.py`): of a projection centre the
-distance of the points in its image, of an angle a radian, of principal distance and point the
+The reference that a σ is compared with (`leastsquares/quality/weakness.py`): of a projection centre
+the distance of the points in its image, of an angle a radian, of principal distance and point the
 principal distance, of a point its distance. Distortion coefficients have none: a σ as large as the
 coefficient only means that it is not needed.
 """
@@ -12,7 +12,13 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.weakness import FAR, VAGUE, Extents, find_weak, find_weak_unsolved
+from jaxbundle.leastsquares.quality.weakness import (
+    FAR,
+    VAGUE,
+    Extents,
+    find_weak,
+    find_weak_unsolved,
+)
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.further.base import ANGLES, LENGTHS

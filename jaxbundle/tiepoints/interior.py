@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, image_ray
-from jaxbundle.leastsquares.small import minimise
+from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.network.tables import Camera
 from jaxbundle.orientation import many
 from jaxbundle.orientation.relative import retract, sampson_distance

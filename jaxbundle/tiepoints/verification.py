@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.small import minimise
+from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.orientation import (
     apply_homography,
     homography,

@@ -17,11 +17,16 @@ from jaxbundle import cameras
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.bundle.minimum import minimise
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
-from jaxbundle.leastsquares.datum import datum_directions
-from jaxbundle.leastsquares.normal import zero_tangent
+from jaxbundle.leastsquares.datum.conditions import datum_directions
+from jaxbundle.leastsquares.equations.normal import zero_tangent
+from jaxbundle.leastsquares.indexing.rows import (
+    fill_places,
+    in_given_order,
+    lay_out_data,
+    residuals,
+)
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.problem import pad_data, pad_values
-from jaxbundle.leastsquares.retraction import changes_of_tables, retract
-from jaxbundle.leastsquares.rows import fill_places, in_given_order, lay_out_data, residuals
 from jaxbundle.network import Camera, Distances, Images, Network, Observations, Points
 from jaxbundle.statistics.inspection import Inspection
 

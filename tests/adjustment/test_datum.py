@@ -22,9 +22,9 @@ from adjustment_checks import (
 
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.datum import generators, move_to_datum, s_transform
-from jaxbundle.leastsquares.defect import find_open_motions, survey_motions
-from jaxbundle.leastsquares.normal import zero_tangent
+from jaxbundle.leastsquares.datum.conditions import generators, move_to_datum, s_transform
+from jaxbundle.leastsquares.datum.defect import find_open_motions, survey_motions
+from jaxbundle.leastsquares.equations.normal import zero_tangent
 from jaxbundle.leastsquares.problem import pad_data, pad_values, without_filling
 from jaxbundle.network.datum_words import open_directions_in_words
 

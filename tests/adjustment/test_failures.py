@@ -8,7 +8,7 @@ import pytest
 from adjustment_checks import solved, synthetic
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.stopping import (
+from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
     NOT_FINITE,
     RELATIVE_COST,

@@ -17,10 +17,10 @@ from adjustment_checks import (
 )
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
-from jaxbundle.leastsquares.elimination import damp, factorise, solve
-from jaxbundle.leastsquares.normal import Normal, normal_equations
+from jaxbundle.leastsquares.equations.elimination import damp, factorise, solve
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.indexing.rows import lay_out_data
 from jaxbundle.leastsquares.problem import pad_data
-from jaxbundle.leastsquares.rows import lay_out_data
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.kinds import EXTERIOR
 

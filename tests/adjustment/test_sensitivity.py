@@ -15,8 +15,8 @@ from adjustment_checks import adjusted, camera, solved, synthetic, vtpv
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.derivatives import attach_derivatives
 from jaxbundle.leastsquares.problem import given_data, pad_values, without_filling
+from jaxbundle.leastsquares.quality.derivatives import attach_derivatives
 
 pytestmark = pytest.mark.slow
 

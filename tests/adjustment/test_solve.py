@@ -25,7 +25,7 @@ from jaxbundle.geometry import (
     matrix_from_rotation_vector,
     omega_phi_kappa_from_matrix,
 )
-from jaxbundle.leastsquares.stopping import SETTLED
+from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.statistics.inspection import Inspection
 
 SHARED = "cameras of two models"

@@ -12,8 +12,8 @@ from test_reductions import line
 from jaxbundle import leastsquares as ls
 from jaxbundle.geometry import quaternion_from_rotation_vector
 from jaxbundle.leastsquares.bridge import stock_problem, values_of
+from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.solution import find_minimum
-from jaxbundle.leastsquares.stopping import SETTLED
 
 POSES, POINTS, SIGMA = 3, 9, 1e-3
 

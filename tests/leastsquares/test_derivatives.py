@@ -16,21 +16,26 @@ from jax.flatten_util import ravel_pytree
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.datum import generators, leave_held, of_groups, zeros_of_tables
+from jaxbundle.leastsquares.datum.conditions import (
+    generators,
+    leave_held,
+    of_groups,
+    zeros_of_tables,
+)
 from jaxbundle.leastsquares.declarations import Kind, Motions, Table
-from jaxbundle.leastsquares.derivatives import attach_derivatives, solve
-from jaxbundle.leastsquares.hessian import exact_equations
-from jaxbundle.leastsquares.normal import Normal, zero_tangent
-from jaxbundle.leastsquares.precision import precision
+from jaxbundle.leastsquares.equations.hessian import exact_equations
+from jaxbundle.leastsquares.equations.normal import Normal, zero_tangent
+from jaxbundle.leastsquares.indexing.rows import lay_out_data
+from jaxbundle.leastsquares.iterations.retraction import retract
+from jaxbundle.leastsquares.iterations.solver import minimise
 from jaxbundle.leastsquares.problem import (
     given_data,
     make_problem,
     make_solver,
     without_filling,
 )
-from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import lay_out_data
-from jaxbundle.leastsquares.solver import minimise
+from jaxbundle.leastsquares.quality.derivatives import attach_derivatives, solve
+from jaxbundle.leastsquares.quality.precision import precision
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 
 find_minimum = eqx.filter_jit(minimise)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxbundle.cameras.cubic_splines import basis
-from jaxbundle.leastsquares import rows
 from jaxbundle.leastsquares.declarations import Kind, Local, Table
-from jaxbundle.leastsquares.layout import SMALL
-from jaxbundle.leastsquares.normal import normal_equations
+from jaxbundle.leastsquares.equations.normal import normal_equations
+from jaxbundle.leastsquares.indexing import rows
+from jaxbundle.leastsquares.indexing.layout import SMALL
 from jaxbundle.leastsquares.problem import make_problem, pad_data
 
 KNOTS, CURVES, SHIFTS, POINTS = 12, 2, 3, 40

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.cofactors import cofactors
 from jaxbundle.leastsquares.declarations import Kind, Motions, Table
-from jaxbundle.leastsquares.elimination import damp, factorise, solve
-from jaxbundle.leastsquares.normal import Normal, normal_equations
+from jaxbundle.leastsquares.equations.elimination import damp, factorise, solve
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.indexing.reduction import FACTORS, choose_reduction, find_band
+from jaxbundle.leastsquares.indexing.rows import lay_out_data
+from jaxbundle.leastsquares.iterations.solver import minimise
+from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.problem import (
     make_problem,
     make_solver,
     pad_data,
     with_factor,
 )
-from jaxbundle.leastsquares.reduction import FACTORS, choose_reduction, find_band
-from jaxbundle.leastsquares.reliability import reliability
-from jaxbundle.leastsquares.rows import lay_out_data
-from jaxbundle.leastsquares.solver import minimise
-from jaxbundle.leastsquares.stopping import SETTLED
+from jaxbundle.leastsquares.quality.cofactors import cofactors
+from jaxbundle.leastsquares.quality.reliability import reliability
 
 STATIONS, POINTS, REACH, NOISE = 60, 200, 5, 1e-3
 LEVELLED = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.bundle.minimum import minimise
-from jaxbundle.leastsquares.rows import evaluate
+from jaxbundle.leastsquares.indexing.rows import evaluate
 
 STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 

@@ -15,8 +15,8 @@ from jaxbundle.bundle.minimum import solved
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
+from jaxbundle.leastsquares.indexing.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.problem import pad_data, pad_values
-from jaxbundle.leastsquares.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.statistics.far_points import find_far_points
 from jaxbundle.statistics.inspection import Inspection

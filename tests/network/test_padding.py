@@ -6,7 +6,7 @@ import numpy as np
 from adjustment_checks import NETWORKS, synthetic
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import rounded
 from jaxbundle.leastsquares.problem import pad_data
 
 

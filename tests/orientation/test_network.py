@@ -13,7 +13,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.minimum import minimise
 from jaxbundle.bundle.orient import orient
-from jaxbundle.leastsquares.stopping import converged
+from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
 from jaxbundle.orientation.network import lacks_start_values

@@ -18,11 +18,11 @@ from adjustment_checks import (
 
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.geometry import quaternion_difference
-from jaxbundle.leastsquares.datum import move_to_datum
+from jaxbundle.leastsquares.datum.conditions import move_to_datum
+from jaxbundle.leastsquares.iterations.solver import minimise
+from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.problem import make_solver, pad_data
-from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
-from jaxbundle.leastsquares.solver import minimise
-from jaxbundle.leastsquares.stopping import SETTLED
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.statistics.inspection import Inspection
 
 NAMES = ("cameras of two models", "everything given", "free", "minimal")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from jaxbundle.leastsquares.distributions import (
+from jaxbundle.leastsquares.quality.distributions import (
     chi2_quantile,
     normal_quantile,
     t_quantile,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxbundle.leastsquares.distributions import critical_length
+from jaxbundle.leastsquares.quality.distributions import critical_length
 from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda, doubt_of_fit, doubt_of_robust
 
 

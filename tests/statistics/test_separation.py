@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbundle.leastsquares.separation import choose_together, find_alternatives
+from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
 
 CRITICAL, APART = 4.0, 3.29
 

@@ -28,7 +28,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares import Result
-from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import some
 

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares import Result, adjust
+from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
-from jaxbundle.leastsquares.motions import similarity
 from jaxbundle.leastsquares.problem import Problem
-from jaxbundle.leastsquares.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.quality.snooping import Removed, snoop, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network import kinds

@@ -31,8 +31,8 @@ from jaxbundle.arguments import shown
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.motions import move_pose
 from jaxbundle.leastsquares.spaces import Frame, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of

@@ -25,8 +25,8 @@ from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.motions import move_pose
 from jaxbundle.leastsquares.spaces import Frame, PoseValue, cross
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns

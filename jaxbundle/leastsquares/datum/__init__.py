@@ -1,0 +1,1 @@
+"""What observations leave open: motions, the datum defect, its conditions."""

@@ -1,0 +1,114 @@
+"""Motions of tables, by one program per table, called on the host.
+
+Tables of one space and size share a program, and so do all small ones, padded to `LEAST_ROWS`. A
+program for a whole problem would be compiled again for every other shape.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxbundle.leastsquares.datum import conditions as datum
+from jaxbundle.leastsquares.datum.motions import Together, move_at_once
+from jaxbundle.leastsquares.declarations import Motions
+from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.types import present
+
+HERE = "table"
+"""The name of a table treated alone."""
+LEAST_ROWS = 128
+"""Tables are padded to at least this many rows."""
+
+
+def directions_of_motions(declared: Declared, values: Values) -> Tangent:
+    """`datum.generators` of all tables: [rows, width, motions]."""
+    found, given = {}, present(declared.motions)
+    for name, value in values.items():
+        action = tuple((HERE, act) for table, act in given.actions if table == name)
+        if not action:
+            rows = len(jax.tree.leaves(value)[0])
+            found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
+            continue
+        motions = Motions(given.names, action)
+        one = Declared((), ((HERE, declared.spaces[name]),), motions)
+        of_rows = lambda rows, one=one: _generators(one, {HERE: rows})[HERE]
+        found[name] = _of_rows(of_rows, value)
+    return found
+
+
+def move_into_datum(
+    declared: Declared, plan: Plan, values: Values, start: Values
+) -> tuple[Values, bool]:
+    """`datum.move_to_datum` by Gauss–Newton steps only."""
+    if plan.datum is None:
+        return values, True
+    if plan.datum.held:
+        held = directions_of_motions(declared, {name: values[name] for name in plan.datum.held})
+        plan = _leave_held(declared, plan, values, held)
+    pinned = jax.tree.map(np.asarray, present(plan.datum))
+    curved, free = present(declared.motions).curved, _free(plan, declared, values)
+    size = float(datum.largest(pinned.weight, start))
+
+    def further(values):
+        tables = {name: values[name] for name in pinned.weight}
+        moves = directions_of_motions(declared, tables)
+        away = {name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
+                for name, value in tables.items()}  # fmt: skip
+        missing, slope = datum.equations(pinned, moves, away)
+        step = datum.limited(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
+        moved = _moved(declared, free, step, values)
+        change = {
+            name: jax.tree.map(np.subtract, moved[name], values[name]) for name in pinned.weight
+        }
+        return moved, float(datum.largest(pinned.weight, change))
+
+    distance, before, count = 1e300, np.inf, 0
+    with np.errstate(all="ignore"):
+        while datum.moves_on(size, distance, before, count):
+            try:
+                moved, new = further(values)
+            except np.linalg.LinAlgError:
+                return values, False
+            values, distance, before, count = moved, new, distance, count + 1
+    return values, distance <= datum.THERE * size
+
+
+def _moved(declared, free, motion, values):
+    """All tables moved, except held values."""
+    moved = dict(values)
+    for name, act in present(declared.motions).actions:
+        by = motion
+        if isinstance(act, Together):
+            act, by = act.move, _move_at_once(act.transform, motion, act.size)
+        of_rows = partial(_move, declared.spaces[name], act, by)
+        moved[name] = _of_rows(of_rows, values[name], free[name])
+    return moved
+
+
+@eqx.filter_jit
+def _difference(space, values, origin):
+    return jax.vmap(space.difference)(values, origin)
+
+
+@eqx.filter_jit
+def _move(space, act, motion, values, free):
+    one = lambda value, f: space.hold(act(motion, value), value, f)
+    return jax.vmap(one)(values, free)
+
+
+def _of_rows(program, *given):
+    """A program on the rows of a table, padded and cut again; in NumPy."""
+    rows = jax.tree.leaves(given)[0].shape[0]
+    more = max(LEAST_ROWS - rows, 0)
+    wide = lambda x: np.pad(x, [(0, more), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")
+    return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
+
+
+_generators = eqx.filter_jit(datum.generators)
+_leave_held = eqx.filter_jit(datum.leave_held)
+_free = eqx.filter_jit(datum.free_of_tables)
+_move_at_once = eqx.filter_jit(move_at_once)

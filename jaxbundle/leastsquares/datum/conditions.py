@@ -1,0 +1,282 @@
+"""The datum: the motions of the whole problem left open by the observations, and their constraints.
+
+A motion that changes no observation makes the normal equations singular along its directions G
+(Blaha 1971; Illner 1985). The open combinations of the declared motions are computed from the
+non-invariant observations and the held unknowns.
+
+The datum is imposed by an S-transformation (Baarda 1973; Teunissen 1985): with a choice B of datum
+unknowns,
+
+    δ ← δ − G(BᵀG)⁻¹Bᵀδ,      Q ← S·Q·Sᵀ,  S = I − G(BᵀG)⁻¹Bᵀ,
+
+B = G on the datum rows for inner constraints (trace of their covariance smallest), B = as many
+single unknowns as the defect for a minimal datum. After convergence the whole problem is moved by
+finite open motions so that Bᵀ(x − x_start) = 0 holds exactly: the result does not depend on the
+path of the iterations.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.leastsquares.equations.normal import Tangent, total
+from jaxbundle.leastsquares.indexing.plan import Datum, Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.types import present
+
+HELD = 1e-7
+"""Smallest relative motion of datum unknowns that fix the datum."""
+NEAR = 1e-3
+"""A motion to the datum by less than this fraction of the problem is near convergence."""
+LONGEST = 1.0
+"""Largest single motion to the datum: radians, or a factor of e."""
+THERE = 1e-12
+"""A motion to the datum by less than this fraction of the problem is the last."""
+MOST_MOTIONS = 50
+
+
+def generators(declared: Declared, values: Values) -> Tangent:
+    """The derivative of every table along each motion, [rows, width, motions]."""
+    given = present(declared.motions)
+    motions, actions = len(given.names), dict(given.actions)
+
+    def of_table(name):
+        space, act = declared.spaces[name], actions.get(name)
+        if act is None:
+            rows = jax.tree.leaves(values[name])[0].shape[0]
+            return jnp.zeros((rows, space.width, motions))
+        act = getattr(act, "near", act)
+        difference = getattr(space, "small_difference", space.difference)
+        change = lambda value, m: difference(act(m, value), value)
+        return jax.vmap(jax.jacfwd(change, 1), (0, None))(values[name], jnp.zeros(motions))
+
+    return {name: of_table(name) for name in values}
+
+
+def of_groups(plan: Plan, of_tables) -> Tangent:
+    """Quantities by table directions, [rows, width, …], rearranged by groups; zero for held
+    unknowns."""
+    found = {}
+    for name, group in plan.groups.items():
+        parts = [
+            of_tables[m.table] if m.rows is None else of_tables[m.table][m.rows]
+            for m in group.members
+        ]
+        rows = jnp.concatenate(parts, 1)
+        free = group.free.reshape(*group.free.shape, *(1,) * (rows.ndim - 2))
+        found[name] = rows * free
+    return found
+
+
+def open_directions(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> Tangent:
+    """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, if
+    known."""
+    moves = generators(declared, values) if moves is None else moves
+    gauge = present(leave_held(declared, plan, values, moves).datum).gauge
+    return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
+
+
+def leave_held(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> Plan:
+    """The plan with open motions minimally changed so that held unknowns keep their current values:
+    a rotation about a held point follows the point. `moves`: the `generators`, if known."""
+    datum = present(plan.datum)
+    held, gauge = datum.held, datum.gauge
+    if not held:
+        return plan
+    if moves is None:
+        moves = generators(declared, {name: values[name] for name in held})
+    rows = jnp.concatenate([
+        (moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()
+    ])  # fmt: skip
+    A = rows.T @ rows
+    scale = jax.lax.stop_gradient(jnp.diagonal(A))
+    scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
+    A = A * scale * scale[:, None]
+    moved = jnp.linalg.pinv(A, HELD, hermitian=True) @ (A @ (gauge / scale[:, None]))
+    moved = dataclasses.replace(datum, gauge=gauge - scale[:, None] * moved)
+    return dataclasses.replace(plan, datum=moved)
+
+
+def s_transform(
+    declared: Declared, plan: Plan, values: Values, change: Tangent, moves: Tangent | None = None
+) -> Tangent:
+    """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged if nothing is open."""
+    if plan.datum is None:
+        return change
+    G, B = datum_directions(declared, plan, values, moves)
+    gram = contract(plan, B, G)
+    along = jnp.linalg.solve(gram, contract(plan, B, change))
+    return {name: d - G[name] @ along for name, d in change.items()}
+
+
+def s_transform_transposed(
+    declared: Declared, plan: Plan, values: Values, row: Tangent, moves: Tangent | None = None
+) -> Tangent:
+    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, orthogonal to the open motions."""
+    if plan.datum is None:
+        return row
+    G, B = datum_directions(declared, plan, values, moves)
+    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
+    return {name: f - B[name] @ along for name, f in row.items()}
+
+
+def datum_directions(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> tuple[Tangent, Tangent]:
+    """G and B of all groups, [rows, w, defect]; `moves`: the `generators`, if known."""
+    G = open_directions(declared, plan, values, moves)
+    weight = of_groups(plan, zeros_of_tables(declared, values) | present(plan.datum).weight)
+    return G, {name: g * weight[name][..., None] for name, g in G.items()}
+
+
+def move_to_datum(
+    declared: Declared, plan: Plan, values: Values, start: Values
+) -> tuple[Values, Bool[Array, ""]]:
+    """The problem moved along its open motions so that Bᵀ(x − x_start) = 0, and whether this was
+    reached.
+
+    Gauss–Newton steps, limited to a radian and a factor e; Newton steps near the solution, which
+    take long to compile but converge for strong deformations (without them:
+    `by_table.move_into_datum`). Iterated to rounding: no motion at all, or a small one that does
+    not decrease."""
+    if plan.datum is None:
+        return values, jnp.asarray(True)
+    plan = leave_held(declared, plan, values)
+    datum = present(plan.datum)
+    still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
+    size = largest(datum.weight, start)
+
+    def moving(state):
+        _, *progress = state
+        return moves_on(size, *progress)
+
+    def further(state):
+        values, before, _, count = state
+        missing, slope = _datum_equations(declared, plan, values, start)
+        near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
+        slope = jnp.where(before > NEAR * size, slope, near)
+        step = limited(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
+        moved = _moved(declared, plan, step, values)
+        differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
+                       for name in datum.weight}  # fmt: skip
+        return moved, largest(datum.weight, differences), before, count + 1
+
+    begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
+    values, distance, *_ = jax.lax.while_loop(moving, further, begin)
+    return values, distance <= THERE * size
+
+
+def moves_on(size, distance, before, count):
+    """Whether a motion to the datum continues after a step of `distance` and a previous one of
+    `before`."""
+    falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
+    return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
+
+
+def limited(step, curved: tuple[int, ...]):
+    """A step of the motions, limited to `LONGEST` in the curved ones."""
+    longest = abs(step[np.array(curved, int)]).max(initial=0.0)
+    return step / (longest / LONGEST).clip(1.0)
+
+
+def largest(holding: Tangent, tables: Values):
+    """The largest value in the datum rows; NumPy for NumPy input."""
+    where = np.where if all(isinstance(w, np.ndarray) for w in holding.values()) else jnp.where
+    return max(
+        where(weight.max(1) > 0, abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
+        for name, weight in holding.items() for x in jax.tree.leaves(tables[name])
+    )  # fmt: skip
+
+
+def equations(datum: Datum, moves: Tangent, away: Tangent):
+    """Bᵀ(x − x_start) and BᵀG, over the datum tables; `away`: x − x_start."""
+    missing, gram = 0.0, 0.0
+    for name, weight in datum.weight.items():
+        G = moves[name] @ datum.gauge
+        B = (G * weight[..., None]).reshape(-1, G.shape[-1])
+        missing = missing + B.T @ away[name].ravel()
+        gram = gram + B.T @ G.reshape(B.shape)
+    return missing, gram
+
+
+def _datum_equations(declared, plan, values, start):
+    """The same, differentiable, from the tables."""
+    datum = present(plan.datum)
+    moves = generators(declared, {name: values[name] for name in datum.weight})
+    away = {name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
+            for name in datum.weight}  # fmt: skip
+    return equations(datum, moves, away)
+
+
+def _missing(tau, fixed, given):
+    """Bᵀ(x − x_start) after a motion along the open directions."""
+    (declared, plan), (values, start) = fixed, given
+    plan = leave_held(declared, plan, values)
+    datum = present(plan.datum)
+    tables = {name: values[name] for name in datum.weight}
+    moved = _moved(declared, plan, datum.gauge @ tau, tables)
+    return _datum_equations(declared, plan, moved, start)[0]
+
+
+def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
+    """`values`, nearly in the datum, moved into it; a function of the values and their start values
+    that is differentiable to any order."""
+    if plan.datum is None:
+        return values
+    still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+
+    def along(tau, of, values):
+        datum = present(leave_held(declared, plan, of).datum)
+        return _moved(declared, plan, datum.gauge @ tau, values)
+
+    # First remove the remaining motion, so that derivatives are taken at zero motion.
+    known = jax.lax.stop_gradient((values, start))
+    slope = jax.jacfwd(_missing)(still, fixed, known)
+    values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
+    tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
+    return along(tau, values, values)
+
+
+def _moved(declared, plan, motion, values):
+    """All tables moved, except held values."""
+    moved, free = dict(values), free_of_tables(plan, declared, values)
+    for name, act in declared.motions.actions:
+        if name not in values:
+            continue
+        space = declared.spaces[name]
+        one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
+        moved[name] = jax.vmap(one)(values[name], free[name])
+    return moved
+
+
+def free_of_tables(plan: Plan, declared: Declared, values: Values) -> dict[str, Array]:
+    """1 for every free direction of every table, 0 for held ones."""
+    free = zeros_of_tables(declared, values)
+    for group in plan.groups.values():
+        for m in (m for m in group.members if m.table in free):
+            columns = group.free[:, m.start : m.start + m.width]
+            rows = slice(None) if m.rows is None else m.rows
+            free[m.table] = free[m.table].at[rows].max(columns)
+    return free
+
+
+def zeros_of_tables(declared: Declared, values: Values) -> dict[str, Array]:
+    """0 for every direction of every table."""
+    rows = {name: jax.tree.leaves(value)[0].shape[0] for name, value in values.items()}
+    return {name: jnp.zeros((n, declared.spaces[name].width)) for name, n in rows.items()}
+
+
+def contract(plan: Plan, B: Tangent, x: Tangent):
+    """Bᵀx over all rows; x may have an additional last axis."""
+    parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
+    e = plan.eliminated
+    kept = sum(part for name, part in parts.items() if name != e)
+    return kept if e is None else kept + total(plan, parts[e])

@@ -1,0 +1,190 @@
+"""The datum defect: the motions of a problem left open by its observations, and their constraints.
+
+Computed once at the start values, on the host, from one compiled survey of the motions of every
+table and their effect on observations.
+"""
+
+from functools import reduce
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.datum.by_table import directions_of_motions
+from jaxbundle.leastsquares.datum.conditions import HELD, free_of_tables, of_groups
+from jaxbundle.leastsquares.equations.linearise import differentiate
+from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.indexing.plan import Datum, Plan
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, prepare
+from jaxbundle.types import present
+
+ROWS = 10_000
+"""Rows of J·G in one factorisation."""
+OPEN = 1e-10
+"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+
+
+class CannotHold(InputError):
+    """The chosen unknowns cannot fix the datum; `defect` of its parameters are open."""
+
+    def __init__(self, defect: int):
+        super().__init__(
+            f"the chosen unknowns cannot fix the datum, of which {defect} parameters are open"
+        )
+        self.defect = defect
+
+
+class Survey(NamedTuple):
+    """The effect of the motions at the start values, including padded rows.
+
+    `products`: J·G of all observations that are not invariant, part by part; `squares`: the sums of
+    squares of the cancelling terms; `held`: G on held unknowns; `moves`, `free`: G and free
+    directions by table, [rows, width, …]; `of_groups`: G by group, 0 for held unknowns."""
+
+    products: tuple[Float[Array, "rows motions"], ...]
+    squares: Float[Array, " motions"]
+    held: Float[Array, "rows motions"]
+    moves: Tangent
+    free: Tangent
+    of_groups: Tangent
+
+
+def survey_motions(
+    declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
+) -> Survey:
+    """See `Survey`; `real`: by table, which rows are not padding."""
+    moves = directions_of_motions(declared, data.start)
+    return _survey(declared, plan, data, real, moves)
+
+
+@eqx.filter_jit
+def _survey(declared, plan, data, real, moves) -> Survey:
+    laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
+    motions = len(present(declared.motions).names)
+    everywhere = {
+        name: jnp.concatenate([
+            moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
+        ], 1)
+        for name, group in plan.groups.items()
+    }  # fmt: skip
+    products, squares = [], jnp.zeros(motions)
+    for number, part in enumerate(plan.parts):
+        if declared.kinds[part.observations].invariant:
+            continue
+        _, touches, E = differentiate(declared, plan, number, prepared, laid)
+        blocks = [(J, everywhere[t.group][t.row, t.start : t.stop][:, None])
+                  for t, J in zip(part.touches, touches)]  # fmt: skip
+        if E is not None:
+            blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
+        total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
+        product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
+        # Non-finite values at the start are ignored here; the solver will report them.
+        there = jnp.isfinite(terms).all(1, keepdims=True)
+        products.append(jnp.where(there, product, 0.0))
+        squares += jnp.where(there, terms**2, 0.0).sum(0)
+    free = free_of_tables(plan, declared, data.start)
+    held = [
+        jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
+        for name, rows in moves.items()
+    ]
+    held = jnp.concatenate([rows.reshape(-1, motions) for rows in held])
+    return Survey(tuple(products), squares, held, moves, free, of_groups(plan, moves))
+
+
+def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
+    """The combinations of the declared motions that change no observation and no held unknown.
+
+    Computed from the singular values of J·G, its columns scaled by the size of their terms, so that
+    neither units nor the number of observations matter."""
+    held = np.asarray(survey.held)
+    held = held[np.isfinite(held).all(1)]
+    scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
+    scale = np.where(scale > 0, scale, 1.0)
+    held = held / scale
+    size = np.linalg.norm(held, axis=1, keepdims=True)
+    rows = [held / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
+    scales = [np.ones_like(scale), *[scale] * len(survey.products)]
+    _, singular, directions = np.linalg.svd(_triangle(rows, scales))
+    return directions[singular < OPEN].T / scale[:, None]
+
+
+def _triangle(parts, scales) -> Float[np.ndarray, "n n"]:
+    """R of the QR of all rows of the parts, their columns divided by the scales: it has their
+    singular values, of which a Gram matrix would lose half of the digits."""
+    n = parts[0].shape[1]
+    R = np.zeros((n, n))
+    for rows, scale in zip(parts, scales):
+        for begin in range(0, len(rows), ROWS):
+            part = rows[begin : begin + ROWS] / scale
+            R = np.asarray(np.linalg.qr(np.concatenate([R, part]), mode="r"))
+    return R
+
+
+def make_datum(
+    plan: Plan, survey: Survey, gauge: Float[np.ndarray, "motions defect"],
+    weight: dict[str, np.ndarray], minimal: bool, real: dict[str, Bool[np.ndarray, " rows"]],
+) -> Datum:  # fmt: skip
+    """The datum fixed by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
+    many of them as the defect, chosen well spread. `real`: see `survey_motions`.
+
+    **Raises:** `CannotHold`."""
+    along = lambda moves: {name: np.asarray(rows) @ gauge for name, rows in moves.items()}
+    moves, free = along(survey.moves), {t: np.asarray(f) for t, f in survey.free.items()}
+    weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
+    defect = gauge.shape[1]
+    directions = [moves[t].reshape(-1, defect) for t in weight]
+    candidates = [w.ravel() for w in weight.values()]
+    size = np.sqrt(sum((rows**2).sum(0) for rows in directions))
+    chosen = [rows * c[:, None] for rows, c in zip(directions, candidates)]
+    R = _triangle(chosen, [size] * len(chosen))
+    if np.isfinite(R).all():  # otherwise the solver will report it
+        singular = np.linalg.svd(R, compute_uv=False)
+        if singular[-1] <= HELD * singular[0]:
+            raise CannotHold(defect)
+    if minimal:
+        picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
+        cuts = np.cumsum([w.size for w in weight.values()])[:-1]
+        weight = {
+            t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
+        }
+    pins = _choose_pins(plan, along({name: survey.of_groups[name] for name in plan.kept}))
+    held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
+    held = {t: mask for t, mask in held.items() if mask.any()}
+    return Datum(*jax.device_put((gauge, weight, pins, held)))
+
+
+def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
+    """As many kept unknowns as the defect, chosen well spread; every kind of direction is
+    normalised by its size, unless that is rounding."""
+    rows, shapes = [], []
+    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
+    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
+    for name in plan.kept:
+        sized = G[name] / np.maximum(size[name], least)
+        rows.append(sized.reshape(-1, sized.shape[2]))
+        shapes.append(G[name].shape[:2])
+    whole = np.concatenate(rows)
+    free = np.concatenate([np.asarray(plan.groups[g].free).ravel() for g in plan.kept])
+    picked = _pick_rows(whole, free)
+    cuts = np.cumsum([len(r) for r in rows])[:-1]
+    return {
+        name: part.reshape(shape)
+        for name, part, shape in zip(plan.kept, np.split(picked, cuts), shapes)
+    }
+
+
+def _pick_rows(G, candidates):
+    """1 for as many independent rows of G as it has columns, 0 for the others."""
+    q, _ = np.linalg.qr(G)
+    rows = q * candidates[:, None]
+    chosen = np.zeros(len(rows))
+    for _ in range(G.shape[1]):
+        pick = np.argmax((rows**2).sum(1))
+        direction = rows[pick] / np.linalg.norm(rows[pick])
+        rows = rows - np.outer(rows @ direction, direction)
+        chosen[pick] = 1.0
+    return chosen

@@ -1,0 +1,1 @@
+"""From residuals to reduced normal equations: Jacobian, normal blocks, elimination, factors."""

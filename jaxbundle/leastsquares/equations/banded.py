@@ -1,0 +1,165 @@
+"""The reduced system if the rows of one group can be ordered so that it is banded.
+
+See `reduction.py`: a block tridiagonal matrix (diagonal blocks D, blocks E below them) with a
+border B for all other groups:
+
+    L_k·L_kᵀ = D_k − C_k·C_kᵀ,   C_{k+1} = E_k·L_k⁻ᵀ,   X_k = L_k⁻¹·(B_k − C_k·X_{k−1})
+    L·Lᵀ of the corner = corner − ΣX_kᵀ·X_k
+
+The blocks of the inverse Q in the band and its border follow from the factor by a backward
+recursion, without the other blocks (Takahashi, Fagan and Chin 1973):
+
+    Q_kb     = −L_k⁻ᵀ·(C_{k+1}ᵀ·Q_{k+1,b} + X_k·Q_bb)               b: the border
+    Q_k,k+1  = −L_k⁻ᵀ·(C_{k+1}ᵀ·Q_{k+1,k+1} + X_k·Q_b,k+1)
+    Q_kk     =  L_k⁻ᵀ·(L_k⁻¹ − C_{k+1}ᵀ·Q_{k+1,k} − X_k·Q_bk)
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.equations.reduced import (
+    Reduced,
+    blocks_of,
+    cholesky_of_lower,
+    flat,
+    split,
+)
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.types import present
+
+
+class BandFactor(eqx.Module):
+    """S block tridiagonal with a border; see the module. `below`: C of the next block."""
+
+    plan: Plan
+    lower: Float[Array, "blocks m m"]
+    below: Float[Array, "blocks m m"]
+    border: Float[Array, "blocks m q"]
+    corner: Float[Array, "q q"]
+
+    def solve(self, b: Tangent) -> Tangent:
+        g, others = _groups(self.plan)
+
+        def forward(less, block):
+            L, C, right = block
+            y = solve_triangular(L, right - less, lower=True)
+            return C @ y, y
+
+        nothing, right = jnp.zeros(self.lower.shape[1]), _into_band(self.plan, b[g])
+        _, y = jax.lax.scan(forward, nothing, (self.lower, self.below, right))
+        rest = flat(others, b) - jnp.einsum("bmq,bm->q", self.border, y)
+        rest = cho_solve((self.corner, True), rest) if rest.size else rest
+        y = y - jnp.einsum("bmq,q->bm", self.border, rest)
+
+        def backward(x, block):
+            L, C, y = block
+            x = solve_triangular(L, y - C.T @ x, lower=True, trans=1)
+            return x, x
+
+        _, x = jax.lax.scan(backward, nothing, (self.lower, self.below, y), reverse=True)
+        return {g: _from_band(self.plan, x)} | split(self.plan, others, rest)
+
+    def inverse(self) -> Reduced:
+        plan, (g, others) = self.plan, _groups(self.plan)
+        m, q = self.border.shape[1:]
+        corner = cho_solve((self.corner, True), jnp.eye(q)) if q else self.corner
+
+        def backward(carry, block):
+            D_next, with_border_next = carry
+            L, C, X = block
+            divided = lambda b: solve_triangular(L, b, lower=True, trans=1)
+            with_border = -divided(C.T @ with_border_next + X @ corner)
+            E = -divided(C.T @ D_next + X @ with_border_next.T)
+            D = solve_triangular(L, jnp.eye(m), lower=True) - C.T @ E.T - X @ with_border.T
+            D = divided(D)
+            return (D, with_border), (D, E, with_border)
+
+        start = jnp.zeros((m, m)), jnp.zeros((m, q))
+        factor = (self.lower, self.below, self.border)
+        _, (D, E, with_border) = jax.lax.scan(backward, start, factor, reverse=True)
+        Q, index = blocks_of(plan, others, corner), jnp.arange(plan.groups[g].rows)
+        Q.own[g] = _blocks(plan, D, E, index, index)
+        border = split(plan, others, jnp.moveaxis(_from_band(plan, with_border), -1, 0))
+        for (a, b), at in plan.blocks.items():
+            if a == b == g:
+                Q.off[a, b] = _blocks(plan, D, E, at.row, at.column)
+            elif a == g:
+                Q.off[a, b] = border[b][at.column, :, at.row].mT
+            elif b == g:
+                Q.off[a, b] = border[a][at.row, :, at.column]
+        return Q
+
+    @property
+    def pivots(self) -> Float[Array, " n"]:
+        of_band = jnp.diagonal(self.lower, axis1=1, axis2=2)
+        return jnp.concatenate([of_band.ravel(), jnp.diagonal(self.corner)])
+
+
+def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
+    """The factor of a banded S; NaN if it is not positive definite."""
+    g, others = _groups(plan)
+    band = present(plan.band)
+    place, width, blocks = band.place, band.width, band.blocks
+    w = plan.groups[g].width
+    m = width * w
+    both = jnp.zeros((2, blocks, width, width, w, w))
+    both = both.at[0, place // width, place % width, place % width].set(S.own[g])
+    if (g, g) in S.off:
+        a, b = place[plan.blocks[g, g].row], place[plan.blocks[g, g].column]
+        high, low = jnp.maximum(a, b), jnp.minimum(a, b)
+        turned = jnp.where((a < b)[:, None, None], S.off[g, g].mT, S.off[g, g])
+        beside = high // width - low // width
+        both = both.at[beside, low // width, high % width, low % width].add(turned)
+    D, E = both.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
+    unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
+    D = D + unused[:, :, None] * jnp.eye(m)
+    border = [S.between(plan, g, other) for other in others]
+    border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
+    border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))
+
+    def step(carry, block):
+        C, X = carry
+        D, E, B = block
+        L = cholesky_of_lower(D - C @ C.T)
+        X = solve_triangular(L, B - C @ X, lower=True)
+        C = solve_triangular(L, E.T, lower=True).T
+        return (C, X), (L, C, X)
+
+    start = jnp.zeros((m, m)), jnp.zeros((m, border.shape[2]))
+    _, (L, C, X) = jax.lax.scan(step, start, (D, E, border))
+    corner = S.matrix(plan, others) - jnp.einsum("bmi,bmj->ij", X, X)
+    return BandFactor(plan, L, C, X, cholesky_of_lower(corner))
+
+
+def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
+    """The group of the band, and those of the border."""
+    group = present(plan.band).group
+    return group, tuple(g for g in plan.kept if g != group)
+
+
+def _into_band(plan: Plan, rows: Float[Array, "rows w *q"]) -> Float[Array, "blocks m *q"]:
+    """Rows of the group at their positions in the band; zero for padding."""
+    band, (_, w, *q) = present(plan.band), rows.shape
+    whole = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
+    return whole.reshape(band.blocks, band.width * w, *q)
+
+
+def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows w *q"]:
+    band = present(plan.band)
+    w = plan.groups[band.group].width
+    return x.reshape(band.blocks * band.width, w, *x.shape[2:])[band.place]
+
+
+def _blocks(plan: Plan, D, E, row, column) -> Float[Array, "blocks w w"]:
+    """The blocks of two rows each, from the blocks on (D) and above (E) the diagonal."""
+    band = present(plan.band)
+    w, width = plan.groups[band.group].width, band.width
+    a, b = band.place[row], band.place[column]
+    low, high = jnp.minimum(a, b), jnp.maximum(a, b)
+    both, here = jnp.stack([D, E]).reshape(2, -1, width, w, width, w), low // width
+    found = both[high // width - here, here, low % width, :, high % width]
+    return jnp.where((a > b)[:, None, None], found.mT, found)

@@ -1,0 +1,214 @@
+"""The structured solve: eliminate rows, solve the reduced system, substitute back.
+
+With N = [A W; Wᵀ V] and V block diagonal (Brown 1958; Triggs et al. 2000, section 6.1):
+
+    V = L·Lᵀ,   Z = L⁻¹·Wᵀ,   h = L⁻¹·b_e
+    S = A − Zᵀ·Z                      (sums over pairs of incidences of one eliminated row)
+    S·x = b − Zᵀ·h                    (`reduced.py`)
+    x_e = L⁻ᵀ·(h − Z·x)
+
+Three tiers: the plan is made once per problem, N per accepted point, this solve per damping.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.leastsquares.equations.banded import BandFactor, factorise_band
+from jaxbundle.leastsquares.equations.damping import matrices
+from jaxbundle.leastsquares.equations.iterative import ConjugateGradients, precondition
+from jaxbundle.leastsquares.equations.normal import Normal, Tangent, agreed, gather, scatter, total
+from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
+from jaxbundle.leastsquares.indexing.plan import Pairs, Plan
+from jaxbundle.types import present
+
+EXACT = 1e-12
+"""Relative residual of a reduced system solved iteratively to full precision. A smaller one may be
+unreachable because of rounding, and open motions drift."""
+PIVOT = 1e-13
+"""A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined."""
+PAIR_ROWS_AT_ONCE = 8192
+"""Pairs whose products are in memory at the same time."""
+LIFT = 1e-10
+"""Added to unsolvable normal equations, relative to their diagonal."""
+
+
+class Factor(eqx.Module):
+    """Factorised N, for solving and for blocks of its inverse. `reduced`: the factor of S scaled by
+    `scale`."""
+
+    plan: Plan
+    reduced: DenseFactor | BandFactor | ConjugateGradients
+    scale: Tangent
+    lower_inverse: Float[Array, "rows w w"] | None
+    Z: dict[str, Float[Array, "chunks length w v"]]
+
+    def inverse(self) -> Reduced:
+        """The blocks of S⁻¹ where S has blocks."""
+        return self.reduced.inverse().scaled(self.plan, self.scale)
+
+
+def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
+    """N + λ·D."""
+    N, e = normal.blocks, normal.plan.eliminated
+    more = {name: damping * d for name, d in matrices(N.metric).items()}
+    own = {name: B + more[name] for name, B in N.own.items()}
+    eliminated = None if e is None else present(N.eliminated) + more[e]
+    return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
+
+
+def lift(normal: Normal) -> Normal:
+    """N plus a small part of its diagonal, so that it can be factorised if it is singular."""
+    N, e = normal.blocks, normal.plan.eliminated
+    more = lambda B: B + LIFT * jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
+    own = {name: more(B) for name, B in N.own.items()}
+    eliminated = None if e is None else more(N.eliminated)
+    return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
+
+
+def factorise(
+    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = EXACT
+) -> Factor:
+    """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
+    solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates
+    the two."""
+    plan = normal.plan
+    S, scale, lower_inverse, Z = reduced_system(normal, regular)
+    if plan.reduction == "iterative":
+        factor = precondition(normal, Z, S, scale, tolerance)
+    else:
+        factor = (factorise_band if plan.reduction == "banded" else factorise_dense)(plan, S)
+    sound = jnp.all(factor.pivots**2 > PIVOT)
+    scale = {g: jnp.where(sound, s, jnp.nan) for g, s in scale.items()}
+    return Factor(plan, factor, scale, lower_inverse, Z)
+
+
+def reduced_system(normal: Normal, regular: Bool[Array, ""] | bool = True):
+    """S scaled by the diagonal of A; the scale, L⁻¹ and Z.
+
+    Held unknowns get a one. A problem that may float is singular along its open motions; it is made
+    `regular` by adding a one to as many diagonal elements (`Datum.pins`), which changes the
+    solution along these motions only."""
+    plan = normal.plan
+    S, lower_inverse, Z = eliminate(normal)
+    diagonal = normal.diagonal()
+    scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
+    S = S.scaled(plan, scale)
+    for g, B in S.own.items():
+        more = 1.0 - plan.groups[g].free
+        if plan.datum is not None:
+            more = more + regular * plan.datum.pins[g]
+        S.own[g] = B + more[:, :, None] * jnp.eye(B.shape[1])
+    return S, scale, lower_inverse, Z
+
+
+def eliminate(normal: Normal):
+    """S = A − Zᵀ·Z in blocks, L⁻¹ of the eliminated rows, and Z."""
+    plan, N, e = normal.plan, normal.blocks, normal.plan.eliminated
+    own, off = dict(N.own), dict(N.off)
+    if e is None:
+        return Reduced(own, off), None, {}
+    held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
+    L = inverse_cholesky(present(N.eliminated) + held)
+    Z, less, less_off = {}, {}, {}
+    for g, W in N.W.items():
+        at = plan.incidences[g]
+        Z[g] = _row_major(_lower_times(L, at.eliminated, W))
+        rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
+        of_chunks = jnp.einsum("cki,ckj->cij", rows, rows)
+        less[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
+    for key, at in plan.blocks.items():
+        if at.pairs is not None:
+            less_off[key] = sum_pairs(at.pairs, at.row.shape[0], Z[key[0]], Z[key[1]])
+    less, less_off = total(plan, (less, less_off))
+    own = {g: B - less[g] if g in less else B for g, B in own.items()}
+    for key, B in less_off.items():
+        off[key] = off[key] - B if key in off else -B
+    return Reduced(own, off), L, Z
+
+
+def solve(factor: Factor, right: Tangent) -> Tangent:
+    """N⁻¹·b for one right-hand side, linear and transposable in b."""
+    plan, e, Z = factor.plan, factor.plan.eliminated, factor.Z
+    kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
+    if e is not None:
+        free = plan.groups[e].free
+        h = jnp.einsum("nij,nj->ni", factor.lower_inverse, right[e] * free)
+        for g, x in gather(plan, Z, h).items():
+            kept[g] = kept[g] - x * factor.scale[g]
+    x = agreed(plan, factor.reduced.solve(kept))
+    x = {g: rows * plan.groups[g].free * factor.scale[g] for g, rows in x.items()}
+    if e is not None:
+        h = h - scatter(plan, Z, x)
+        x[e] = jnp.einsum("nji,nj->ni", factor.lower_inverse, h) * free
+    return x
+
+
+def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
+    """Σ aᵀb over the pairs of every block: one small matrix product of depth (length × w) per
+    chunk, a quarter of the time of scattered outer products."""
+    a, b = (x.reshape(-1, *x.shape[2:]) for x in (a, b))
+    depth, m, n = a.shape[1], a.shape[2], b.shape[2]
+
+    def add(sums, i, j, k):
+        rows = i.shape[1] * depth
+        left, right = a[i].reshape(-1, rows, m), b[j].reshape(-1, rows, n)
+        product = jnp.einsum("cki,ckj->cij", left, right)
+        return sums.at[k].add(product, indices_are_sorted=True)
+
+    return over_pairs(pairs, add, jnp.zeros((blocks, m, n)))
+
+
+def over_pairs(pairs: Pairs, add, sums):
+    """`add(sums, first, second, block)` for all chunks of pairs, some at a time."""
+    for chunks in zip(pairs.first, pairs.second, pairs.block):
+        number, length = chunks[0].shape
+        step = max(1, PAIR_ROWS_AT_ONCE // length)
+        whole = number // step * step
+        if number > step:
+            steps = [x[:whole].reshape(-1, step, *x.shape[1:]) for x in chunks]
+            sums, _ = jax.lax.scan(lambda sums, chunk: (add(sums, *chunk), None), sums, steps)
+            chunks = [x[whole:] for x in chunks]
+        if len(chunks[0]):
+            sums = add(sums, *chunks)
+    return sums
+
+
+def inverse_cholesky(V: Float[Array, "n w w"]) -> Float[Array, "n w w"]:
+    """L⁻¹ of V = L·Lᵀ, written out over scalars (7 ns per row of three; a batched Cholesky takes
+    60); NaN if V is not positive definite."""
+    w = V.shape[-1]
+    L, M = {}, {}
+    for j in range(w):
+        pivot = V[:, j, j] - sum(L[j, k] ** 2 for k in range(j))
+        M[j, j] = jax.lax.rsqrt(jnp.where(pivot > PIVOT * V[:, j, j], pivot, jnp.nan))
+        for i in range(j + 1, w):
+            L[i, j] = (V[:, i, j] - sum(L[i, k] * L[j, k] for k in range(j))) * M[j, j]
+    for j in range(w):
+        for i in range(j + 1, w):
+            M[i, j] = -sum(L[i, k] * M[k, j] for k in range(j, i)) * M[i, i]
+    zero = jnp.zeros_like(V[:, 0, 0])
+    rows = [jnp.stack([M.get((i, j), zero) for j in range(w)], -1) for i in range(w)]
+    return jnp.stack(rows, -2)
+
+
+def _lower_times(L, at, W):
+    """L[at]·W of every incidence, L lower triangular; written out: half the time of a product."""
+    w = L.shape[-1]
+    of = L.reshape(-1, w * w)[at]
+    row = lambda i: sum(of[..., w * i + j, None] * W[..., j, :] for j in range(i + 1))
+    return jnp.stack([row(i) for i in range(w)], -2)
+
+
+@jax.jit
+def _row_major(x):
+    """Blocks in row-major order. Otherwise XLA chooses the layout of a shared array for one of its
+    readers (the product by chunks), and the gathers of the pairs take three times as long.
+
+    A separate function: if a compiled function returns its constrained array, JAX (0.10) lets
+    XLA choose the layout of the other results, but reads them in the default order."""
+    return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))

@@ -1,0 +1,98 @@
+"""The exact Hessian of ½vᵀPv in the blocks of the normal equations.
+
+It differs from JᵀPJ by Σ p·v·∂²v, the curvature of the observation equations and, by
+`Space.moved`, which is right to second order, that of the manifolds. Second derivatives come from
+the function of one observation, forward over reverse, and are summed like those of Gauss–Newton
+(`normal.Sums`).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.leastsquares.equations.linearise import columns_of, widths_of
+from jaxbundle.leastsquares.equations.normal import Sums
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import (
+    Declared,
+    Laid,
+    Residual,
+    Values,
+    fill_places,
+    over,
+    prepare,
+    residual_of,
+)
+from jaxbundle.types import present
+
+
+def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
+    """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`."""
+    plan, laid = fill_places(plan, laid)
+    prepared, sums = prepare(declared, values), Sums(plan)
+    for number, part in enumerate(plan.parts):
+        cost, gradient, hessian = _derivatives(declared, plan, number, prepared, laid)
+        more = _blocks(declared, plan, part, gradient, hessian)
+        sums.add_part(part, cost.sum(), *more)
+    return sums.finished(declared, values)
+
+
+def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
+    """½|v|² of every observation of a part, its gradient and Hessian by all directions of its
+    slots, with a column of zeros at the end."""
+    part = plan.parts[number]
+    kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
+    one = _HalfSquare(residual_of(declared, part), widths)
+    return over(part, kind, prepared, laid, number, one)
+
+
+@dataclasses.dataclass(frozen=True)
+class _HalfSquare:
+    """½|v|² of one observation, its gradient and Hessian by the changes of its slots."""
+
+    residual: Residual
+    widths: tuple[int, ...]
+
+    def __call__(self, blocks, measured, weight):
+        ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
+
+        def half_square(x):
+            changes = tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
+            return 0.5 * sum(r * r for r in self.residual(blocks, measured, weight, changes))
+
+        def gradient(x):
+            cost, g = jax.value_and_grad(half_square)(x)
+            return g, (cost, g)
+
+        hessian, (cost, g) = jax.jacfwd(gradient, has_aux=True)(jnp.zeros(ends[-1]))
+        return cost, jnp.pad(g, (0, 1)), jnp.pad(hessian, (0, 1))
+
+
+def _blocks(declared: Declared, plan: Plan, part, g, H):
+    """The contribution of a part, see `Sums.add_part`."""
+    widths = widths_of(declared, plan, part)
+
+    def columns(slots, start, stop):
+        at = columns_of(widths, slots, start, stop)
+        return np.array([-1 if c is None else sum(widths[: c[0]]) + c[1] for c in at], int)
+
+    def block(H, rows, columns):
+        """Some rows and columns of H, (which, free) each."""
+        (i, free), (j, others) = rows, columns
+        return H[..., i[:, None], j] * free[..., :, None] * others[..., None, :]
+
+    free = lambda t: plan.groups[t.group].free[t.row, t.start : t.stop]
+    touches = [(columns(t.slots, t.start, t.stop), free(t)) for t in part.touches]
+    summed, right, eliminated, W = H.sum(1), g.sum(1), None, []
+    if part.slot is not None:
+        e = columns(((part.slot, 0),), 0, widths[part.slot])
+        own = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
+        flat = lambda x: x.reshape(-1, *x.shape[2:])
+        beside = (g[..., e] * own[1])[..., None]
+        eliminated = flat(jnp.concatenate([block(H, own, own), beside], -1))
+        W = [flat(block(H, own, (j, free[:, None]))) for j, free in touches]
+    own, gradient = [block(summed, t, t) for t in touches], [right[:, i] * f for i, f in touches]
+    couples = [block(summed, touches[c.first], touches[c.second]) for c in part.couples]
+    return own, gradient, couples, eliminated, W

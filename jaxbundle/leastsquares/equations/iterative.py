@@ -1,0 +1,121 @@
+"""The reduced system without its matrix: preconditioned conjugate gradients.
+
+S = A − Zᵀ·Z is only applied to vectors (Agarwal et al. 2010): Z·x spreads changes of kept rows over
+their incidences, Zᵀ gathers them again. No pair of incidences is ever listed, so time and memory
+grow with the incidences alone. The blocks of S of every kept row, L·Lᵀ, are the preconditioner
+(Schur–Jacobi):
+
+    (L⁻¹·S·L⁻ᵀ)·y = L⁻¹·b,   x = L⁻ᵀ·y,
+
+where every element of y is a change in units of its conditional σ, so that one norm fits all. A
+problem that may float is singular but consistent, which conjugate gradients tolerate.
+"""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.equations.normal import (
+    Normal,
+    Tangent,
+    agreed,
+    gather,
+    scatter,
+    times_kept,
+)
+from jaxbundle.leastsquares.equations.reduced import Reduced
+
+MOST_STEPS, MOST_MORE = 2000, 100
+"""Steps of conjugate gradients, and of their refinement."""
+REACHED = 1e-10
+"""The relative residual that rounding allows in one run: below it the search directions are noise,
+and steps may drift, above all along open motions. Solutions of full precision are refined once
+more, and are NaN if even this was not reached."""
+LEAST = 1e-300
+
+
+class ConjugateGradients(eqx.Module):
+    """S = A − Zᵀ·Z scaled, applied to vectors, and L⁻¹ of its diagonal blocks. `tolerance`: the
+    norm of the residual relative to that of the right-hand side."""
+
+    normal: Normal
+    Z: dict[str, Float[Array, "chunks length w v"]]
+    scale: Tangent
+    lower_inverse: dict[str, Float[Array, "rows w w"]]
+    tolerance: float = eqx.field(static=True)
+
+    def solve(self, b: Tangent) -> Tangent:
+        times = lambda indices, x: {
+            g: jnp.einsum(indices, M, x[g]) for g, M in self.lower_inverse.items()
+        }
+        divided, back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
+        right, tag = divided(b), lx.positive_semidefinite_tag
+        product = lambda y: divided(self._times(back(y)))
+        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
+
+        def improved(y, left, tolerance, steps):
+            """y refined with the residual `left`, if that decreases it; and the new residual."""
+            # lineax annotates a float, but accepts an array
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), LEAST)
+            method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
+            change = lx.linear_solve(operator, left, method, throw=False).value
+            better = jax.tree.map(jnp.add, y, change)
+            after = jax.tree.map(jnp.subtract, right, product(better))
+            less = optx.two_norm(after) < optx.two_norm(left)
+            return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
+
+        nothing, reached = jax.tree.map(jnp.zeros_like, right), max(self.tolerance, REACHED)
+        y, left = improved(nothing, right, reached, MOST_STEPS)
+        if self.tolerance < REACHED:
+            y, left = improved(y, left, self.tolerance / REACHED, MOST_MORE)
+            solved = optx.two_norm(left) <= 2 * REACHED * optx.two_norm(right)
+            y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
+        return back(y)
+
+    def inverse(self) -> Reduced:
+        raise ValueError("conjugate gradients have no factor to read an inverse from: with_factor")
+
+    @property
+    def pivots(self) -> Float[Array, " n"]:
+        """The pivots of every block alone."""
+        roots = [jnp.diagonal(M, axis1=1, axis2=2).ravel() for M in self.lower_inverse.values()]
+        return 1 / jnp.concatenate(roots)
+
+    def _times(self, x: Tangent) -> Tangent:
+        """S·x."""
+        plan = self.normal.plan
+        x = {g: rows * self.scale[g] for g, rows in x.items()}
+        product = times_kept(plan, self.normal.blocks, x)
+        for g, less in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
+            product[g] = product[g] - less
+        return agreed(plan, {g: rows * self.scale[g] for g, rows in product.items()})
+
+
+def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:
+    """S for conjugate gradients, `S.own` its diagonal blocks scaled."""
+    lower_inverse = {g: inverse_of_lower(B) for g, B in S.own.items()}
+    return ConjugateGradients(normal, Z, scale, lower_inverse, tolerance)
+
+
+def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
+    """L⁻¹ of B = L·Lᵀ: elimination transforms (B, 1) to (Lᵀ, L⁻¹); NaN if B is not positive
+    definite.
+
+    A loop over the w columns: LAPACK's loop over the rows waits inside the thread pool, where
+    the programs of several devices could deadlock.
+    """
+    w = B.shape[1]
+
+    def eliminate(k, both):
+        row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
+        below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)
+        return (both - below[:, :, None] * row[:, None]).at[:, k].set(row)
+
+    both = jnp.concatenate([B, jnp.broadcast_to(jnp.eye(w), B.shape)], -1)
+    return jax.lax.fori_loop(0, w, eliminate, both)[:, :, w:]

@@ -1,0 +1,150 @@
+"""Observations that depend on few of many columns of a row: an image point sees sixteen of the
+hundreds of knots of a spline camera.
+
+A kind that declares this (`Kind.local`) names, for one observation, the columns its residuals
+depend on at the values as they are, and has its residual as a function of the values in these
+columns. J then has their derivatives alone, and products are added to N where they belong:
+
+    N[cᵢ, cⱼ] += JᵢᵀJⱼ,    g[cᵢ] += Jᵢᵀr        c the columns of the observation
+
+in place of products of rows that are zero nearly everywhere. Which columns they are may change from
+iteration to iteration; nothing of it is planned.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.equations.linearise import (
+    differentiate_rows,
+    eliminated_without_held,
+    widths_of,
+    without_held,
+)
+from jaxbundle.leastsquares.indexing.plan import Part, Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Laid, look_up, over_rows, weighted
+from jaxbundle.leastsquares.spaces import Space, Vector
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalJacobian:
+    """Of a part with local columns: residuals [chunks, length, r]; J of its touches and of its
+    eliminated row, that of touch number `touch` with as many columns as are local; `columns`, where
+    these are in the touched group (beyond its width: held)."""
+
+    r: Float[Array, "chunks length r"]
+    touches: tuple[Float[Array, "chunks length r _"], ...]
+    eliminated: Float[Array, "chunks length r e"] | None
+    touch: int
+    columns: Int[Array, "chunks length m"]
+
+
+def local_touch(declared: Declared, part: Part) -> int | None:
+    """Which touch of a part is of few of many columns; None: none is."""
+    kind = declared.kinds[part.observations]
+    if kind.local is None or not part.large:
+        return None
+    space = declared.spaces[kind.of[kind.local.slot]]
+    if not isinstance(space, Vector) or space.tied or space.width < 2 * kind.local.number:
+        return None
+    alone = [[s for s, _ in touch.slots] == [kind.local.slot] for touch in part.touches]
+    return alone.index(True) if any(alone) else None
+
+
+def differentiate_locally(
+    declared: Declared, plan: Plan, number: int, touch: int, prepared, laid: Laid
+) -> LocalJacobian:
+    """As `differentiate`, for a part that has such a touch."""
+    part = plan.parts[number]
+    kind, local = declared.kinds[part.observations], declared.kinds[part.observations].local
+    assert local is not None
+    blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
+    measured, weight = laid.measured[number], laid.weight[number]
+    at = over_rows(_Columns(kind), part.by_row, blocks, measured, weight)
+    table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]
+    values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in at)
+    spaces = tuple(declared.spaces[name] for name in kind.of)
+    widths = list(widths_of(declared, plan, part))
+    widths[local.slot] = local.number
+    residual = _LocalResidual(kind, spaces)
+    r, blocks = differentiate_rows(
+        residual, tuple(widths), part, blocks, (measured, at, values), weight
+    )
+    group = plan.groups[part.touches[touch].group]
+    to = jnp.full(len(prepared[kind.of[local.slot]]), group.width)
+    space = spaces[local.slot]
+    assert isinstance(space, Vector)
+    moving = jnp.array(space.moving, int)
+    to = to.at[moving].set(part.touches[touch].start + jnp.arange(len(space.moving)))
+    columns = to[jnp.stack(at, -1)]
+    free = group.free[part.touches[touch].row][:, None]
+    found = []
+    for number_of, one in enumerate(part.touches):
+        J = jnp.concatenate([blocks[slot] for slot, _ in one.slots], -1)
+        if number_of == touch:
+            mask = jnp.take_along_axis(
+                jnp.broadcast_to(free, (*columns.shape[:2], group.width)), columns, -1,
+                mode="fill", fill_value=0.0,
+            )  # fmt: skip
+            J = J * mask[:, :, None, :]
+        else:
+            J = without_held(plan, one, J)
+        found.append(J)
+    E = None
+    if plan.eliminated is not None and part.slot is not None:
+        E = eliminated_without_held(plan, part, blocks[part.slot])
+    return LocalJacobian(r, tuple(found), E, touch, columns)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Columns:
+    """The columns of one observation."""
+
+    kind: Kind
+
+    def __call__(self, blocks, measured, weight):
+        assert self.kind.local is not None
+        return self.kind.local.columns(*blocks, measured)
+
+
+@dataclasses.dataclass(frozen=True)
+class _LocalResidual:
+    """`rows.Residual` as a function of the values in the local columns."""
+
+    kind: Kind
+    spaces: tuple[Space, ...]
+
+    def __call__(self, blocks, given, weight, changes):
+        local, (measured, columns, values) = self.kind.local, given
+        assert local is not None
+        values = tuple(v + d for v, d in zip(values, changes[local.slot], strict=True))
+        moved: list[Any] = [
+            block if slot == local.slot else space.moved(block, change)
+            for slot, (space, block, change) in enumerate(zip(self.spaces, blocks, changes))
+        ]
+        return weighted(local.residual(*moved, columns, values, measured), weight)
+
+
+def products_of(
+    like: Float[Array, "rows w w"], row: Int[Array, " chunks"], J, columns
+) -> Float[Array, "rows w w"]:
+    """The products of every observation, added up chunk by chunk in the shape of N."""
+
+    def add(N, chunk):
+        row, J, at = chunk
+        products = jnp.einsum("kri,krj->kij", J, J)
+        return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
+
+    nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # of the devices that J is of
+    return jax.lax.scan(add, nothing, (row, J, columns))[0]
+
+
+def spread(found: Float[Array, "chunks length m *v"], columns, width: int):
+    """Rows that belong to columns, summed over the observations of a chunk: [chunks, width, v]."""
+    zero = jnp.zeros((found.shape[0], width, *found.shape[3:]))
+    chunk = jnp.arange(found.shape[0])[:, None, None]
+    return zero.at[chunk, columns].add(found, mode="drop")

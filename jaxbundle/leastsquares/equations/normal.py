@@ -1,0 +1,322 @@
+"""The normal equations N·δ = −g in blocks.
+
+    N = ⎡ A   W ⎤   A: kept groups, `own` diagonal blocks and `off` off-diagonal blocks
+        ⎣ Wᵀ  V ⎦   V: one small block for each eliminated row; W: one for each incidence
+
+They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from second derivatives of
+every observation (the exact Hessian, `hessian.py`); everything after that is the same.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial, reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.equations.damping import measure
+from jaxbundle.leastsquares.equations.linearise import differentiate
+from jaxbundle.leastsquares.equations.local import (
+    LocalJacobian,
+    differentiate_locally,
+    local_touch,
+    products_of,
+    spread,
+)
+from jaxbundle.leastsquares.indexing.plan import Key, Part, Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Laid, Values, prepare
+from jaxbundle.types import AnyArray, present
+
+Tangent = dict[str, Float[Array, "rows width"]]
+"""A small change of all groups, the eliminated rows among them."""
+Rows = Float[AnyArray, "rows width"]
+AnyTangent = Mapping[str, Rows]
+
+
+class NormalBlocks(eqx.Module):
+    """N in blocks; rows and columns of held unknowns are zero. `own` and `off` are sums over all
+    devices, the others belong to the eliminated rows of one device. `metric`: D of the damping."""
+
+    own: dict[str, Float[Array, "rows w w"]]
+    off: dict[Key, Float[Array, "blocks w v"]]
+    eliminated: Float[Array, "rows w w"] | None
+    W: dict[str, Float[Array, "chunks length w v"]]
+    metric: dict[str, Float[Array, "rows w *w"]]
+
+
+class Normal(lx.AbstractLinearOperator):
+    """N as a linear operator on changes of the unknowns."""
+
+    plan: Plan
+    blocks: NormalBlocks
+
+    def mv(self, vector: Tangent) -> Tangent:
+        """N·x."""
+        plan, N, e = self.plan, self.blocks, self.plan.eliminated
+        product = times_kept(plan, N, vector)
+        if e is not None:
+            product[e] = jnp.einsum("nij,nj->ni", N.eliminated, vector[e])
+            product[e] = product[e] + scatter(plan, N.W, vector)
+            for g, more in gather(plan, N.W, vector[e]).items():
+                product[g] = product[g] + more
+        return product
+
+    def diagonal(self) -> Tangent:
+        """The diagonal of N."""
+        N, e = self.blocks, self.plan.eliminated
+        blocks = N.own if e is None else N.own | {e: present(N.eliminated)}
+        return {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in blocks.items()}
+
+    def as_matrix(self) -> Float[Array, "n n"]:
+        """The dense matrix, groups in the order of their names; for small problems and tests."""
+        zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), self.in_structure())
+        flat, unravel = ravel_pytree(zero)
+        column = lambda e: ravel_pytree(self.mv(unravel(e)))[0]
+        return jax.vmap(column, out_axes=1)(jnp.eye(flat.size))
+
+    def transpose(self) -> "Normal":
+        return self
+
+    def in_structure(self) -> Tangent:
+        return jax.eval_shape(self.diagonal)
+
+    def out_structure(self) -> Tangent:
+        return self.in_structure()
+
+
+for _trait in (
+    lx.is_diagonal, lx.is_tridiagonal, lx.has_unit_diagonal, lx.is_lower_triangular,
+    lx.is_upper_triangular, lx.is_negative_semidefinite,
+):  # fmt: skip
+    _trait.register(Normal)(lambda operator: False)
+for _trait in (lx.is_symmetric, lx.is_positive_semidefinite):
+    _trait.register(Normal)(lambda operator: True)
+for _same in (lx.linearise, lx.materialise, lx.conj):
+    _same.register(Normal)(lambda operator: operator)
+lx.diagonal.register(Normal)(lambda operator: operator.diagonal())
+
+
+def total(plan: Plan, parts):
+    """The sum over the devices of the contributions of their eliminated rows."""
+    return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
+
+
+def agreed(plan: Plan, value):
+    """The mean over the devices of values that should be the same on all, to make them identical to
+    the last digit: devices that decide differently would deadlock."""
+    return value if plan.axis is None else jax.lax.pmean(value, plan.axis)
+
+
+def times_kept(plan: Plan, N: NormalBlocks, x: Tangent) -> Tangent:
+    """A·x."""
+    product = {g: jnp.einsum("nij,nj->ni", B, x[g]) for g, B in N.own.items()}
+    for (later, earlier), B in N.off.items():
+        at = plan.blocks[later, earlier]
+        down = jnp.einsum("bij,bj->bi", B, x[earlier][at.column])
+        up = jnp.einsum("bij,bi->bj", B, x[later][at.row])
+        product[later] = product[later].at[at.row].add(down)
+        product[earlier] = product[earlier].at[at.column].add(up)
+    return product
+
+
+def gather(plan: Plan, W: dict[str, Array], h: Float[Array, "rows w"]) -> Tangent:
+    """Wᵀ·h for rows h that are eliminated; the sum of all devices."""
+    found = {}
+    for g, blocks in W.items():
+        at, rows = plan.incidences[g], _tall(blocks)
+        of_chunks = jnp.einsum("cki,ck->ci", rows, h[at.eliminated].reshape(rows.shape[:2]))
+        found[g] = jax.ops.segment_sum(of_chunks, at.row, plan.groups[g].rows)
+    return total(plan, found)
+
+
+def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
+    """W·x."""
+    found = jnp.zeros(())
+    for g, blocks in W.items():
+        at = plan.incidences[g]
+        moved = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][at.row])
+        found = found + jax.ops.segment_sum(
+            moved.reshape(-1, blocks.shape[-2]), at.eliminated.ravel(),
+            plan.groups[present(plan.eliminated)].rows,
+        )  # fmt: skip
+    return found
+
+
+def _tall(blocks):
+    """The blocks of a chunk as one matrix."""
+    return blocks.reshape(blocks.shape[0], -1, blocks.shape[-1])
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def normal_equations(
+    declared: Declared, plan: Plan, values: Values, laid: Laid
+) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
+    """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J).
+
+    Traced once per plan: the solver needs the shapes of its results before the values."""
+    prepared, sums = prepare(declared, values), Sums(plan)
+    for number, part in enumerate(plan.parts):
+        local = local_touch(declared, part)
+        if local is not None:
+            sums.add_local(part, differentiate_locally(
+                declared, plan, number, local, prepared, laid
+            ))  # fmt: skip
+            continue
+        r, touches, E = differentiate(declared, plan, number, prepared, laid)
+        sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
+    return sums.finished(declared, values)
+
+
+def _products_of(part: Part, r, touches, E):
+    """The Gauss–Newton contribution of a part, see `Sums.add_part`: products of the blocks of J."""
+    tall = [J.reshape(J.shape[0], -1, J.shape[-1]) for J in touches]
+    right, eliminated, W = r.reshape(r.shape[0], -1), None, []
+    if E is not None:
+        flat = lambda x: x.reshape(-1, *x.shape[2:])
+        J = flat(E)
+        eliminated = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
+        W = [products(J, flat(K)) for K in touches]
+    own = [jnp.einsum("cki,ckj->cij", J, J) for J in tall]
+    gradient = [jnp.einsum("cki,ck->ci", J, right) for J in tall]
+    couples = [jnp.einsum("cki,ckj->cij", tall[c.first], tall[c.second]) for c in part.couples]
+    return own, gradient, couples, eliminated, W
+
+
+class Sums:
+    """Sums of blocks and gradient over the parts."""
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+        zero = lambda g: jnp.zeros((g.rows, g.width))
+        self.gradient = {name: zero(g) for name, g in plan.groups.items()}
+        self.own = {name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()}
+        self.off = {}
+        self.W = {}
+        self.cost = jnp.zeros(())
+
+    def add_part(self, part: Part, cost, own, gradient, couples, eliminated, W):
+        """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
+        `couples` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside the block
+        (None without), and `W` [places, w, v] of each of the touches."""
+        self.cost = self.cost + cost
+        for touch, N, g in zip(part.touches, own, gradient):
+            group, columns = touch.group, slice(touch.start, touch.stop)
+            self.own[group] = self.own[group].at[touch.row, columns, columns].add(N)
+            self.gradient[group] = self.gradient[group].at[touch.row, columns].add(g)
+        for couple, N in zip(part.couples, couples):
+            self._add_couple(part, couple, N)
+        if eliminated is not None:
+            at, e = present(part.eliminated).ravel(), present(self.plan.eliminated)
+            both = jax.ops.segment_sum(eliminated, at, self.own[e].shape[0])
+            self.own[e] += both[..., :-1]
+            self.gradient[e] += both[..., -1]
+        for touch, N in zip(part.touches, W):
+            self._add_incidences(touch, N)
+
+    def add_local(self, part: Part, found: LocalJacobian):
+        """What a part with local columns adds (`local.py`)."""
+        t, J, at = found.touch, found.touches[found.touch], found.columns
+        touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width
+        others = [k for k in range(len(part.touches)) if k != t]
+        couples = [c for c in part.couples if t not in (c.first, c.second)]
+        rest = dataclasses.replace(
+            part, touches=tuple(part.touches[k] for k in others),
+            couples=tuple(dataclasses.replace(
+                c, first=others.index(c.first), second=others.index(c.second)
+            ) for c in couples),
+        )  # fmt: skip
+        r, E = found.r, found.eliminated
+        kept = tuple(found.touches[k] for k in others)
+        self.add_part(rest, 0.5 * jnp.vdot(r, r), *_products_of(rest, r, kept, E))
+        self.own[touch.group] += products_of(self.own[touch.group], touch.row, J, at)
+        g = spread(jnp.einsum("clri,clr->cli", J, r), at, width)
+        self.gradient[touch.group] = self.gradient[touch.group].at[touch.row].add(g)
+        whole = dataclasses.replace(touch, start=0, stop=width)
+        for couple in part.couples:
+            if t in (couple.first, couple.second):
+                k = couple.second if couple.first == t else couple.first
+                B = spread(jnp.einsum("clri,clrj->clij", J, found.touches[k]), at, width)
+                touches = tuple(whole if i == t else one for i, one in enumerate(part.touches))
+                self._add_couple(
+                    dataclasses.replace(part, touches=touches), couple,
+                    B if couple.first == t else B.mT,
+                )  # fmt: skip
+        if E is not None:
+            self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
+
+    def _add_local_incidences(self, touch, W, columns, width):
+        plan = self.plan.incidences[touch.group]
+        n, shape = plan.eliminated.size, W.shape[:2]
+        at = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
+        found = jnp.zeros((n, width, W.shape[-1])).at[at[..., None], columns].add(W, mode="drop")
+        self.W[touch.group] = self.W.get(touch.group, 0.0) + found.mT.reshape(
+            *plan.eliminated.shape, W.shape[-1], width
+        )
+
+    def _add_couple(self, part, couple, N):
+        """An off-diagonal block, or a diagonal one if the two rows are the same."""
+        first, second = part.touches[couple.first], part.touches[couple.second]
+        key = first.group, second.group
+        columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
+        if couple.same is not None:
+            on = N * couple.same[:, None, None]
+            own = self.own[first.group].at[first.row, columns, others].add(on)
+            self.own[first.group] = own.at[first.row, others, columns].add(on.mT)
+        if couple.block is None:
+            return
+        shape = tuple(self.plan.groups[g].width for g in key)
+        pad = lambda B, rows, columns: jnp.zeros((B.shape[0], *shape)).at[:, rows, columns].set(B)
+        placed = pad(N, columns, others)
+        if couple.turned is not None:
+            turned = couple.turned[:, None, None]
+            placed = turned * pad(N.mT, others, columns) + (1 - turned) * placed
+        summed = jax.ops.segment_sum(placed, couple.block, self.plan.blocks[key].row.shape[0])
+        self.off[key] = self.off.get(key, 0.0) + summed.at[-1].set(0.0)
+
+    def _add_incidences(self, touch, W):
+        """W of every observation, summed for each incidence."""
+        plan = self.plan.incidences[touch.group]
+        width = self.plan.groups[touch.group].width
+        if W.shape[-1] != width:
+            W = jnp.zeros((*W.shape[:-1], width)).at[..., touch.start : touch.stop].set(W)
+        if touch.incidence is not None:
+            W = jax.ops.segment_sum(W, touch.incidence.ravel(), plan.eliminated.size)
+        self.W[touch.group] = self.W.get(touch.group, 0.0) + W.reshape(
+            *plan.eliminated.shape, *W.shape[1:]
+        )
+
+    def finished(self, declared: Declared, values: Values):
+        plan, e = self.plan, self.plan.eliminated
+        kept = lambda tree: {name: x for name, x in tree.items() if name != e}
+        own, off, cost, gradient = total(
+            plan, (kept(self.own), self.off, self.cost, kept(self.gradient))
+        )
+        eliminated = None
+        if e is not None:
+            eliminated, gradient[e] = self.own[e], self.gradient[e]
+        metric = measure(declared, plan, values, own | ({e: eliminated} if e else {}))
+        return cost, gradient, NormalBlocks(own, off, eliminated, self.W, metric)
+
+
+def products(a, b):
+    """aᵀb of every row, written out: a batched product of tiny matrices takes three times as
+    long."""
+    return reduce(
+        jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
+    )
+
+
+def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
+    """aᵀb, the eliminated rows of all devices."""
+    e = plan.eliminated
+    kept = sum((jnp.vdot(a[g], b[g]) for g in plan.kept), jnp.zeros(()))
+    return kept if e is None else kept + total(plan, jnp.vdot(a[e], b[e]))
+
+
+def zero_tangent(plan: Plan) -> Tangent:
+    """The zero change."""
+    return {name: jnp.zeros((g.rows, g.width)) for name, g in plan.groups.items()}

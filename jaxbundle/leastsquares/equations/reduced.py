@@ -1,0 +1,124 @@
+"""The reduced system S·x = b of the kept groups: its blocks, and its dense factor.
+
+It is solved by a dense Cholesky factorisation (here), a banded one (`banded.py`), or without
+factorisation by conjugate gradients (`iterative.py`). All three have
+
+- `solve(b)`: S⁻¹·b for rows of the kept groups;
+- `inverse()`: the blocks of S⁻¹ where S has blocks;
+- `pivots`: the square roots of the pivots, 1 if uncorrelated, 0 if undetermined.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.equations.normal import AnyTangent, Tangent
+from jaxbundle.leastsquares.indexing.plan import Key, Plan
+
+Groups = tuple[str, ...]
+
+
+class Reduced(eqx.Module):
+    """S, or another symmetric matrix, in the blocks that S consists of; see `NormalBlocks`."""
+
+    own: dict[str, Float[Array, "rows w w"]]
+    off: dict[Key, Float[Array, "blocks w v"]]
+
+    def scaled(self, plan: Plan, scale: Tangent) -> "Reduced":
+        """Rows and columns times `scale`."""
+        times = lambda B, s, t: B * s[:, :, None] * t[:, None, :]
+        return Reduced(
+            {g: times(B, scale[g], scale[g]) for g, B in self.own.items()},
+            {(a, b): times(B, scale[a][plan.blocks[a, b].row], scale[b][plan.blocks[a, b].column])
+             for (a, b), B in self.off.items()},
+        )  # fmt: skip
+
+    def matrix(self, plan: Plan, groups: Groups) -> Float[Array, "n n"]:
+        """The matrix of some groups; only its lower triangle is right."""
+        size = lambda g: plan.groups[g].free.size
+        rows = [
+            [self.between(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
+             for j, b in enumerate(groups)] for i, a in enumerate(groups)
+        ]  # fmt: skip
+        return jnp.block(rows) if rows else jnp.zeros((0, 0))
+
+    def between(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
+        """The matrix of two groups; of one with itself only its lower triangle is right."""
+        if (b, a) in self.off and a != b:
+            return self.between(plan, b, a).T
+        (n, w), (m, v) = plan.groups[a].free.shape, plan.groups[b].free.shape
+        matrix = jnp.zeros((n, m, w, v))
+        if (a, b) in self.off:
+            at = plan.blocks[a, b]
+            matrix = matrix.at[at.row, at.column].add(self.off[a, b])
+        if a == b:
+            matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.own[a])
+        return matrix.transpose(0, 2, 1, 3).reshape(n * w, m * v)
+
+
+class DenseFactor(eqx.Module):
+    """S = L·Lᵀ."""
+
+    plan: Plan
+    lower: Float[Array, "n n"]
+
+    def solve(self, b: Tangent) -> Tangent:
+        kept = self.plan.kept
+        return split(self.plan, kept, cho_solve((self.lower, True), flat(kept, b)))
+
+    def inverse(self) -> Reduced:
+        Q = cho_solve((self.lower, True), jnp.eye(self.lower.shape[0]))
+        return blocks_of(self.plan, self.plan.kept, Q)
+
+    @property
+    def pivots(self) -> Float[Array, " n"]:
+        return jnp.diagonal(self.lower)
+
+
+def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
+    """The factor of S; NaN if it is not positive definite."""
+    return DenseFactor(plan, cholesky_of_lower(S.matrix(plan, plan.kept)))
+
+
+@jax.custom_jvp
+def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """L of S = L·Lᵀ from the lower triangle of S; NaN if it is not positive definite."""
+    return jnp.linalg.cholesky(S, symmetrize_input=False)
+
+
+@cholesky_of_lower.defjvp
+def _(primals, tangents):
+    # JAX's derivative rule expects the full symmetric change.
+    whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
+    factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
+    return jax.jvp(factor, primals, tangents)
+
+
+def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
+    """The blocks of a symmetric matrix of some groups where S has blocks."""
+    cut = lambda x: split(plan, groups, x)
+    parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
+    index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
+    own = {g: parts[g][g][i, :, i] for g, i in index.items()}
+    keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
+    at = plan.blocks
+    return Reduced(own, {
+        (a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys
+    })
+
+
+def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
+    """Some groups as one vector."""
+    return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
+
+
+def split(plan: Plan, groups: Groups, vector: Float[Array, "n ..."]):
+    """The rows of some groups in one, group by group."""
+    ends = np.cumsum([plan.groups[g].free.size for g in groups])
+    parts = jnp.split(vector, ends[:-1]) if groups else ()
+    return {
+        g: x.reshape(*plan.groups[g].free.shape, *x.shape[1:]) for g, x in zip(groups, parts)
+    }

@@ -1,0 +1,1 @@
+"""The index plan: which observation touches which unknowns, in arrays of round sizes."""

@@ -1,0 +1,180 @@
+"""The eliminated rows, and the block rows formed by kept tables.
+
+See `plan.py` for the terms."""
+
+import dataclasses
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.indexing.indices import as_column, as_index
+from jaxbundle.leastsquares.indexing.plan import Group, Member
+from jaxbundle.types import present
+
+MASKED = 100_000
+"""From this number of eliminated rows, whether all of them are free is compiled in. With fewer rows
+some may be held by the same program, as in data snooping: a mask costs little, compiling much.
+"""
+
+
+@dataclasses.dataclass
+class Choices:
+    """Free choices of a plan (lengths of chunks, sharing of groups): made once for a large problem
+    and reused for every part of it."""
+
+    before: dict[Hashable, Any]
+    made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
+
+    def __call__(self, *key, found) -> Any:
+        """The given choice, or an earlier one."""
+        self.made[key] = self.before.get(key, found)
+        return self.made[key]
+
+
+@dataclasses.dataclass
+class Share:
+    """The observations that make a part; `slot`: that of the eliminated row."""
+
+    observations: int
+    source: Int[np.ndarray, " share"]
+    slot: int | None
+
+
+class Grouping:
+    """Shares of observations and groups of tables.
+
+    `members`: by group, (table, first column, its rows or None: all); `group_of`: by table, group,
+    first column, row of the group for every row of the table; `row_in`: for every row of the
+    eliminated table its place among those that are eliminated; `kept`: the groups in order."""
+
+    def __init__(
+        self, tables: Sequence[Table], observations: Sequence[Observations],
+        eliminate: str | None, choose: Choices,
+    ):  # fmt: skip
+        self.tables = {t.name: t for t in tables}
+        self.observations, self.eliminate, self.choose = observations, eliminate, choose
+        self.moving = choose("moving", found=[t.name for t in tables if t.free.any()])
+        self.stays = self._rows_that_stay()
+        self.shares = self._share_observations()
+        self._form_groups()
+
+    # ------------------------------------------------------------------ what is eliminated
+
+    def _rows_that_stay(self):
+        """Rows of the eliminated table that stay in the reduced system: those tied by an
+        observation to another row of their table."""
+        if self.eliminate is None:
+            return None
+        table = self.tables[self.eliminate]
+        stays = np.zeros(table.rows, bool)
+        for given in self.observations:
+            slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            for s in slots if len(slots) > 1 else ():
+                stays[given.rows[s]] = True
+        return self.choose("stays", found=stays & table.free.any(1))
+
+    def _share_observations(self):
+        """Observations of one kind, separated by the slot that touches an eliminated row."""
+        shares = []
+        for o, given in enumerate(self.observations):
+            slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            slot_of = np.full(given.number, -1)
+            for s in slots:
+                slot_of[~present(self.stays)[given.rows[s]]] = s
+            # Two held rows of the table may meet: the last counts as eliminated.
+            for slot in self.choose("slots", o, found=np.unique(slot_of).tolist()):
+                rows = np.flatnonzero(slot_of == slot)
+                shares.append(Share(o, rows, None if slot < 0 else slot))
+        return shares
+
+    # ------------------------------------------------------------------ groups
+
+    def _form_groups(self):
+        """Kept tables in groups; the eliminated rows are the last group."""
+        self.members, self.group_of = {}, {}
+        for name in self.moving:
+            table = self.tables[name]
+            if name == self.eliminate:
+                continue
+            host = next((g for g in self.members if self._meet_always(g, name)), None)
+            host = self.choose("host", name, found=host)
+            if host is None:
+                self.members[name] = [(name, 0, None)]
+                self.group_of[name] = name, 0, np.arange(table.rows)
+            else:
+                start = sum(self.tables[t].space.width for t, *_ in self.members[host])
+                self.members[host].append((name, start, None))
+                self.group_of[name] = host, start, np.arange(table.rows)
+        self.row_in, name = {}, self.eliminate
+        if name is not None:
+            stays = present(self.stays)
+            place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
+            if stays.any():
+                kept = f"{name} (kept)"
+                self.members[kept] = [(name, 0, np.flatnonzero(stays))]
+                self.group_of[name] = kept, 0, place(stays)
+            rows = np.flatnonzero(~stays) if stays.any() else None
+            self.members[name] = [(name, 0, rows)]
+            self.row_in = place(~stays)
+        # In the order of JAX's pytrees.
+        self.kept = sorted(g for g in self.members if g != name)
+
+    def _meet_always(self, group, name):
+        """Whether the rows of a table occur in exactly the same observations of eliminated rows as
+        those of a group."""
+        first = self.members[group][0][0]
+        if self.tables[first].rows != self.tables[name].rows:
+            return False
+        met = False
+        for share in self.shares:
+            given = self.observations[share.observations]
+            of, rows = given.kind.of, given.rows
+            if share.slot is None:
+                continue
+            a = [s for s, t in enumerate(of) if t == first]
+            b = [s for s, t in enumerate(of) if t == name]
+            if len(a) != len(b) or len(a) > 1:
+                return False
+            if a:
+                met = True
+                if not np.array_equal(rows[a[0]][share.source], rows[b[0]][share.source]):
+                    return False
+        return met
+
+    def group(self, name: str) -> Group:
+        members, free = [], []
+        for table, start, rows in self.members[name]:
+            given = self.tables[table]
+            free.append(given.free if rows is None else given.free[rows])
+            index = None if rows is None else as_index(rows, ("group", name), ("table", table))
+            members.append(Member(table, start, given.space.width, index))
+        free = np.concatenate(free, 1)
+        may_be_held = name == self.eliminate and len(free) < MASKED
+        all_free = bool(free.all()) and not may_be_held
+        all_free = self.choose("all free", name, found=all_free)
+        return Group(tuple(members), as_column(free, ("group", name)), all_free)
+
+    def touched_groups(self, share: Share, of):
+        """The kept groups that a share touches, in order, with their slots and first columns; a
+        second row of a group is a touch of its own."""
+        found = []
+        for s, name in enumerate(of):
+            if s == share.slot or name not in self.group_of:
+                continue
+            group, start, _ = self.group_of[name]
+            entry = next(
+                (f for f in found if f[0] == group and all(of[q] != name for q, _ in f[1])), None
+            )
+            if entry is None:
+                found.append((group, [(s, start)]))
+            else:
+                entry[1].append((s, start))
+        found.sort(key=lambda f: self.kept.index(f[0]))
+        return [(group, tuple(slots)) for group, slots in found]
+
+    def rows(self, group: str) -> int:
+        table, _, rows = self.members[group][0]
+        return self.tables[table].rows if rows is None else len(rows)

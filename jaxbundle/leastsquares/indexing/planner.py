@@ -1,0 +1,262 @@
+"""Plans a problem on the host: see `plan.py`."""
+
+import dataclasses
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxbundle.choices import REDUCTIONS
+from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.indexing.grouping import Choices, Grouping, Share
+from jaxbundle.leastsquares.indexing.indices import Sizes, as_column, as_index, count
+from jaxbundle.leastsquares.indexing.layout import (
+    SMALL,
+    chunk_length,
+    chunk_pairs,
+    lay_out,
+    pair_chunk_lengths,
+    pairs_between,
+)
+from jaxbundle.leastsquares.indexing.plan import Blocks, Couple, Incidences, Part, Plan, Touch
+from jaxbundle.leastsquares.indexing.reduction import FACTORS, MOST_PAIRS, plan_reduction
+
+
+def make_plan(
+    tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None,
+    choices: dict | None = None, ways: Sequence[str] = REDUCTIONS,
+) -> tuple[Plan, Sizes, dict]:  # fmt: skip
+    """The plan on the host, its arrays as `Index` and `Column` (`indices.finish`), the sizes of its
+    lists, and the choices made (lengths of chunks, blocks of the reduced matrix). `choices`: those
+    of a larger problem of which this is a part, to be reused; `ways`: allowed solvers of the
+    reduced system."""
+    choose = Choices(choices or {})
+    plan = _Planner(Grouping(tables, observations, eliminate, choose), ways).plan()
+    sizes = {("table", t.name): t.rows + 1 for t in tables}
+    sizes |= {("observations", o): x.number + 1 for o, x in enumerate(observations)}
+    return plan, sizes | count(plan), choose.made
+
+
+@dataclasses.dataclass
+class _LaidPart:
+    """A part in its chunks of `length`, along the list `along`; `used`: which positions are
+    used."""
+
+    part: Part
+    used: Bool[np.ndarray, " places"]
+    length: int
+    along: Hashable
+
+    def set(self, field: str, number: int, **changed) -> None:
+        """Replaces an item in one of the touches or couples."""
+        items = list(getattr(self.part, field))
+        items[number] = dataclasses.replace(items[number], **changed)
+        self.part = dataclasses.replace(self.part, **{field: tuple(items)})
+
+
+@dataclasses.dataclass
+class _LaidIncidences:
+    """Incidences of a group in their chunks; of those that are one: place, both rows."""
+
+    incidences: Incidences
+    live: Int[np.ndarray, " n"]
+    eliminated: Int[np.ndarray, " n"]
+    row: Int[np.ndarray, " n"]
+    along: Hashable
+    length: int
+
+
+class _Planner:
+    def __init__(self, grouping: Grouping, ways: Sequence[str]):
+        self.by, self.choose = grouping, grouping.choose
+        self.ways = self.choose("ways", found=tuple(ways))
+
+    def plan(self):
+        parts = [self.lay_out(k, share) for k, share in enumerate(self.by.shares)]
+        incidences = {g: self.incidences_of(g, parts) for g in self.by.kept}
+        incidences = {g: found for g, found in incidences.items() if found is not None}
+        groups = {g: self.by.group(g) for g in (*self.by.kept, self.by.eliminate) if g is not None}
+        blocks, reduction, band = self.reduce(parts, incidences, groups)
+        incidences = {g: found.incidences for g, found in incidences.items()}
+        parts = tuple(p.part for p in parts)
+        return Plan(groups, self.by.eliminate, parts, incidences, blocks, reduction, band)
+
+    def reduce(self, parts, incidences, groups):
+        """The blocks of the reduced matrix, its solver, its band."""
+        rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
+        met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
+        if len(ways) > 1 and (met * (met - 1)).sum() / 2 > MOST_PAIRS:
+            ways = ("iterative",)
+        blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
+        shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
+        place = lambda at: (at.row.rows, at.column.rows) if at else np.zeros((2, 0), np.int64)
+        ties = lambda g: place(blocks.get((g, g)))
+        number = sum(given.number for given in self.by.observations)
+        way, band = plan_reduction(shapes, ties, number, ways)
+        self.choose.made["ways",] = (way,)
+        return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
+
+    def lay_out(self, k: int, share: Share) -> _LaidPart:
+        """Part k in chunks, with its touches (couples and incidences are added later)."""
+        given = self.by.observations[share.observations]
+        of = given.kind.of
+        rows = [np.asarray(r)[share.source] for r in given.rows]
+        slots = self.by.touched_groups(share, of)
+        major = np.zeros(len(share.source), np.int64)
+        for _, touched in slots:
+            slot = touched[0][0]
+            row = self.by.group_of[of[slot]][2][rows[slot]]
+            major = np.unique(major * (row.max(initial=0) + 1) + row, return_inverse=True)[1]
+        minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
+        along = ("part", k)
+        length = self.choose("length", along, found=chunk_length(major))
+        large = self.choose("large", k, found=len(major) >= SMALL)
+        order, used = lay_out(major, minor, length)
+        chunk = lambda x: x[order].reshape(-1, length)
+        lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)
+        first[major] = np.arange(len(major))  # An observation of every major.
+        for s, name in enumerate(of):
+            at = chunk(rows[s])
+            one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
+            one = self.choose("by chunk", k, s, found=one and s != share.slot)
+            by_row.append(not one)
+            lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))
+        touches = []
+        for group, touched in slots:
+            slot = touched[0][0]
+            row = chunk(self.by.group_of[of[slot]][2][rows[slot]])[:, 0]
+            stop = max(start + self.by.tables[of[s]].space.width for s, start in touched)
+            start = min(start for _, start in touched)
+            index = as_index(row, along, ("group", group))
+            touches.append(Touch(group, touched, start, stop, index, None))
+        source = np.where(used, share.source[order], -1).reshape(-1, length)
+        place = np.full(given.number, -1)
+        place[share.source[order][used]] = np.flatnonzero(used)
+        eliminated = None
+        if share.slot is not None:
+            at = self.by.row_in[chunk(rows[share.slot])]
+            eliminated = as_index(at, along, ("group", self.by.eliminate))
+        number = ("observations", share.observations)
+        made = Part(
+            observations=share.observations, slot=share.slot, by_row=tuple(by_row),
+            large=large, lookup=tuple(lookup), eliminated=eliminated,
+            source=as_index(source, along, number), place=as_index(place, number, along, length),
+            touches=tuple(touches), couples=(),
+        )  # fmt: skip
+        return _LaidPart(made, used, length, along)
+
+    def incidences_of(self, group, parts):
+        """The incidences of a group; sets the incidence of the observations of the parts."""
+        at = [
+            (k, t) for k, p in enumerate(parts) if p.part.slot is not None
+            for t, touch in enumerate(p.part.touches) if touch.group == group
+        ]  # fmt: skip
+        if not at:
+            return None
+        number = len(self.by.row_in)
+        eliminated, row, used = [], [], []
+        for k, t in at:
+            p = parts[k]
+            eliminated.append(p.part.eliminated.rows.ravel())
+            row.append(np.repeat(p.part.touches[t].row.rows, p.length))
+            used.append(p.used)
+        eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
+        keys = row[used].astype(np.int64) * number + eliminated[used]
+        keys, of = np.unique(keys, return_inverse=True)
+        apart = len(at) == 1 and len(keys) == used.sum()
+        if self.choose("incidences apart", group, found=apart):
+            p = parts[at[0][0]]
+            along, length = p.along, p.length
+        else:
+            r, q = keys // number, keys % number
+            along = ("incidences", group)
+            length = self.choose("length", along, found=chunk_length(r))
+            order, live = lay_out(r, q, length)
+            place = np.empty(len(keys), np.int64)
+            place[order[live]] = np.flatnonzero(live)
+            whole = np.full(len(used), -1)
+            whole[used] = place[of]
+            cuts = np.cumsum([len(parts[k].used) for k, _ in at])[:-1]
+            for (k, t), where in zip(at, np.split(whole, cuts)):
+                p = parts[k]
+                index = as_index(where.reshape(-1, p.length), p.along, along, length)
+                p.set("touches", t, incidence=index)
+            eliminated, row, used = q[order], r[order], live
+        plan = Incidences(
+            as_index(eliminated.reshape(-1, length), along, ("group", self.by.eliminate)),
+            as_index(row[::length], along, ("group", group)),
+        )
+        live = np.flatnonzero(used)
+        eliminated, row = eliminated[live], row[live]
+        return _LaidIncidences(plan, live, eliminated, row, along, length)
+
+    def find_blocks(self, parts, incidences):
+        """The blocks of the reduced matrix between kept groups: from pairs of incidences, and from
+        observations that touch two kept rows."""
+        direct = {}  # (later, earlier): [(part, couple, row, column, along)]
+        for k, p in enumerate(parts):
+            self._couples(k, p, direct)
+        blocks = {}
+        for place, later in enumerate(self.by.kept):
+            for earlier in self.by.kept[: place + 1]:
+                key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
+                pairs = self._pairs(a, b, later == earlier)
+                made = self._block_list(key, pairs, direct.get(key, ()), parts)
+                if made is not None:
+                    blocks[key] = made
+        return blocks
+
+    def _couples(self, k, p, direct):
+        touches = p.part.touches
+        couples = []
+        for j in range(len(touches)):
+            for i in range(j):
+                a, b = touches[j], touches[i]  # the later group first
+                row, column = a.row.rows, b.row.rows
+                same = turned = None
+                if a.group == b.group:
+                    equal, less = row == column, row < column
+                    row, column = np.maximum(row, column), np.minimum(row, column)
+                    meets = self.choose("same", k, j, i, found=bool(equal.any()))
+                    same = as_column(equal.astype(float), p.along) if meets else None
+                    turned = as_column(less.astype(float), p.along)
+                    row = np.where(equal, -1, row)
+                direct.setdefault((a.group, b.group), []).append((k, len(couples), row, column))
+                couples.append(Couple(j, i, None, turned, same))
+        p.part = dataclasses.replace(p.part, couples=tuple(couples))
+
+    def _pairs(self, later, earlier, within):
+        """Pairs of incidences: places and rows of the block (row of the later, of the earlier)."""
+        if later is None or earlier is None:
+            empty = np.zeros(0, np.int64)
+            return empty, empty, empty, empty, None
+        i, j = pairs_between(later.eliminated, earlier.eliminated)
+        if within:  # below the diagonal; an incidence paired with itself is summed by chunks
+            low = later.row[i] > earlier.row[j]
+            i, j = i[low], j[low]
+        return later.live[i], earlier.live[j], later.row[i], earlier.row[j], (
+            (later.along, later.length), (earlier.along, earlier.length),
+        )  # fmt: skip
+
+    def _block_list(self, key, pairs, direct, parts):
+        i, j, row, column, into = pairs
+        columns = np.int64(self.by.rows(key[1]))
+        number = lambda r, c: r.astype(np.int64) * columns + c
+        keys = [number(row, column), *(number(r[r >= 0], c[r >= 0]) for *_, r, c in direct)]
+        keys = self.choose("blocks", *key, found=np.unique(np.concatenate(keys)))
+        if not len(keys):
+            return None
+        along = ("blocks", *key)
+        for k, couple, r, c in direct:
+            block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
+            parts[k].set("couples", couple, block=as_index(block, parts[k].along, along))
+        found = None
+        lengths = self.choose("pair chunks", *key, found=pair_chunk_lengths(len(i)))
+        if lengths:
+            block = np.searchsorted(keys, number(row, column))
+            found = chunk_pairs(i, j, block, into, along, key, lengths)
+        return Blocks(
+            as_index(keys // columns, along, ("group", key[0])),
+            as_index(keys % columns, along, ("group", key[1])),
+            found,
+        )

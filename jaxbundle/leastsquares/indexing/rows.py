@@ -1,0 +1,217 @@
+"""From tables and measurements to the columns of the observation equations.
+
+values (tables)  ──prepare, once a row──▶  columns  ──look up──▶  blocks of every observation
+
+Everything is a structure of arrays: one array for each scalar of a block.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxbundle.leastsquares.declarations import Kind, Motions
+from jaxbundle.leastsquares.indexing.plan import Part, Plan
+from jaxbundle.leastsquares.spaces import Space, Vector
+from jaxbundle.types import AnyArray
+
+WIDE = 64
+"""Residuals of one observation, as of the priors of a spline camera."""
+
+Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
+"""The rows of every table."""
+
+
+class Data(eqx.Module):
+    """The data of a problem, all differentiable.
+
+    `start`: the start values of the tables, including held values; for every set of
+    observations `measured` and `weight` (see `Observations`), in the given order.
+    """
+
+    start: Values
+    measured: tuple[PyTree[Float[Array, "n ..."]], ...]
+    weight: tuple[Float[AnyArray, "n ..."], ...]
+
+
+class Laid(eqx.Module):
+    """Measurements and weights of every part in the order of computation, scalar by scalar."""
+
+    measured: tuple[PyTree[Float[Array, "chunks length"]], ...]
+    weight: tuple[PyTree[Float[Array, "chunks length"]], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """The functions of a problem: its kinds of observations, the spaces of its tables, the motions
+    that may be open. Hashable: a static argument of compiled programs."""
+
+    kinds: tuple[Kind, ...]
+    named_spaces: tuple[tuple[str, Space], ...]
+    motions: Motions | None = None
+
+    @property
+    def spaces(self) -> dict[str, Space]:
+        return dict(self.named_spaces)
+
+
+def lay_out_data(plan: Plan, data: Data) -> Laid:
+    """The measurements, looked up once per solution."""
+    of = lambda rows, part: look_up(scalars(rows), part.source)
+    return Laid(
+        tuple(of(data.measured[part.observations], part) for part in plan.parts),
+        tuple(of(data.weight[part.observations], part) for part in plan.parts),
+    )
+
+
+def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
+    """The elements of every row: numbers as they are, vectors as tuples, matrices as tuples of
+    tuples."""
+
+    def split(x):
+        return x if x.ndim == 1 else tuple(split(x[:, i]) for i in range(x.shape[1]))
+
+    return jax.tree.map(split, rows)
+
+
+def prepare(declared: Declared, values: Values) -> dict[str, PyTree[Float[Array, " rows"]]]:
+    """The prepared block of every row of every table."""
+    return {name: jax.vmap(declared.spaces[name].prepare)(rows) for name, rows in values.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Residual:
+    """`(blocks, measured, weight) -> residuals / σ`, tuples of scalars, of one observation of a
+    kind; `changes` has one tuple for each slot, empty where the table is held."""
+
+    kind: Kind
+    spaces: tuple[Space, ...]
+
+    def __call__(self, blocks, measured, weight, changes=None):
+        changes = ((),) * len(self.spaces) if changes is None else changes
+        moved = [s.moved(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
+        return weighted(evaluate(self.kind, moved, measured), weight)
+
+
+    def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
+        """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
+        of columns, as scalars of which XLA compiles for minutes."""
+        moved = []
+        for space, block, change in zip(self.spaces, blocks, changes, strict=True):
+            if isinstance(space, Vector) and space.size:
+                block = _stacked(block)
+                if change.shape[0]:
+                    columns, of = (jnp.array(x, int) for x in space.moves)
+                    block = block.at[columns].add(change[of])
+            else:
+                block = _stacked(space.moved(block, tuple(change)))
+            moved.append(block)
+        given = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
+        found, w = self.kind.residual(*moved, given), jnp.stack(weight)
+        v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
+        return jnp.where(w > 0, w * v, 0.0)
+
+    def is_wide(self, weight) -> bool:
+        """Whether `array` is the way: the kind is one of arrays, with a weight for each."""
+        return not self.kind.scalars and len(weight) > WIDE and not isinstance(weight[0], tuple)
+
+
+def residual_of(declared: Declared, part: Part) -> Residual:
+    """The residuals of one observation of a part."""
+    kind = declared.kinds[part.observations]
+    return Residual(kind, tuple(declared.spaces[name] for name in kind.of))
+
+
+def evaluate(kind: Kind, blocks, measured):
+    """The residuals of one observation as a tuple of scalars."""
+    if not kind.scalars:
+        blocks = (_stacked(b) for b in blocks)
+        measured = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
+    found = kind.residual(*blocks, measured)
+    if isinstance(found, tuple):
+        return found
+    return (found,) if jnp.ndim(found) == 0 else tuple(found)
+
+
+def _stacked(block) -> Any:
+    """Tuples of scalars as arrays; other blocks as they are."""
+    if type(block) is tuple and block:
+        return jnp.stack([_stacked(x) for x in block])
+    return block
+
+
+def weighted(v, weight):
+    """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
+    if isinstance(weight[0], tuple):
+        rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
+        return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
+    return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
+
+
+def diagonal_of(weight) -> Any:
+    """The weight of every residual, 0 if it does not count: of observations [n, r] or [n, r, r], or
+    of one as scalars."""
+    if isinstance(weight, tuple):
+        return tuple(w[i] if isinstance(w, tuple) else w for i, w in enumerate(weight))
+    return weight if weight.ndim == 2 else weight.diagonal(axis1=1, axis2=2)
+
+
+def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
+    """Positions without weight use the rows of one with weight: an undefined value, such as the
+    distance of a point from itself, would be NaN in reverse mode in spite of its zero weight."""
+    parts, measured = [], []
+    for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
+        shape = part.source.shape
+        live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
+        place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
+        every = lambda at, shape=shape: jnp.broadcast_to(at if at.ndim == 2 else at[:, None], shape)
+        seen = lambda x, place=place: x.ravel()[place]
+        lookup, by_row = tuple(seen(every(at)) for at in part.lookup), (True,) * len(part.lookup)
+        parts.append(dataclasses.replace(part, lookup=lookup, by_row=by_row))
+        measured.append(jax.tree.map(seen, values))
+    return dataclasses.replace(plan, parts=tuple(parts)), Laid(tuple(measured), laid.weight)
+
+
+def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) -> Any:
+    """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
+    axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
+    blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
+    return over_rows(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
+
+
+@partial(jax.jit, static_argnums=(0, 1), inline=True)
+def over_rows(function, by_row, blocks, measured, weight):
+    """`over` of blocks that are looked up."""
+    axes = tuple(0 if one else None for one in by_row)
+    return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
+
+
+def look_up(columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]):
+    """The elements of every column at these (non-negative) indices of a plan."""
+    there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
+    return jax.tree.map(lambda column: column.at[at].get(**there), columns)
+
+
+def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
+    """Residuals divided by σ of every part, [chunks, length, r]."""
+    prepared, found = prepare(declared, values), []
+    for number, part in enumerate(plan.parts):
+        kind = declared.kinds[part.observations]
+        rows = over(part, kind, prepared, laid, number, residual_of(declared, part))
+        found.append(jnp.stack(rows, -1))
+    return tuple(found)
+
+
+def in_given_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
+    """Quantities by observation of every part, rearranged by set of observations in the given
+    order."""
+    found: dict[int, Float[Array, "n ..."]] = {}
+    for part, rows in zip(plan.parts, parts):
+        flat = rows.reshape(-1, *rows.shape[2:])[part.place]
+        known = found.get(part.observations)
+        found[part.observations] = flat if known is None else known + flat
+    return found

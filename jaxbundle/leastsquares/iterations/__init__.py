@@ -1,0 +1,1 @@
+"""From one accepted point to the next: descent, search, acceptance, stopping."""

@@ -1,0 +1,96 @@
+"""The iterations of a problem with its own layout of the normal equations.
+
+Acceptance of steps and step sizes follow `search.py`, stopping `stopping.py`; this module only
+puts them in order. Everything is traced, so that many problems can be iterated under `vmap` or
+`lax.map`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxbundle.leastsquares.iterations.search import RegionState, fraction_kept
+from jaxbundle.leastsquares.iterations.stopping import LIMIT, Approach, Tolerance
+
+
+class Loop(eqx.Module):
+    """The accepted unknowns `at`, with the normal equations and ½vᵀPv there; the unknowns to try
+    next; the termination, and the number of iterations."""
+
+    at: PyTree
+    trial: PyTree
+    equations: PyTree
+    cost: Float[Array, ""]
+    promised: Float[Array, ""]
+    step_size: Float[Array, ""]
+    region: RegionState
+    approach: Approach
+    termination: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+def iterate(
+    linearise: Callable[[Any], tuple[Any, Any]],
+    step: Callable[[Any, Any], tuple[Any, Any, Any]],
+    retract: Callable[[Any, Any], Any],
+    start: PyTree,
+    tolerance: Callable[[Any], Tolerance],
+    max_steps: int | Int[Array, ""],
+    go: bool | Array = True,
+) -> Loop:
+    """Iterate from start values until a stopping criterion is met.
+
+    **Arguments:**
+
+    - `linearise(x)`: the normal equations at x, a tree of arrays, and ½vᵀPv, not finite where it
+      cannot be computed.
+    - `step(equations, λ)`: the change δ = −(N + λ·D)⁻¹·g, and the numbers −gᵀδ and δᵀ·D·δ.
+    - `retract(x, δ)`: applies the change.
+    - `tolerance(equations)`: the tolerances.
+    - `go`: if false, nothing is done.
+    """
+
+    def body(loop: Loop) -> Loop:
+        first = loop.steps == 0
+        tried_equations, tried = linearise(loop.trial)
+        limits = tolerance(loop.equations)
+        kept = fraction_kept(loop.promised, loop.cost - tried, limits.noise(loop.cost))
+        accept, region = loop.region.after(first, kept)
+        at, equations, cost = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old),
+            (loop.trial, tried_equations, tried), (loop.at, loop.equations, loop.cost),
+        )  # fmt: skip
+        step_size, approach = loop.approach.choose_step(
+            region.radius, loop.step_size, first, accept, loop.promised, kept, cost
+        )
+        damping = 1 / step_size
+        change, decrement, damped = step(equations, damping)
+        finite = jnp.isfinite(decrement)
+        change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
+        termination, approach = approach.judge(
+            tolerance(equations), step_size, finite, decrement, first, accept, loop.cost, cost,
+            tried,
+        )  # fmt: skip
+        return Loop(
+            at=at, trial=retract(at, change), equations=equations, cost=cost,
+            promised=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
+            step_size=step_size, region=region, approach=approach, termination=termination,
+            steps=loop.steps + 1,
+        )  # fmt: skip
+
+    equations, zero = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linearise, start)
+    )
+    return jax.lax.while_loop(
+        lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
+        body,
+        Loop(
+            at=start, trial=start, equations=equations, cost=zero, promised=zero,
+            step_size=jnp.full_like(zero, jnp.inf), region=RegionState.begin(),
+            approach=Approach.begin(), termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
+        ),
+    )  # fmt: skip

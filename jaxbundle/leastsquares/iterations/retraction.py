@@ -1,0 +1,30 @@
+"""The retraction: applying a small change of the groups to the tables."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxbundle.leastsquares.equations.normal import AnyTangent, Rows, Tangent
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import Declared, Values
+
+
+def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Values:
+    """The tables after a change; held unknowns must have a zero change."""
+    moved = dict(values)
+    for name, rows in changes_of_tables(plan, values, change).items():
+        moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], rows)
+    return moved
+
+
+def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[str, Rows]:
+    """The change of every table that moves, [rows, width]."""
+    found: dict[str, Rows] = {}
+    for name, group in plan.groups.items():
+        for member in group.members:
+            part = change[name][:, member.start : member.start + member.width]
+            if member.rows is not None:
+                rows = jax.tree.leaves(values[member.table])[0].shape[0]
+                part = jnp.zeros((rows, member.width)).at[member.rows].add(part)
+            known = found.get(member.table)
+            found[member.table] = part if known is None else known + part
+    return found

@@ -1,0 +1,142 @@
+"""Dense least squares with few unknowns on a manifold: start values, refined closed forms.
+
+    v(x) → vᵀv = min,        x ← x ⊞ δ,        (N + λ·diag N)·δ = −Jᵀv,        N = JᵀJ
+
+J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. Steps and
+stopping follow the engine's rules (`loop.py`). The iterations are not differentiated: the
+derivatives, to any order, are those of the root of ∂(vᵀv)/∂δ = 0 (`jaxbundle.implicit`), curvature
+of v included.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Float, PyTree
+
+from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.leastsquares.iterations.loop import iterate
+from jaxbundle.leastsquares.iterations.stopping import Tolerance
+
+DETERMINED = 1e-10
+"""Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem."""
+MOST = 30
+"""Evaluations."""
+SETTLED = 1e-8
+"""The last step moves no unknown by more than this fraction of its σ; an undamped step follows."""
+
+
+class Fit(eqx.Module):
+    """An adjusted estimate, its vᵀPv, and Q = N⁻¹ in the order of δ (infinite: undetermined).
+
+    `weakest`: least eigenvalue of N scaled to a unit diagonal, 1 for uncorrelated unknowns.
+    """
+
+    estimate: PyTree
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "u u"]
+    weakest: Float[Array, ""]
+
+    @property
+    def determined(self):
+        return self.weakest > DETERMINED
+
+
+def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
+    """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
+    estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
+    return finish(residuals, retract, estimate, data, unknowns)
+
+
+def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
+    """The estimate at the end of the iterations, and its vᵀv, without derivatives.
+
+    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum
+    evaluations.
+    """
+    start, data = stop_gradient((start, data))
+
+    def linearise(x):
+        N, g, v = _linearised(residuals, retract, x, data, unknowns)
+        there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
+        return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
+
+    def step(equations, damping):
+        N, g, _ = equations
+        D = jnp.diag(N)
+        D = jnp.where(D > 0, D, 1.0)
+        change = -_solve(N + damping * jnp.diag(D), g)
+        return change, -g @ change, D @ change**2
+
+    def tolerance(equations):
+        N, _, rows = equations
+        zero = jnp.zeros((), N.dtype)
+        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + SETTLED, zero)
+
+    loop = iterate(linearise, step, retract, start, tolerance, steps)
+    return loop.at, jnp.where(jnp.isfinite(loop.cost), 2 * loop.cost, jnp.inf)
+
+
+def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknowns: int) -> Fit:
+    """The last step, without damping, the derivatives and the cofactors."""
+    x, held = stop_gradient((estimate, data))
+    N, g = normal_equations(residuals, retract, x, held, unknowns)
+    diagonal = jnp.diag(N)
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    scaled = N * scale * scale[:, None]
+    weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
+    determined = weakest > DETERMINED
+    N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
+    step = jnp.where(determined, -_solve(N, g), 0)
+    square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
+    # at the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong
+    rounding = 1e-22 * jnp.sum(diagonal)
+    good = square(retract(x, step), held) <= 1.001 * square(x, held) + rounding
+    x = retract(x, jnp.where(good, step, 0))
+    still = jnp.zeros(unknowns, step.dtype)
+    fixed = (residuals, retract, x)
+    x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
+    N, _ = normal_equations(residuals, retract, x, data, unknowns)
+    N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
+    cofactor = jnp.where(determined, inverse(N), jnp.inf)
+    return Fit(x, square(x, data), cofactor, weakest)
+
+
+def _half_gradient(delta, fixed, data):
+    """∂(½vᵀv)/∂δ after a step δ from the estimate."""
+    residuals, retract, x = fixed
+    return jax.grad(lambda delta: 0.5 * jnp.sum(residuals(retract(x, delta), *data) ** 2))(delta)
+
+
+def normal_equations(residuals, retract, x, data, unknowns):
+    """N = JᵀJ and Jᵀv at x."""
+    return _linearised(residuals, retract, x, data, unknowns)[:2]
+
+
+def _linearised(residuals, retract, x, data, unknowns):
+    """N = JᵀJ, Jᵀv and v at x."""
+
+    def twice(delta):
+        v = residuals(retract(x, delta), *data)
+        return v, v
+
+    zero = jnp.zeros(unknowns, jax.tree.leaves(x)[0].dtype)
+    J, v = jax.jacfwd(twice, has_aux=True)(zero)
+    return J.T @ J, J.T @ v, v
+
+
+def inverse(N: Float[Array, "u u"]) -> Float[Array, "u u"]:
+    """N⁻¹ of a positive definite N; else not finite."""
+    return _solve(N, jnp.eye(N.shape[0], dtype=N.dtype))
+
+
+def _solve(N, g):
+    """N⁻¹·g with N scaled to a unit diagonal; not finite if N is not positive definite."""
+    diagonal = jnp.diag(N)
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    column = scale if g.ndim == 1 else scale[:, None]
+    return column * cho_solve(cho_factor(N * scale * scale[:, None]), column * g)

@@ -1,0 +1,240 @@
+"""Least squares on manifolds with `optimistix.least_squares`.
+
+From one accepted point to the next, a search accepts or rejects the step tried, a
+descent computes the next one, and `stopping` decides. Residuals, Jacobian and normal equations are
+formed once per accepted point; a rejected step costs a factorisation and the residuals.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbundle.leastsquares.equations.normal import (
+    Normal,
+    NormalBlocks,
+    Tangent,
+    dot,
+    normal_equations,
+    total,
+    zero_tangent,
+)
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Laid,
+    Values,
+    lay_out_data,
+    residuals,
+)
+from jaxbundle.leastsquares.iterations.search import (
+    Info,
+    MarquardtDescent,
+    NielsenTrustRegion,
+    promise,
+)
+from jaxbundle.leastsquares.iterations.stopping import (
+    LIMIT,
+    NOT_FINITE,
+    SETTLED,
+    Approach,
+    Tolerance,
+)
+
+
+class History(eqx.Module):
+    """One row per evaluation: ½vᵀPv, λ of its step, accepted or not."""
+
+    cost: Float[Array, " steps"]
+    damping: Float[Array, " steps"]
+    accepted: Bool[Array, " steps"]
+
+    def with_row(self, i, cost, damping, accepted) -> "History":
+        return History(
+            self.cost.at[i].set(cost),
+            self.damping.at[i].set(damping),
+            self.accepted.at[i].set(accepted),
+        )
+
+
+class Known(eqx.Module):
+    """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the next step."""
+
+    cost: Float[Array, ""]
+    gradient: Tangent
+    normal: NormalBlocks
+    damping: Float[Array, ""]
+
+
+class State(eqx.Module):
+    """The loop state besides the accepted unknowns: the quantities there, and the step to try."""
+
+    first: Bool[Array, ""]
+    known: Known
+    change: Tangent
+    trial: Values
+    step_size: Float[Array, ""]
+    descent: Any
+    search: Any
+    approach: Approach
+    termination: Int[Array, ""]
+    steps: Int[Array, ""]
+    history: History
+
+
+class LeastSquares(optx.AbstractLeastSquaresSolver):
+    """The solver of a planned problem; see the module.
+
+    **Arguments:** `descent` and `search`: ours or optimistix's (those without memory of earlier
+    points); `retract(plan, values, change)`: applies a change; `max_steps`: maximum evaluations,
+    and `rows` of the history, which are compiled in; `progress(step, cost, λ)` is called on the
+    host after every evaluation.
+    """
+
+    declared: Declared
+    plan: Plan
+    tolerance: Tolerance
+    retract: Callable = eqx.field(static=True)
+    descent: optx.AbstractDescent = MarquardtDescent()
+    search: optx.AbstractSearch = NielsenTrustRegion()
+    max_steps: int | Int[Array, ""] = 100
+    rows: int = eqx.field(static=True, default=128)
+    progress: Callable | None = eqx.field(static=True, default=None)
+    rtol: ClassVar[float] = 0.0
+    atol: ClassVar[float] = 0.0
+    norm: ClassVar[Callable] = staticmethod(optx.max_norm)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> State:
+        struct = eqx.filter_eval_shape(self._linearise, y, args)
+        info = eqx.filter_eval_shape(self._info, struct)
+        zero, rows = zero_tangent(self.plan), self.rows
+        nothing = jnp.full(rows, jnp.nan)
+        return State(
+            first=jnp.asarray(True), known=_zeros(struct), change=zero, trial=y,
+            step_size=jnp.asarray(jnp.inf), descent=self.descent.init(zero, info),
+            search=self.search.init(zero, info), approach=Approach.begin(),
+            termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
+            history=History(nothing, nothing, jnp.zeros(rows, bool)),
+        )  # fmt: skip
+
+    def step(self, fn, y, args, options, state: State, tags):
+        before, zero = self._info(state.known), zero_tangent(self.plan)
+        residual, aux = fn(state.trial, args)
+        tried = optx.FunctionInfo.Eval(half_square(self.plan, residual))
+        step_size, accept, _, search = self.search.step(
+            state.first, zero, state.change, before, tried, state.search
+        )
+        promised, kept = promise(before, state.change, tried.f)
+        y, known = self._accepted_point(accept, y, args, state)
+        step_size, approach = state.approach.choose_step(
+            step_size, state.step_size, state.first, accept, promised, kept, known.cost
+        )
+        change, finite = self._next_change(known, step_size, state.descent)
+        termination, approach = approach.judge(
+            self.tolerance, step_size, finite, -dot(self.plan, known.gradient, change),
+            state.first, accept, before.f, known.cost, tried.f,
+        )  # fmt: skip
+        trial = self.retract(self.plan, y, change)
+        y = jax.tree.map(lambda old, new: jnp.where(termination == SETTLED, new, old), y, trial)
+        self._report(state, tried.f)
+        return y, State(
+            first=jnp.asarray(False), known=dataclasses.replace(known, damping=1 / step_size),
+            change=change, trial=trial, step_size=step_size, descent=state.descent, search=search,
+            approach=approach, termination=termination, steps=state.steps + 1,
+            history=state.history.with_row(state.steps, tried.f, 1 / state.step_size, accept),
+        ), aux  # fmt: skip
+
+    def terminate(self, fn, y, args, options, state: State, tags):
+        ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
+        return ended, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state: State, tags, result):
+        # optimistix ends the loop at non-finite unknowns before any step.
+        termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
+        stats = {
+            "termination": termination, "iterations": state.steps, "history": state.history,
+        }  # fmt: skip
+        return y, aux, stats
+
+    def _linearise(self, values: Values, laid: Laid) -> Known:
+        equations = normal_equations(self.declared, self.plan, values, laid)
+        return Known(*equations, damping=jnp.asarray(0.0))
+
+    def _info(self, known: Known) -> Info:
+        """The information passed to searches and descents."""
+        normal, noise = Normal(self.plan, known.normal), self.tolerance.noise(known.cost)
+        return Info(known.cost, known.gradient, normal, known.damping, noise)
+
+    def _accepted_point(self, accept, y, args, state: State):
+        """The last accepted point and its quantities: the one tried, or the old one."""
+        return jax.lax.cond(
+            accept,
+            lambda: (state.trial, self._linearise(state.trial, args)),
+            lambda: (y, state.known),
+        )
+
+    def _next_change(self, known: Known, step_size, descent_state):
+        """The descent's step from the accepted point, zero if it cannot be computed."""
+        asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
+        change, _ = self.descent.step(step_size, asked)
+        finite = total(self.plan, 1 - _all_finite(change).astype(int)) == 0
+        return jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change), finite
+
+    def _report(self, state: State, cost):
+        if self.progress is not None:
+            jax.debug.callback(self.progress, state.steps, cost, 1 / state.step_size)
+
+
+class NoAdjoint(optx.AbstractAdjoint):
+    """Run the loop without derivatives: they are attached to its result (`derivatives.py`)."""
+
+    def apply(self, primal_fn, rewrite_fn, inputs, tags):
+        loop = lambda cond, body, init, max_steps: jax.lax.while_loop(cond, body, init)
+        return primal_fn((*inputs, loop))
+
+
+V = TypeVar("V")
+
+
+class Minimum(eqx.Module, Generic[V]):
+    """The end of the loop: unknowns (tables, or those of a network), termination
+    (`stopping.TERMINATIONS`), number of steps, history."""
+
+    values: V
+    termination: Int[Array, ""]
+    iterations: Int[Array, ""]
+    history: History
+
+
+def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
+    """Run the solver from `start` by `optimistix.least_squares`; no derivatives."""
+    laid = lay_out_data(solver.plan, data)
+    fn = lambda values, laid: residuals(solver.declared, solver.plan, values, laid)
+    solution = optx.least_squares(
+        fn, solver, start, laid, max_steps=None, adjoint=NoAdjoint(), throw=False
+    )
+    stats = solution.stats
+    return Minimum(solution.value, stats["termination"], stats["iterations"], stats["history"])
+
+
+find = eqx.filter_jit(minimise)
+"""`minimise`, compiled once for all callers."""
+
+
+def half_square(plan: Plan, residual) -> Float[Array, ""]:
+    """½·vᵀPv of all devices."""
+    return total(plan, 0.5 * sum((jnp.vdot(r, r) for r in residual), jnp.zeros(())))
+
+
+def _zeros(struct):
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
+
+
+def _all_finite(tree) -> Bool[Array, ""]:
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()

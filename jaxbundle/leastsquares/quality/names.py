@@ -1,0 +1,118 @@
+"""Names of unknowns for reports, and the names of undetermined ones."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.leastsquares.datum.by_table import directions_of_motions
+from jaxbundle.leastsquares.datum.conditions import open_directions
+from jaxbundle.leastsquares.equations.elimination import reduced_system
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
+from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
+from jaxbundle.types import present
+
+INDETERMINATE = 1e-12
+"""Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions."""
+SHARE = 0.05
+"""An unknown with a larger part in undetermined directions is listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Name:
+    """One unknown: kind and id of its owner, and its parameter."""
+
+    kind: str
+    id: str
+    parameter: str
+
+    def __str__(self) -> str:
+        return f"{self.parameter} of {self.kind} {self.id}"
+
+
+def place_of(problem: Problem, group: str, row: int, column: int) -> tuple[str, int, int]:
+    """Table, row and direction of a column of a row of a group."""
+    for m in problem.plan.groups[group].members:
+        if m.start <= column < m.start + m.width:
+            return m.table, row if m.rows is None else int(m.rows[row]), column - m.start
+    raise IndexError(column)
+
+
+def name_of(problem: Problem, group: str, row: int, column: int) -> Name:
+    """The unknown in a column of a row of a group."""
+    name, row, direction = place_of(problem, group, row, column)
+    table = problem.table(name)
+    return Name(table.title, table.label(row), table.parameter(direction))
+
+
+def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
+    """Group, row and column of all unknowns of the reduced system, in its order."""
+    return [
+        (g, row, column) for g in problem.plan.kept
+        for row, column in np.ndindex(problem.plan.groups[g].free.shape)
+    ]  # fmt: skip
+
+
+def undetermined(
+    problem: Problem, values: Values, threshold: float = INDETERMINATE
+) -> list[str]:
+    """The unknowns that the observations do not determine, most affected first. `threshold`: of the
+    scaled eigenvalues; a larger one also finds unknowns that are hardly separated."""
+    S, V, G = scaled_system(problem, values)
+    rows = [] if V is None else _undetermined_rows(problem, V)
+    if not np.isfinite(S).all():
+        return rows
+    if G.shape[1]:  # The datum is fixed separately.
+        q, _ = np.linalg.qr(G)
+        S = S + q @ q.T
+    eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
+    null = vectors[:, eigenvalues < threshold * max(1.0, eigenvalues[-1:].sum())]
+    share, names = (null**2).sum(1), kept_unknowns(problem)
+    order = np.argsort(-share, kind="stable")
+    return [str(name_of(problem, *names[i])) for i in order if share[i] > SHARE] + rows
+
+
+def scaled_system(problem: Problem, values: Values):
+    """S scaled by its diagonal before elimination, in the order of
+    `kept_unknowns`; V of the eliminated rows (None: there are none); the open directions."""
+    plan, data = problem.plan, pad_data(problem, problem.data)
+    values = pad_values(problem, values)
+    moves = None if plan.datum is None else directions_of_motions(problem.declared, values)
+    found = _scaled(problem.declared, plan, values, data, moves)
+    S, V, G = jax.tree.map(np.asarray, found)
+    return np.tril(S) + np.tril(S, -1).T, V, G
+
+
+@eqx.filter_jit
+def _scaled(declared: Declared, plan: Plan, values: Values, data: Data, moves):
+    *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    S, scale, *_ = reduced_system(Normal(plan, blocks), regular=False)
+    G = jnp.zeros((sum(plan.groups[g].free.size for g in plan.kept), 0))
+    if plan.datum is not None:
+        open_ones = open_directions(declared, plan, values, moves)
+        rows = [open_ones[g] / scale[g][..., None] for g in plan.kept]
+        G = jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in rows])
+    return S.matrix(plan, plan.kept), blocks.eliminated, G
+
+
+def _undetermined_rows(problem: Problem, V) -> list[str]:
+    """Eliminated rows that are undetermined even if all other unknowns are given."""
+    e = present(problem.plan.eliminated)
+    group, table = problem.plan.groups[e], problem.table(e)
+    finite = np.isfinite(V).all((1, 2))
+    V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))
+    held = 1.0 - np.asarray(group.free)
+    V = V + held[:, :, None] * np.eye(V.shape[1])
+    diagonal = np.diagonal(V, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
+    weak = np.flatnonzero(finite & (smallest < INDETERMINATE))
+    rows = group.members[0].rows
+    rows = weak if rows is None else np.asarray(rows)[weak]
+    all_of = ", ".join(table.parameter(j) for j in range(table.space.width))
+    return [f"{all_of} of {table.title} {table.label(int(row))}" for row in rows]
+

@@ -1,0 +1,150 @@
+"""Robust estimation by iterative reweighting.
+
+The length t of the residual vector of an observation, in units of its σ and of a robust scale s,
+gives it the weight
+
+    Huber    w = min(1, k/t)               k = 3           Huber (1964)
+    Cauchy   w = 1/(1 + (t/k)²)            k = 2.5486      Holland and Welsch (1977)
+    Tukey    w = (1 − (t/k)²)², t < k      k = 5.1230      Beaton and Tukey (1974)
+
+and the problem is adjusted again with p = w/σ² until the weights converge (Krarup, Juhl and Kubik,
+1980). The scale is a posteriori, so only the ratios of the given σ matter:
+
+    s = median(t)/m·√(n/r),     m the median length of normal residuals,
+
+a median absolute deviation (MAD), corrected for the redundancy r of n observations. A few blunders
+do not change it; too small σ do.
+
+With ψ(t) = w·t the efficiency for normal errors in the plane is E[ψ' + ψ/t]²/(2·E[ψ²]), t² ~ χ²₂
+(Maronna, 1976): 0.95 for Cauchy's and Tukey's k. Huber's k leaves 99 of 100 good observations
+unchanged, so that good data give the least-squares estimate. It has a unique solution and provides
+start values and scale for the other two, which discard outliers.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.problem import Problem, with_data
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile, critical_length
+from jaxbundle.leastsquares.quality.snooping import Adjust, readjust
+from jaxbundle.leastsquares.solution import Solution
+
+LEAST_WEIGHT = 1e-6
+"""Smallest weight, so that the problem stays determined."""
+RESTING, NEARLY_RESTING = 1e-4, 1e-3
+"""Weights with a smaller RMS change have converged; the limit is looser for those that only start
+another estimator."""
+ROUNDS = 100
+
+
+def huber(t: Float[np.ndarray, " n"], k: float = 3.0) -> Float[np.ndarray, " n"]:
+    """Weights of residual lengths t in units of their σ."""
+    return np.minimum(1.0, k / np.maximum(t, k))
+
+
+def cauchy(t: Float[np.ndarray, " n"], k: float = 2.5486) -> Float[np.ndarray, " n"]:
+    """Weights of residual lengths t in units of their σ."""
+    return 1 / (1 + (t / k) ** 2)
+
+
+def tukey(t: Float[np.ndarray, " n"], k: float = 5.1230) -> Float[np.ndarray, " n"]:
+    """Weights of residual lengths t in units of their σ."""
+    return np.maximum(1 - np.minimum(t / k, 1.0) ** 2, 0.0) ** 2
+
+
+_WEIGHT = {"huber": huber, "cauchy": cauchy, "tukey": tukey}
+
+
+@dataclasses.dataclass(frozen=True)
+class Suspect:
+    """An observation whose residual exceeds the critical length: its set, row there, the length t
+    of its residual in units of σ and scale, its weight factor."""
+
+    set: int
+    row: int
+    test: float
+    weight: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Reweighted:
+    """The solution with the last weights; by set their factors w; the scale a posteriori; whether
+    the weights converged; `lengths` t in units of σ and scale."""
+
+    found: Solution
+    weights: dict[int, Float[np.ndarray, " n"]]
+    scale: float
+    rests: bool
+    lengths: dict[int, Float[np.ndarray, " n"]]
+
+    def suspects(self, significance: float = 0.001) -> list[Suspect]:
+        """Observations with residuals above the critical length, the worst first; `significance` is
+        the probability of any in data without blunders."""
+        used = {o: (self.found.problem.weights(o) > 0).any(1) for o in self.lengths}
+        critical = critical_length(significance, sum(int(u.sum()) for u in used.values()))
+        found = [
+            Suspect(o, row, float(t[row]), float(self.weights[o][row]))
+            for o, t in self.lengths.items()
+            for row in np.flatnonzero(used[o] & (t > critical)).tolist()
+        ]
+        return sorted(found, key=lambda s: -s.test)
+
+
+def residual_lengths(found: Solution) -> dict[int, Float[np.ndarray, " n"]]:
+    """|v/σ| of the observations that are removed or weighted as a whole, by set."""
+    kinds = enumerate(given.kind.snooped for given in found.problem.observations)
+    return {
+        o: np.sqrt((found.residuals[o] ** 2).sum(1)) for o, policy in kinds if policy == "whole"
+    }
+
+
+def robust_scale(problem: Problem, lengths: dict[int, Float[np.ndarray, " n"]]) -> float:
+    """s of residual lengths |v/σ| of observations, by set; never 0."""
+    normal = []  # |v/σ| by the median of the lengths of as many normal residuals
+    for o, t in lengths.items():
+        weight = problem.weights(o)
+        used = (weight > 0).any(1)
+        normal.append(t[used] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
+    counts = problem.counts
+    share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
+    scale = np.median(np.concatenate(normal)) / math.sqrt(max(share, 1e-3))
+    return max(float(scale), np.finfo(float).tiny)
+
+
+def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: str) -> Reweighted:
+    """Adjust with the weights of an estimator until they converge.
+
+    **Arguments:** `adjust_from(problem, start)`: the solution of a changed problem; `estimator`:
+    one of `ESTIMATORS`.
+    """
+    given, scale, rests = problem.data.weight, 1.0, False
+    t = residual_lengths(Solution(problem, values))
+    weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}
+    move = lambda problem, values, adjust_from: adjust_from(problem, values)
+    for name in dict.fromkeys(("huber", estimator)):
+        resting = RESTING if name == estimator else NEARLY_RESTING
+        for _ in range(ROUNDS):
+            scale = robust_scale(problem, t) if name == "huber" else scale
+            before = w
+            w = {o: np.maximum(_WEIGHT[name](x / scale), LEAST_WEIGHT) for o, x in t.items()}
+            change = np.concatenate([w[o] - before[o] for o in w])
+            rests = bool(np.sqrt(np.mean(change**2)) < resting)
+            if rests:
+                break
+            weight = tuple(
+                np.asarray(p) * _root(w[o], p) if o in w else p for o, p in enumerate(given)
+            )
+            weighted = with_data(problem, dataclasses.replace(problem.data, weight=weight))
+            # The first start values may be far from a solution.
+            values = move(weighted, values, adjust_from).values
+            move, t = readjust, residual_lengths(Solution(problem, values))
+    found = adjust_from(weighted, values)
+    return Reweighted(found, w, scale, rests, {o: x / scale for o, x in t.items()})
+
+
+def _root(w, weight):
+    return np.sqrt(w).reshape(-1, *(1,) * (np.ndim(weight) - 1))

@@ -1,0 +1,316 @@
+"""Data snooping: remove blunders found by the test and adjust again, until none is left.
+
+    |w|  > z(1 − α/2)                        Baarda (1968): each residual separately
+    |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
+
+One blunder affects the residuals of its neighbours. So only observations that cannot mask each
+other are removed together (`separation.py`): of every eliminated row only the worst, of a kept row
+only those that stay significant whatever the influence of the worse ones, and only those at least
+half as bad as the worst of all. Observations without an eliminated row, or with residuals tested
+individually, are removed alone. An eliminated row left with too few residuals is excluded too.
+
+If observations of a row are inseparable, as the two of a two-ray point, nothing decides which is
+wrong: when no others are left, all of them are removed and listed as one ("either of").
+
+Finally every removed observation is tested against the adjustment without it, by its predicted
+residual v with variance σ²·(1 + h), and restored if it passes. Removed observations keep their rows
+with weight zero, so nothing is compiled again.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.arguments import number, one_of
+from jaxbundle.choices import TESTS
+from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.problem import Problem, hold, with_data
+from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
+from jaxbundle.leastsquares.solution import Solution, take_step
+
+TOGETHER = 0.5
+"""Observations are removed together with the worst if their test is at least this fraction of
+its."""
+STEPPING = 20_000
+"""Problems with at least this many observations take single steps between removals."""
+
+Adjust = Callable[[Problem, Values], Solution]
+"""The solution of a problem from start values; raises if there is none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Removed:
+    """A removed observation: its set, row, residual (None: all) and test value. `others`: rows of
+    inseparable observations, removed with it."""
+
+    set: int
+    row: int
+    residual: int | None
+    test: float
+    others: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """All rows that were removed."""
+        return (self.row, *self.others)
+
+
+def check_test(test: str | None, significance: float, option: str = "") -> None:
+    """Refuse an unknown test, and a level that is not a probability; `option` precedes the names in
+    the message.
+
+    **Raises:** `InputError`.
+    """
+    one_of(f"{option}snooping", test, TESTS, none=True)
+    number(f"{option}significance", significance, "a number between 0 and 1", lambda a: 0 < a < 1)
+
+
+def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
+    """The solution of a problem with slightly changed weights. A large one takes a single
+    Gauss–Newton step if this decreases vᵀPv, with an error of the square of the change; for a small
+    one compiling the step would take longer. A final result must be adjusted once more."""
+    if sum(given.number for given in problem.observations) >= STEPPING:
+        before = Solution(problem, values)
+        after = Solution(problem, take_step(problem, values))
+        if after.vtpv <= before.vtpv:
+            return after
+    return adjust_from(problem, values)
+
+
+def snoop(
+    found: Solution,
+    adjust_from: Adjust,
+    *,
+    test: str = "pope",
+    significance: float = 0.001,
+    limit: int | None = None,
+    doubtful: Sequence[Removed] = (),
+) -> tuple[Solution, list[Removed]]:
+    """Remove blunders, the worst first.
+
+    **Arguments:**
+
+    - `found`: the solution with all observations.
+    - `adjust_from(problem, start)`: the solution of a changed problem.
+    - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
+    - `significance`: α, two-sided: for `"pope"` the probability of removing anything from data
+      without blunders, for `"baarda"` that of removing one residual. Observations of one eliminated
+      row that are inseparable at this level are removed together.
+    - `limit`: maximum number of removals.
+    - `doubtful`: initially removed observations, restored if they pass in the end.
+
+    **Returns:** the solution without the removed observations, and what was removed in the order
+    of removal.
+
+    **Raises:** `InputError` for an unknown test, or a level that is not a probability.
+    """
+    check_test(test, significance)
+    whole, removed, returned = found.problem, [*doubtful], set()
+    touched = _Touched(whole)
+    if removed:
+        found = adjust_from(without(whole, removed), found.values)
+    while found.problem.counts.redundancy >= 2:
+        unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
+        counts = found.problem.counts
+        critical = critical_w(
+            test, significance, touched.tested(found.problem), counts.redundancy, found.sigma0
+        )
+        worst = _worst(found, touched, unit, critical / unit, normal_quantile(1 - significance / 2))
+        if worst and limit is not None:
+            worst = worst[: max(limit - len(removed), 0)]
+        if worst:
+            removed += worst
+        else:
+            passing = _passing(whole, found, touched, removed, critical) - returned
+            kept = list(_without_passing(removed, passing))
+            if kept == removed:
+                break
+            returned |= passing
+            removed = kept
+        found = readjust(without(whole, removed), found.values, adjust_from)
+    if doubtful:
+        removed = list(_tested(whole, found, removed))
+    return adjust_from(found.problem, found.values) if removed else found, removed
+
+
+class _Touched:
+    """The rows touched by tested observations: by set the eliminated row of each (−1: none) and an
+    index of its first kept row; `whole`: sets whose observations are removed as a whole."""
+
+    def __init__(self, problem: Problem):
+        self.eliminated = problem.plan.eliminated
+        self.own: dict[int, Int[np.ndarray, " n"]] = {}
+        self.shared: dict[int, Int[np.ndarray, " n"]] = {}
+        first = np.cumsum([0, *(t.rows for t in problem.tables)])
+        start = {t.name: n for t, n in zip(problem.tables, first)}
+        moves = {t.name: t.free.any(1) for t in problem.tables}
+        stays = problem.kept_rows
+        for o, given in enumerate(problem.observations):
+            own, shared = np.full(given.number, -1), np.full(given.number, -1)
+            for name, rows in zip(given.kind.of, given.rows):
+                if name == self.eliminated:
+                    own = np.where(moves[name][rows] & ~stays[rows], rows, own)
+                elif moves[name].any():
+                    shared = np.where(shared < 0, start[name] + rows, shared)
+            self.own[o], self.shared[o] = own, shared
+        kinds = [given.kind.snooped for given in problem.observations]
+        self.whole = [o for o, policy in enumerate(kinds) if policy == "whole"]
+        self.single = [o for o, policy in enumerate(kinds) if policy == "single"]
+
+    def tested(self, problem: Problem) -> int:
+        """The number of tested residuals."""
+        weight = [problem.weights(o) for o in (*self.whole, *self.single)]
+        return sum(int((w > 0).sum()) for w in weight)
+
+
+def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> list[Removed]:
+    """The observations to remove now, the worst first; tests in `unit`.
+
+    Observations of a row are separable if the test of the suspect exceeds `apart` without the
+    other."""
+    tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
+    alone = [Removed(o, *_place(tests[o]), tests[o].max(initial=0.0)) for o in touched.single]
+    together, of, row = [], [], []
+    for o in touched.whole:
+        of_one = tests[o].max(1, initial=0.0)
+        lonely = np.where(touched.own[o] < 0, of_one, 0.0)
+        alone.append(Removed(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
+        together.append(np.where(touched.own[o] < 0, 0.0, of_one))
+        of.append(np.full(len(of_one), o))
+        row.append(np.arange(len(of_one)))
+    together, of, row = (np.concatenate([*x, []]) for x in (together, of, row))
+    of, row = of.astype(int), row.astype(int)
+    worst = max(alone, key=lambda r: r.test, default=None)
+    other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
+    if worst and other > max(critical, largest):
+        return [worst]
+    at = np.flatnonzero(together > max(critical, other, TOGETHER * largest))
+    if not len(at):
+        return []
+    pick = lambda by_set: np.array([by_set[o][k] for o, k in zip(of[at], row[at])])
+    chosen = at[choose_together(
+        together[at], pick(touched.own), pick(touched.shared), pick(_leverage(found)), critical,
+    )]  # fmt: skip
+    rays = _Neighbours(found, touched, unit)
+    others = {
+        k: rays.alternatives(int(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
+    }
+    certain = [k for k in others if not others[k]]
+    return [
+        Removed(int(of[k]), int(row[k]), None, float(together[k]), others[k])
+        for k in certain or others
+    ]
+
+
+def _place(tests):
+    """Row and residual of the largest."""
+    row, residual = np.unravel_index(tests.argmax(), tests.shape)
+    return int(row), int(residual)
+
+
+def _leverage(found: Solution):
+    """h̃/r of every observation, the largest of its residuals: h minus the part of its eliminated
+    row alone."""
+    tested, tiny = found.reliability, np.finfo(float).tiny
+    return {
+        o: (np.clip(1 - r - tested.own[o], 0.0, None) / np.maximum(r, tiny)).max(1, initial=0.0)
+        for o, r in tested.redundancy.items()
+    }
+
+
+class _Neighbours:
+    """The observations of every eliminated row, to test their separability."""
+
+    def __init__(self, found: Solution, touched: _Touched, unit: float):
+        self.found, self.unit, self.sets = found, unit, touched.own
+        self.order, self.sorted = {}, {}
+        for o, own in touched.own.items():
+            used = np.flatnonzero((found.problem.weights(o) > 0).any(1) & (own >= 0))
+            self.order[o] = used[np.argsort(own[used], kind="stable")]
+            self.sorted[o] = own[self.order[o]]
+
+    def alternatives(self, o: int, row: int, critical: float, apart: float) -> tuple[int, ...]:
+        """Inseparable rows of the same set and eliminated row."""
+        own = self.sets[o][row]
+        rows = {
+            s: self.order[s][slice(*np.searchsorted(self.sorted[s], [own, own + 1]))]
+            for s in (o, *(s for s in self.sets if s != o))
+        }
+        E, v = self.found.by_eliminated, self.found.residuals
+        width = next(iter(E.values())).shape[2]
+        design = np.concatenate([E[s][k].reshape(-1, width) for s, k in rows.items()])
+        residual = np.concatenate([v[s][k].ravel() for s, k in rows.items()]) / self.unit
+        size = v[o].shape[1]
+        where = [np.arange(size) + size * i for i in range(len(rows[o]))]
+        suspect = int(np.flatnonzero(rows[o] == row)[0])
+        alternatives = find_alternatives(design, residual, where, suspect, critical, apart)
+        return tuple(rows[o][alternatives].tolist())
+
+
+def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
+    """Sets, rows and residuals of removed observations that agree with the adjustment without
+    them."""
+    if not removed:
+        return set()
+    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
+    if touched.eliminated is not None:
+        free = lambda problem: problem.table(touched.eliminated).free.any(1)
+        aside = free(whole) & ~free(found.problem)
+        for o, own in touched.own.items():
+            tests[o][(own >= 0) & aside[own]] = np.inf
+    value = lambda r, row: tests[r.set][row, r.residual if r.residual is not None else slice(None)]
+    return {
+        (r.set, row, r.residual) for r in removed for row in r.rows
+        if np.max(value(r, row)) < critical
+    }  # fmt: skip
+
+
+def _tested(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
+    """The same with the tests of initially doubtful observations."""
+    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
+    for r in removed:
+        yield r if np.isfinite(r.test) else dataclasses.replace(
+            r, test=float(tests[r.set][r.row].max())
+        )
+
+
+def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
+    """The observations that stay removed. If all inseparable ones pass individually, they still
+    contradict each other and all stay removed."""
+    for r in removed:
+        stay = tuple(row for row in r.rows if (r.set, row, r.residual) not in passing)
+        if stay == r.rows or (not stay and r.others):
+            yield r
+        elif stay:
+            yield dataclasses.replace(r, row=stay[0], others=stay[1:])
+
+
+def _finite(tests) -> Float[np.ndarray, "..."]:
+    """|tests|, 0 if there is none."""
+    tests = np.abs(np.asarray(tests))
+    return np.where(np.isfinite(tests), tests, 0.0)
+
+
+def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
+    """The problem with the weights of removed observations set to zero; eliminated rows left with
+    too few residuals are excluded."""
+    weight = [np.array(w) for w in problem.data.weight]
+    for r in removed:
+        weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0
+    e, lone = problem.plan.eliminated, []
+    if e is not None and removed:
+        touched, width = _Touched(problem), problem.table(e).space.width
+        left = np.zeros(problem.table(e).rows)
+        for o, own in touched.own.items():
+            rows = (np.asarray(problem.weights(o, weight[o])) > 0).sum(1)
+            np.add.at(left, own[own >= 0], rows[own >= 0])
+        changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
+        lone = [row for row in sorted(changed) if left[row] < width]
+        for o, own in touched.own.items():
+            weight[o][np.isin(own, lone)] = 0.0
+    data = dataclasses.replace(problem.data, weight=tuple(weight))
+    problem = with_data(problem, data)
+    return problem if e is None or not lone else hold(problem, e, lone)

@@ -1,0 +1,173 @@
+"""What observations determine in name only: the weakest directions, in the words of the unknowns.
+
+The σ of an unknown says little by itself; compared with an *extent* e of what it measures it does:
+a place with a distance, an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
+largest eigenvalues μ of
+
+    A = E⁻¹·S·Q·Sᵀ·E⁻¹
+
+belong to the weakest directions, and no σ is larger than σ0·√μ₁ extents. They are found by subspace
+iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the factor
+that exists, never an inverse; where the cofactors are at hand, the σ are read from these. What has
+no extent is not judged. Eliminated rows count by the σ they have where everything else is given.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.leastsquares.datum.conditions import s_transform, s_transform_transposed
+from jaxbundle.leastsquares.equations.elimination import Factor, factorise, lift, solve
+from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.equations.reduced import flat, split
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.rows import lay_out_data
+from jaxbundle.leastsquares.problem import Problem
+from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
+from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
+
+VAGUE = 50.0
+"""An unknown whose σ is above a fiftieth of its extent is determined in name only."""
+FAR = 10.0
+"""A row whose σ is above a tenth of its extent: errors of the second order in it are as large as
+those that least squares propagate."""
+DIRECTIONS, ROUNDS = 6, 8
+"""Of the subspace iteration: directions looked for, products with A."""
+SMALL = 1000
+"""Reduced systems with fewer unknowns have their cofactors computed for this."""
+
+Extents = dict[str, Float[np.ndarray, "rows *width"]]
+"""1/e by table, [rows, width]; of the eliminated table e [rows], 0 where a row is not judged."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Weak:
+    """`names` of kept unknowns with a σ above 1/`VAGUE` of their extent, the weakest first;
+    `worst`: the largest of these ratios. `rows`: eliminated ones with a σ above 1/`FAR` of theirs,
+    of so many judged."""
+
+    names: tuple[str, ...] = ()
+    worst: float = 0.0
+    rows: tuple[int, ...] = ()
+    of: int = 0
+
+
+def find_weak(found: Solution, extents: Extents, sigma0: float) -> Weak:
+    """The weak directions of a solution; none are looked for where there is no factor."""
+    if found.problem.plan.reduction not in FACTORS:
+        return Weak()
+    at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL
+    return _weak(found, found.factor, extents, sigma0, at_hand)
+
+
+def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
+    """The weak directions where iterations ended without a solution, by σ a priori: the normal
+    equations are lifted a little, so that there is a factor."""
+    if found.problem.plan.reduction not in FACTORS:
+        return Weak()
+    factor = with_plan(_lifted_factor(*found.given), found.problem.plan)
+    return _weak(found, factor, extents, 1.0)
+
+
+@eqx.filter_jit
+def _lifted_factor(declared, plan, values, data) -> Factor:
+    *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    return without_plan(factorise(lift(Normal(plan, blocks))))
+
+
+def _weak(found: Solution, factor: Factor, extents: Extents, sigma0: float, at_hand=False) -> Weak:
+    problem, plan = found.problem, found.problem.plan
+    sigma0 = sigma0 if np.isfinite(sigma0) else 1.0
+    if not np.isfinite(np.asarray(factor.reduced.pivots)).all():
+        return Weak()
+    far, judged = _far_rows(problem, factor, extents, sigma0)
+    if far is None:
+        return Weak()
+    per_extent = _per_extent(problem, extents)
+    if at_hand:
+        own = found.cofactors.own
+        variance = {g: np.diagonal(np.asarray(own[g]), axis1=1, axis2=2) for g in plan.kept}
+        sigma = np.sqrt(np.asarray(flat(plan.kept, variance))) * per_extent
+    else:
+        sigma = _sigma_of_weakest(found, factor, per_extent)
+    sigma = sigma0 * sigma
+    order = np.argsort(-sigma, kind="stable")[: (VAGUE * sigma > 1).sum()]
+    names = kept_unknowns(problem) if len(order) else []
+    return Weak(
+        tuple(str(name_of(problem, *names[k])) for k in order), float(sigma.max(initial=0.0)),
+        far, judged,
+    )  # fmt: skip
+
+
+def _far_rows(problem: Problem, factor: Factor, extents: Extents, sigma0: float):
+    """Eliminated rows with large σ, the worst first, and how many were judged; None where their
+    factor is not finite."""
+    e = problem.plan.eliminated
+    if e is None or e not in extents:
+        return (), 0
+    L, members = np.asarray(factor.lower_inverse), problem.plan.groups[e].members
+    if not np.isfinite(L).all():
+        return None, 0
+    size = problem.table(e).rows
+    rows = np.arange(len(L)) if members[0].rows is None else np.asarray(members[0].rows)
+    real = rows < size
+    rows, free = rows[real], np.asarray(problem.plan.groups[e].free)[real].any(1)
+    extent = extents[e][rows]
+    judged = free & (extent > 0)
+    size = np.sqrt((L[real] ** 2).sum((1, 2))) * sigma0
+    ratio = np.where(judged, size / np.where(judged, extent, 1.0), 0.0)
+    far = np.argsort(-ratio, kind="stable")[: (FAR * ratio > 1).sum()]
+    return tuple(rows[far].tolist()), int(judged.sum())
+
+
+def _per_extent(problem: Problem, extents: Extents) -> Float[np.ndarray, " reduced"]:
+    """1/e of the columns of the reduced system; 0 for what is held or has no extent."""
+    plan, found = problem.plan, {}
+    for g in plan.kept:
+        group = plan.groups[g]
+        found[g] = np.zeros(group.free.shape)
+        for m in group.members:
+            if m.table not in extents:
+                continue
+            of = extents[m.table]
+            if of.ndim == 1:  # Kept rows of the eliminated table.
+                of = np.where(of > 0, 1 / np.where(of > 0, of, 1.0), 0.0)[:, None]
+            rows = np.arange(group.rows) if m.rows is None else np.asarray(m.rows)
+            real = np.flatnonzero(rows < len(of))
+            found[g][real, m.start : m.start + m.width] = of[rows[real]]
+        found[g] *= np.asarray(group.free)
+    return np.asarray(flat(plan.kept, found))
+
+
+def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
+    """σ/e (a priori) of the reduced system's columns, as far as the weakest directions give it."""
+    directions = np.random.default_rng(0).standard_normal((DIRECTIONS, len(per_extent)))
+    directions *= per_extent > 0
+    for _ in range(ROUNDS):
+        directions = np.linalg.qr(directions.T)[0].T
+        previous = directions
+        declared, _, values, _ = found.given
+        directions = np.asarray(
+            _products(declared, values, factor, found.moves, per_extent, directions)
+        )
+    mu, turn = np.linalg.eigh(previous @ directions.T)
+    return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
+
+
+@eqx.filter_jit
+def _products(declared, values, factor: Factor, moves, per_extent, directions):
+    """A times each of the directions [m, reduced]."""
+    plan = factor.plan
+    still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
+
+    def product(direction):
+        right = still | split(plan, plan.kept, direction * per_extent)
+        right = s_transform_transposed(declared, plan, values, right, moves)
+        change = s_transform(declared, plan, values, solve(factor, right), moves)
+        return flat(plan.kept, change) * per_extent
+
+    return jax.vmap(product)(directions)
