@@ -1,6 +1,5 @@
 """Whether the input of a command is small, so that compiling takes longer than computing."""
 
-import os
 from pathlib import Path
 
 SMALL = 100_000
@@ -12,9 +11,9 @@ def is_small(path: Path) -> bool:
     folder = path if path.is_dir() else path.parent if path.suffix == ".toml" else None
     total = 0
     try:
-        for file in os.scandir(folder) if folder else [path]:
+        for file in folder.iterdir() if folder else [path]:
             total += file.stat().st_size
-            if total > SMALL or (folder and file.is_dir()):
+            if total > SMALL or file.is_dir():
                 return False
     except OSError:
         return False  # The command says so.
