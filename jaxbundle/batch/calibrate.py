@@ -121,7 +121,7 @@ def calibrate_batch(
 
     def run(portion):
         rows = _solve_portion(*fixed, portion)
-        return rows if snooping is None else _snooped(*fixed, portion, rows, snooping, significance)
+        return rows if snooping is None else _snoop(*fixed, portion, rows, snooping, significance)
 
     parts, done = [], 0
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
@@ -178,7 +178,7 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
     return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
 
 
-def _snooped(
+def _snoop(
     model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
 ) -> dict:
     """The rows of a portion without blunders; only cameras with removed points are solved again.

@@ -133,7 +133,7 @@ def parameters_of(
     **Raises:** `NotSolvedError` where the model cannot be fitted."""
     given = dict(given or {})
     if _by_fit(model):
-        return _fitted(first, xy, image_size, model, free, pixel_size, given) | given
+        return _fit(first, xy, image_size, model, free, pixel_size, given) | given
     found = first.interior
     if model.unit == "px":
         return found | given
@@ -154,7 +154,7 @@ def parameters_of(
     return parameters | given
 
 
-def _fitted(first, xy, image_size, model, free, pixel_size, given) -> dict[str, float]:
+def _fit(first, xy, image_size, model, free, pixel_size, given) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
     if {*given} - {*model.principal_distance}:

@@ -84,9 +84,9 @@ def _ideal(model, known, seen: Sightings, interior):
 
 def _fit(seen, x, y, axes, least_points):
     """Columns (arrays of a view each) of H (2 axes) or P (3), w > 0 at the points; usable views."""
-    X, middle, (size,) = _normalised(seen.weight, _of_views(seen, axes))
+    X, middle, (size,) = _normalise(seen.weight, _of_views(seen, axes))
     X = [jnp.where(jnp.max(jnp.abs(c), 1, keepdims=True) > THIN, c, 0.0) for c in X]
-    (x, y), (mx, my), (k,) = _normalised(seen.weight, (x, y))
+    (x, y), (mx, my), (k,) = _normalise(seen.weight, (x, y))
     solution, usable = _direct_linear(seen.weight, X, x, y)
     h = [*solution, jnp.ones_like(mx)]
     # [(X − X̄)/size, 1] in the units of the object, then x = k·x̃ + mx
@@ -102,7 +102,7 @@ def _of_views(seen, n):
     return [seen.point[:, i] + nil for i in range(n)]
 
 
-def _normalised(weight, axes):
+def _normalise(weight, axes):
     """Coordinates about their mean, of mean square 1 an axis together; mean and size a view."""
     number = jnp.maximum(jnp.sum(weight, 1), 1.0)
     mean = [jnp.sum(jnp.where(weight > 0, a, 0.0), 1) / number for a in axes]

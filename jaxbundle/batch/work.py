@@ -140,7 +140,7 @@ def plan_works(
     folders: dict[str, str] = {}
     for name, path in inputs.items():
         if is_camera_stack(path):
-            works[name] = _stacked(read_camera_stack(path), name, settings)
+            works[name] = _stack(read_camera_stack(path), name, settings)
         elif settings.board is not None and is_photograph_folder(path):
             folders[name] = path
         else:
@@ -154,11 +154,11 @@ def plan_works(
             works["photographs"] = _photographed_rigs(rigs, tuple(folders), settings)
         else:
             found = PhotographFolders(tuple(folders.values()), settings.board, kept, workers)
-            works["photographs"] = _photographed(found, tuple(folders), settings)
+            works["photographs"] = _detect(found, tuple(folders), settings)
     return [*works.values()]
 
 
-def _stacked(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
+def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     brief, of_rigs = settings.brief, settings.as_rigs()
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
@@ -177,7 +177,7 @@ def _stacked(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     return Work(keys, settings.of_cameras(), stack.fingerprint, rigs, portion=RIGS_A_WRITE)
 
 
-def _photographed(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
+def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
     brief, of_rigs = settings.brief, settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.adjusting}
 

@@ -282,10 +282,10 @@ def _with_start_values(network: Network) -> tuple[Network, str]:
     if not lacks_start_values(network):
         return network, ""
     found = orient(network)
-    return _placed(found), found.finding
+    return _place(found), found.finding
 
 
-def _placed(found: Oriented) -> Network:
+def _place(found: Oriented) -> Network:
     """The network with start values; refused if half or more is excluded.
 
     **Raises:** `NotSolvedError`."""

@@ -196,7 +196,7 @@ def compare(
     elif held_by:
         raise InputError("held_by: no similarity is found that could be held by points")
     one, other = (_In(r, f, r.problem, b.problem) for r, f in zip((a, b), frames))
-    return _compared(a, b, one, other, rows, tau, held, significance)
+    return _compare(a, b, one, other, rows, tau, held, significance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -358,7 +358,7 @@ def _call(chosen, values):
     return chosen(values)
 
 
-def _compared(
+def _compare(
     a: Adjustment, b: Adjustment, one: _In, other: _In, rows: _Common, tau, held,
     significance: float,
 ) -> AdjustmentComparison:  # fmt: skip

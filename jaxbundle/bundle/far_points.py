@@ -63,10 +63,10 @@ def minimise_at_any_distance(
         if far is not None:
             found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
             if solved(found.with_factor(), minimum):
-                return found, _joined([*legs, minimum])
+                return found, _join([*legs, minimum])
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]
-    return problem, _joined([*legs, minimise(problem, start, max_steps=left, **options)])
+    return problem, _join([*legs, minimise(problem, start, max_steps=left, **options)])
 
 
 def minimise_with_infinity(
@@ -90,7 +90,7 @@ def minimise_with_infinity(
         released += held & ~there
         changed = (there != held).any()
         if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
-            return problem, _joined(legs)
+            return problem, _join(legs)
         steps = ROUND if changed else 2 * steps
         if changed:
             held = there
@@ -190,7 +190,7 @@ def _unit(problem: Problem) -> float:
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 
 
-def _joined(legs: Sequence[Minimum]) -> Minimum:
+def _join(legs: Sequence[Minimum]) -> Minimum:
     """Several successive minimisations combined into one; each but the first re-evaluates the end
     point of the previous one."""
     if len(legs) == 1:

@@ -38,7 +38,7 @@ def orient(network: Network, *, tolerance: float = TOLERANCE) -> Oriented:
     **Raises:** `InputError` for bad tables; `NotSolvedError` if no image could be oriented.
     """
     require_x64()
-    return find_start_values(network, _adjusted, tolerance)
+    return find_start_values(network, _adjust, tolerance)
 
 
 def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:
@@ -62,7 +62,7 @@ def screen(network: Network) -> Network:
     return find_start_values(network.replace(points=points)).network
 
 
-def _adjusted(network: Network, sights: Sights, model: Model) -> None:
+def _adjust(network: Network, sights: Sights, model: Model) -> None:
     """Adjust a model in place with held interior orientation, using the rays that agree."""
     agree = misclosures(sights, model) < sights.tolerance[sights.image]
     rays = np.bincount(sights.point[agree], minlength=sights.points)

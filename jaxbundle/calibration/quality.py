@@ -241,11 +241,11 @@ def cross_validation(result) -> CrossValidation | None:
     rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
     return CrossValidation(
         rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, (own[0], own[1]),
-        _compared(network.cameras[0], own),
+        _compare(network.cameras[0], own),
     )  # fmt: skip
 
 
-def _compared(camera: Camera, halves) -> Comparison | None:
+def _compare(camera: Camera, halves) -> Comparison | None:
     model = get_model(camera.model)
     try:
         return compare_cameras(

@@ -131,7 +131,7 @@ def stability(
     cameras = [camera for camera, _ in calibrations]
     names = _check(calibrations, at)
     p = np.array([[camera.parameters[name] for name in names] for camera in cameras])
-    C = np.array([_ordered(covariance, names) for _, covariance in calibrations])
+    C = np.array([_order(covariance, names) for _, covariance in calibrations])
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
@@ -179,7 +179,7 @@ def _check(calibrations, at) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _ordered(covariance: Covariance, names):
+def _order(covariance: Covariance, names):
     order = [list(covariance[0]).index(name) for name in names]
     return np.asarray(covariance[1])[np.ix_(order, order)]
 

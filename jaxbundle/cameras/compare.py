@@ -127,7 +127,7 @@ def compare_cameras(
         if rotate:
             weight = near[:, None] * np.abs(step)
             rotation = np.array(_best_turn(other, p, rays, target, weight))
-        there = np.array(_turned(other, p, rotation, rays))
+        there = np.array(_turn(other, p, rotation, rays))
     difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
     length = np.linalg.norm(difference, axis=1)
     known = np.isfinite(length)
@@ -180,7 +180,7 @@ def _unfolded(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarr
 
 
 @partial(jax.jit, static_argnums=0)
-def _turned(model, p, rotation, rays):
+def _turn(model, p, rotation, rays):
     """Images of the rotated rays [n, 2]."""
     R = matrix_from_rotation_vector(rotation)
     return jax.vmap(lambda ray: jnp.stack(project(model, tuple(p), *(R @ ray))))(rays)
@@ -192,7 +192,7 @@ def _best_turn(model, p, rays, xy, weight):
     image."""
 
     def misclosures(rotation, rays, xy, weight):
-        d = weight * (_turned(model, p, rotation, rays) - xy)
+        d = weight * (_turn(model, p, rotation, rays) - xy)
         return jnp.where((weight > 0) & jnp.isfinite(xy), d, 0.0).ravel()
 
     return minimise(misclosures, jnp.add, jnp.zeros(3), (rays, xy, weight), 3)[0]

@@ -54,13 +54,13 @@ def image_grid(low: Numbers, high: Numbers) -> Float[np.ndarray, "points 2"]:
 def rays_of(model: CameraModel, values: Values, xy) -> Float[np.ndarray, "points 3"]:
     """Rays of measured image points; NaN if there are none."""
     with local_x64():
-        return np.asarray(_rays(model, _ordered(model, values), np.asarray(xy, float)))
+        return np.asarray(_rays(model, _order(model, values), np.asarray(xy, float)))
 
 
 def images_of(model: CameraModel, values: Values, rays) -> Float[np.ndarray, "points 2"]:
     """Measured images of rays; NaN if there are none."""
     with local_x64():
-        return np.asarray(_images(model, _ordered(model, values), np.asarray(rays, float)))
+        return np.asarray(_images(model, _order(model, values), np.asarray(rays, float)))
 
 
 def fit_parameters(
@@ -84,7 +84,7 @@ def fit_parameters(
     chosen = [model.parameters.index(name) for name in free or fitted(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with local_x64():
-        start = min((_ordered(model, values) for values in starts), key=lambda p: _finite(cost(p)))
+        start = min((_order(model, values) for values in starts), key=lambda p: _finite(cost(p)))
         if not np.isfinite(cost(start)):
             raise ValueError("no start of the fit has an image of the whole area")
 
@@ -175,7 +175,7 @@ def _finite(cost: float) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def _ordered(model: CameraModel, values: Values):
+def _order(model: CameraModel, values: Values):
     return np.array([values[name] for name in model.parameters], float)
 
 

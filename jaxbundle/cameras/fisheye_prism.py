@@ -38,7 +38,7 @@ CORE = ("fx", "fy", "cx", "cy")
 _angle, _ray = equidistant((0, 1), up=False)
 
 
-def _decentred(x, y, r2, p1, p2):
+def _decentre(x, y, r2, p1, p2):
     return 2 * p1 * x * y + p2 * (r2 + 2 * x * x), 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
 
 
@@ -47,7 +47,7 @@ def thin_prism(p: Parameters, a: Scalar, b: Scalar):
     _, _, _, _, k1, k2, p1, p2, k3, k4, sx1, sy1 = p
     t2 = a * a + b * b
     k = radial((k1, k2, k3, k4), t2)
-    da, db = _decentred(a, b, t2, p1, p2)
+    da, db = _decentre(a, b, t2, p1, p2)
     return a * k + da + sx1 * t2, b * k + db + sy1 * t2
 
 
@@ -63,7 +63,7 @@ def rad_tan(p: Parameters, a: Scalar, b: Scalar):
     factor = radial(k, a * a + b * b)
     g, h = a * factor, b * factor
     d2 = g * g + h * h
-    dg, dh = _decentred(g, h, d2, p1, p0)
+    dg, dh = _decentre(g, h, d2, p1, p0)
     return g + dg + d2 * (s0 + d2 * s1), h + dh + d2 * (s2 + d2 * s3)
 
 

@@ -124,19 +124,19 @@ class CameraModel:
     from_ideal: Formula = dataclasses.field(init=False, compare=False)
 
     def __post_init__(self):
-        for name, value in _completed(self).items():
+        for name, value in _complete(self).items():
             object.__setattr__(self, name, value)
         columns = [self.parameters.index(name) for name in self.principal_distance]
         ideal, ray = IMAGES[self.image](columns, self.axes == "up")
         if self.magnification is not None:
-            ideal, ray = (_magnified(of, columns, self.magnification) for of in (ideal, ray))
+            ideal, ray = (_magnify(of, columns, self.magnification) for of in (ideal, ray))
         formula, back = self.correct or self.distort, self.inverse
         if self.project is not None:
             formula = _of_the_ideal_image(self.project, ray)
         if self.unproject is not None:
             corrected = _to_the_ideal_image(self.unproject, ideal)
             formula, back = (corrected, back) if formula is None else (formula, corrected)
-        assert formula is not None, "checked by _completed"
+        assert formula is not None, "checked by _complete"
         back = back or implicit_inverse(
             formula, self.start or _less_its_origin(formula), self.iterations
         )
@@ -170,7 +170,7 @@ class CameraModel:
         return f"CameraModel({self.name!r})"
 
 
-def _completed(model: CameraModel) -> dict:
+def _complete(model: CameraModel) -> dict:
     """The fields of a model that are not functions, checked, in the form that is kept."""
     if not isinstance(model.name, str) or not model.name.isprintable() or not model.name.strip():
         raise ValueError(f"The name of a camera model must be a text, but is {model.name!r:.60}.")
@@ -235,7 +235,7 @@ def _to_the_ideal_image(unproject: ToRay, ideal: OfRay) -> Formula:
     return lambda p, x, y: ideal(p, *unproject(p, x, y))
 
 
-def _magnified(function, columns, magnification) -> Any:
+def _magnify(function, columns, magnification) -> Any:
     """An ideal image, or its rays, at the scale that the image has on the axis."""
     return lambda p, *at: function({c: p[c] * magnification(p) for c in columns}, *at)
 

@@ -99,7 +99,7 @@ def convert(
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)
-        cameras = _sized(read_cameras(input, models), image_size, pixel_size)
+        cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
             network = network_of_cameras(cameras, str(input)).warn(*fits_told(cameras))
             return _convert_network(network, output, kind, model, measured, force)
@@ -110,7 +110,7 @@ def convert(
     network = read_network(
         input, format=format, overrides=overrides, control=control, models=models
     )
-    network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
+    network = network.replace(cameras=_add_sizes(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind, control)
     _keep_others(output, kind, force)
@@ -154,7 +154,7 @@ def _kind(output: Path, to: str | None) -> str:
     return found
 
 
-def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
+def _add_sizes(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
     """The cameras, with sizes added if missing."""
     given = {"image_size": image_size, "pixel_size": pixel_size}
     made = tuple(

@@ -71,7 +71,7 @@ def stock_problem(problem: Problem):
     **Raises:** `ValueError` if the datum is open: the stock loop has no datum."""
     if problem.counts.datum:
         raise ValueError("the stock solvers have no datum: fix it by held values or observations")
-    declared, plan, scale = _charted(problem.declared), problem.plan, _scale(problem)
+    declared, plan, scale = _chart(problem.declared), problem.plan, _scale(problem)
 
     def fn(y, data: Data):
         change, witness = y
@@ -91,7 +91,7 @@ def values_of(problem: Problem, y) -> Values:
     return without_filling(problem, {n: jax.vmap(charts[n].value)(*v) for n, v in values.items()})
 
 
-def _charted(declared: Declared) -> Declared:
+def _chart(declared: Declared) -> Declared:
     charts = tuple((name, Chart(space)) for name, space in declared.named_spaces)
     return dataclasses.replace(declared, named_spaces=charts)
 

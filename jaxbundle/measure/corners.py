@@ -59,7 +59,7 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
         return _with_other_markers(grey, board)
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    grey, _ = _reduced(need_opencv(), grey, QUICK)
+    grey, _ = _reduce(need_opencv(), grey, QUICK)
     # A part of a board is a board too: the largest is searched first.
     for columns, rows in sorted(near, key=lambda size: -size[0] * size[1]):
         try:
@@ -93,7 +93,7 @@ def largest_chessboard(grey: Grey, board: Board) -> Board | None:
     """The chessboard in the photograph with all its corners, of any number; searched in a
     reduced copy. More columns than rows, or as in `board`."""
     cv2 = need_opencv()
-    grey, _ = _reduced(cv2, grey, QUICK)
+    grey, _ = _reduce(cv2, grey, QUICK)
     least = LEAST["chessboard"]
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     try:
@@ -125,7 +125,7 @@ def _chessboard(cv2, grey, board):
             f"no chessboard of {size[0]} × {size[1]} inner corners found: it must be seen whole, "
             "with a light margin"
         )
-    xy = _refined(cv2, grey, xy.reshape(*board.grid, 2))
+    xy = _refine(cv2, grey, xy.reshape(*board.grid, 2))
     return _first_black(grey, _turned_right(xy), board).reshape(-1, 2)
 
 
@@ -133,14 +133,14 @@ def _in_copies(cv2, grey, seek):
     """The result of `seek` in reduced copies, in pixels of the image; None: nothing found."""
     sides = [side for side in SIDES if side < max(grey.shape)]
     for side in (*sides, max(grey.shape))[: len(SIDES)]:
-        copy, factor = _reduced(cv2, grey, side)
+        copy, factor = _reduce(cv2, grey, side)
         xy = seek(copy)
         if xy is not None:
             return factor * xy.reshape(-1, 2).astype(float) + (factor - 1) / 2
     return None
 
 
-def _reduced(cv2, grey, side):
+def _reduce(cv2, grey, side):
     """The image reduced by a whole factor to the maximum side; and the factor."""
     factor = -(-max(grey.shape) // side)
     if factor < 2:
@@ -150,7 +150,7 @@ def _reduced(cv2, grey, side):
     return cv2.resize(grey[:rows, :columns], size, interpolation=cv2.INTER_AREA), factor
 
 
-def _refined(cv2, grey, xy):
+def _refine(cv2, grey, xy):
     """Refined corners [rows, columns, 2], each in a window without other corners."""
     near = [np.linalg.norm(np.diff(xy, axis=axis), axis=2) for axis in (0, 1)]
     half = int(np.clip(WINDOW * min(d.min() for d in near), SMALLEST, LARGEST))

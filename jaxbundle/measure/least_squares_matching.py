@@ -126,7 +126,7 @@ def match_least_squares(
     x, y = _window(n, dtype)
     # unknowns scaled by their effect at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
-    computed = lambda p: jax.vmap(_computed, (None, None, 0, 0))(p / size, other, x, y)
+    computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
 
     def normal_equations(p):
         # forward, and stored: in reverse, or within the products, grey values are looked up again
@@ -138,7 +138,7 @@ def match_least_squares(
     Q, determined = _inverse(N)
     contrast2 = (p[7] / size[7]) ** 2
     if blur > 0:
-        M = _correlated(jax.jacfwd(computed)(p), n, blur)
+        M = _correlate(jax.jacfwd(computed)(p), n, blur)
         variance = square / (n * n - jnp.trace(Q @ M))
         Q, real = _inverse(N - variance * _of_noise(contrast2, size, x, y, blur))
         determined &= real
@@ -151,7 +151,7 @@ def match_least_squares(
         C = noise * (1 + contrast2) * Q
         if reach:
             J, v = jax.jacfwd(computed)(p), computed(p) - grey
-            C = Q @ _gathered(J * v[:, None], n, reach) @ Q
+            C = Q @ _gather(J * v[:, None], n, reach) @ Q
     p = p / size
     affine = p[:6].reshape(2, 3)
     known = textured & determined & (p[7] > 0)
@@ -227,7 +227,7 @@ def _kept_noise(t):
     return sum(own[abs(i - j)] * a * b for i, a in enumerate(w) for j, b in enumerate(w))
 
 
-def _gathered(g, n, reach):
+def _gather(g, n, reach):
     """Σ K(d)·g(x)·g(x + d)ᵀ over a window of n × n pixels."""
     k = np.arange(n)
     K = jnp.asarray(np.maximum(1 - np.abs(k[:, None] - k) / reach, 0), g.dtype)
@@ -235,7 +235,7 @@ def _gathered(g, n, reach):
     return g.T @ near.reshape(g.shape)
 
 
-def _correlated(J, n, blur):
+def _correlate(J, n, blur):
     """JᵀRJ of a window of n × n pixels."""
     k = np.arange(n)
     K = jnp.asarray(np.exp(-((k[:, None] - k) ** 2) / (4 * blur**2)), J.dtype)
@@ -261,7 +261,7 @@ def _interpolated_noise(p, size, x, y):
     return jnp.sum(_kept_noise(u) * _kept_noise(v)) / 2
 
 
-def _computed(p, image, x, y):
+def _compute(p, image, x, y):
     """h0 + h1·g2 of one pixel of the window."""
     return p[6] + p[7] * grey_value(
         image, p[0] * x + p[1] * y + p[2], p[3] * x + p[4] * y + p[5]

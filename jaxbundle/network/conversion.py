@@ -50,7 +50,7 @@ def convert_cameras(
             cameras.append(camera)
             continue
         mine = of_ray == c
-        made, conversion, shift, step = _converted(camera, model, r0, xy[mine], measured)
+        made, conversion, shift, step = _convert(camera, model, r0, xy[mine], measured)
         xy[mine], sigma[mine] = shift + step * xy[mine], np.abs(step) * sigma[mine]
         cameras.append(made)
         done[camera.id] = conversion
@@ -78,17 +78,17 @@ def convert_one(
     camera: Camera, model: str | CameraModel, r0: float = 0.0
 ) -> tuple[Camera, Conversion]:
     """A camera in the model with this name, or a given one, and its `Conversion`."""
-    made, conversion, _, _ = _converted(camera, model, r0, np.zeros((0, 2)))
+    made, conversion, _, _ = _convert(camera, model, r0, np.zeros((0, 2)))
     return made, conversion
 
 
-def _converted(camera: Camera, model: str | CameraModel, r0: float, xy, measured: bool = False):
+def _convert(camera: Camera, model: str | CameraModel, r0: float, xy, measured: bool = False):
     """The camera, the conversion, and shift and step of its image points."""
     source, target = get_model(camera.model), model_of(model)
     sizes = camera.image_size, camera.pixel_size
     parameters, centre = dict(camera.parameters), np.zeros(2)
     if model == "snavely" and camera.model != "bingo":
-        parameters, centre, sizes = _centred(camera)
+        parameters, centre, sizes = _centre(camera)
     area = None
     if len(xy) and (measured or camera.image_size is None):
         area = xy.min(0) - centre, xy.max(0) - centre
@@ -109,7 +109,7 @@ def _converted(camera: Camera, model: str | CameraModel, r0: float, xy, measured
     return made, conversion, shift - step * centre, step
 
 
-def _centred(camera: Camera):
+def _centre(camera: Camera):
     """The camera with its principal point at the image centre, and how far it was from there."""
     model, parameters = get_model(camera.model), dict(camera.parameters)
     names, size = model.principal_point, camera.image_size or (1, 1)

@@ -206,7 +206,7 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
             parameters=("X", "Y", "Z"),
         ),
     ]
-    sets, given = _observed(network, data, priors, cameras)
+    sets, given = _observe(network, data, priors, cameras)
     taking_part = [f for f in network.further if isinstance(f, RollingShutter)]
     taking_part += [f for f in among(network) if not isinstance(f, RollingShutter)]
     declared = [f.among(network).declare(network, origin) for f in taking_part]
@@ -227,7 +227,7 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     return Declared(tuple(tables), tuple(given), layout, data, origin, motions)
 
 
-def _observed(network: Network, data: Data, priors, cameras: tuple[CameraTable, ...]):
+def _observe(network: Network, data: Data, priors, cameras: tuple[CameraTable, ...]):
     """Image points, control, priors and distances: their rows in the network (`Set`), and the
     observations."""
     images, observations = network.images, network.observations

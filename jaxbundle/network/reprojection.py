@@ -40,7 +40,7 @@ def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
                 if in_pixels and model.unit == "mm":
                     pitch[c] = camera.pixel_size
         rows = np.flatnonzero(np.array([camera.model == name for camera in cameras])[of_ray])
-        off = (_projected(model, network, rows, values) - rays.xy[rows]) / pitch[of_ray[rows]]
+        off = (_project(model, network, rows, values) - rays.xy[rows]) / pitch[of_ray[rows]]
         length[rows] = np.linalg.norm(off, axis=1)
     good = np.isfinite(length)
     number = np.bincount(rays.point[good], minlength=len(network.points))
@@ -49,7 +49,7 @@ def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
         return total / number, "px" if in_pixels else "mm"
 
 
-def _projected(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
+def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
     """The images of the points of some rays, a portion at a time."""
     images, rays = network.images, network.observations
     found = np.zeros((len(rows), 2))

@@ -166,7 +166,7 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
         if task.reliability:
             r = redundancy(declared, plan, data)
             weights = [diagonal_of(w) for w in data.weight[: task.image_sets]]
-            inverse = [_masked(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
+            inverse = [_mask(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
                        for o, w in enumerate(weights)]  # fmt: skip
             return jnp.log(_norm(jnp.concatenate(inverse), POWER)) / 2
         functions, still = task.functions, zero_tangent(plan)
@@ -215,22 +215,22 @@ def _log_measure(index, blocks, mask):
     single = len(blocks) == 1
 
     def mean():
-        return jnp.log(jnp.sum(_masked(variances, there[..., 0])) / size) / 2
+        return jnp.log(jnp.sum(_mask(variances, there[..., 0])) / size) / 2
 
     def worst():
         of_blocks = variances if single else variances.mean(1, keepdims=True)
-        return jnp.log(_norm(_masked(of_blocks, there[..., 0]), POWER)) / 2
+        return jnp.log(_norm(_mask(of_blocks, there[..., 0]), POWER)) / 2
 
     def determinant():
         scale = jnp.sqrt(variances)
         correlation = blocks / (scale[:, :, None] * scale[:, None, :])
         log = jnp.linalg.slogdet(correlation)[1] / 2 + jnp.log(scale).sum(1)
-        return jnp.sum(_masked(log, mask > 0)) / size
+        return jnp.sum(_mask(log, mask > 0)) / size
 
     return jax.lax.switch(index, [mean, worst, determinant])
 
 
-def _masked(x, there):
+def _mask(x, there):
     return jnp.where(there, x, 0.0)
 
 
@@ -257,7 +257,7 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
             )
         return
     start = problem.data.start
-    move = lambda t: functions(_moved(start, t))
+    move = lambda t: functions(_move(start, t))
     slope = np.asarray(jax.jacfwd(move)(jnp.zeros(7)))
     change = np.abs(slope @ np.asarray(datum.gauge))
     size = np.abs(slope) @ np.abs(np.asarray(datum.gauge)) + np.abs(functions(start))[:, None]
@@ -271,7 +271,7 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
         )
 
 
-def _moved(values: Values, t: Float[AnyArray, "7"]) -> Values:
+def _move(values: Values, t: Float[AnyArray, "7"]) -> Values:
     """The unknowns after a small similarity: shifts, rotations, scale."""
     turn = matrix_from_quaternion(quaternion_from_rotation_vector(t[3:6]))
     moved = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]

@@ -122,7 +122,7 @@ def _design_configuration(
     before = _state(pairs, network, start.values, seed)
     best, path, converged = None, [], True
     for attempt in range(starts):
-        begin = _rolled(start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
+        begin = _roll(start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
                         variables, seed + attempt)  # fmt: skip
         end, steps, done = search(pairs, variables, begin, program, ends, max_iterations)
         if not kept(conditions, variables, pairs.problem.origin, end):
@@ -202,7 +202,7 @@ def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
     variables = choose_variables(start.values, DESIGNED[:3], moving, np.zeros(0, int))
     program = make_program(pairs, configuration(pairs, variables))
     position, rotation, target = try_stations(pairs, CANDIDATES, seed)
-    begins = [_placed(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
+    begins = [_place(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
     aims = np.array([program(variables.vector(s), s, ROUGH)[0] for s in begins])
     boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
@@ -275,7 +275,7 @@ def _require_determined(state: State) -> None:
         )
 
 
-def _rolled(start: Start, variables, seed: int) -> Start:
+def _roll(start: Start, variables, seed: int) -> Start:
     """A small roll, so that the search leaves a symmetrical start."""
     x = variables.vector(start)
     if "roll" not in variables.sizes:
@@ -290,11 +290,11 @@ def _elsewhere(pairs: Pairs, start: Start, moving, seed: int) -> Start:
     """The moving stations at random in the room."""
     position, rotation, target = try_stations(pairs, len(moving), seed)
     for row, p, q, t in zip(moving, position, rotation, target):
-        start = _placed(pairs, start, np.array([row]), p, q, t)
+        start = _place(pairs, start, np.array([row]), p, q, t)
     return start
 
 
-def _placed(pairs: Pairs, start: Start, rows, position, rotation, target: int) -> Start:
+def _place(pairs: Pairs, start: Start, rows, position, rotation, target: int) -> Start:
     """Some stations at other positions."""
     values = start.values
     positions, rotations, look = (

@@ -71,7 +71,7 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     random = np.random.default_rng(seed)
     found = []
     for _ in range(draws):
-        values = _adjusted(problem, _measured(exact, random))
+        values = _adjust(problem, _measure(exact, random))
         if values is not None:
             found.append(np.asarray(of(values)) - np.asarray(of(truth)))
     if not found:
@@ -86,7 +86,7 @@ def _points_of(interest):
     return lambda values: np.asarray(values.point)[interest]
 
 
-def _measured(exact: Data, random: np.random.Generator) -> Data:
+def _measure(exact: Data, random: np.random.Generator) -> Data:
     """Simulated data."""
     noisy = {
         name: np.asarray(exact.measured(name))
@@ -97,7 +97,7 @@ def _measured(exact: Data, random: np.random.Generator) -> Data:
     return dataclasses.replace(exact, image_xy=xy, **noisy)
 
 
-def _adjusted(problem: Problem, data: Data) -> Values | None:
+def _adjust(problem: Problem, data: Data) -> Values | None:
     """The adjusted values, in the datum of the problem; None without solution."""
     system = with_data(problem.system, problem.layout.data(data))
     minimum = find_minimum(system)

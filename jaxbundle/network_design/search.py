@@ -121,7 +121,7 @@ def search(
     from scipy.optimize import minimize
 
     margins = station_margins(pairs.conditions, variables, pairs.problem.origin)
-    conditions = () if margins is None else _compiled(margins)
+    conditions = () if margins is None else _compile(margins)
     steps: list[Step] = []
     converged = False
     for softness in rounds:
@@ -153,7 +153,7 @@ def search(
     return start, steps, converged
 
 
-def _compiled(margins):
+def _compile(margins):
     value, slope = eqx.filter_jit(margins), eqx.filter_jit(jax.jacfwd(margins))
     as_numbers = lambda f: lambda x, start: np.asarray(f(jnp.asarray(x), start))
     return ({"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)},)

@@ -96,7 +96,7 @@ class Variables:
             away = (look - position)[self.images]
             rotation = rotation.at[self.images].set(jax.vmap(turned)(rotation[self.images], away))
         if "roll" in parts:
-            rolled = jax.vmap(_rolled)(rotation[self.images], parts["roll"][:, 0])
+            rolled = jax.vmap(_roll)(rotation[self.images], parts["roll"][:, 0])
             rotation = rotation.at[self.images].set(rolled)
         if "targets" in parts:
             point = point.at[self.points].set(parts["targets"] * self.unit)
@@ -115,7 +115,7 @@ def turned(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, 
     return retract_quaternion(q, times * axis)
 
 
-def _rolled(q, roll):
+def _roll(q, roll):
     return retract_quaternion(q, jnp.zeros(3).at[2].set(roll))
 
 

@@ -186,7 +186,7 @@ def simulate_with_truth(
     )  # fmt: skip
     towards = stations.position[image] - points.position[observations.point]
     disturbance = _disturbance(disturb, towards)
-    return Simulation(_measured(truth, begin, sigma_xy, disturbance, rng), truth)
+    return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
 
 
 def _imaged(rays, kept, need):
@@ -231,7 +231,7 @@ def _sigma_of_images(sigma, xy):
     return np.broadcast_to(np.where(sigma > 0, sigma, 1.0), xy.shape).copy()
 
 
-def _measured(truth: Network, begin, noise, disturb, rng) -> Network:
+def _measure(truth: Network, begin, noise, disturb, rng) -> Network:
     """The network as observed: noise, errors of given coordinates, disturbed start values."""
     images, points, distances = truth.images, truth.points, truth.distances
     observations = truth.observations

@@ -53,7 +53,7 @@ def simulate_further(
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
         if isinstance(rows, RollingShutter):
             shift = _moved_image_points(truth, rows, values) - truth.observations.xy
-            network = _shifted(network, truth, shift)
+            network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
             seen = declared.observations[len(declared.layout.sets)]
@@ -89,7 +89,7 @@ def _moved_image_points(truth: Network, rows: RollingShutter, values):
     )
 
 
-def _shifted(network: Network, truth: Network, shift) -> Network:
+def _shift(network: Network, truth: Network, shift) -> Network:
     rays, others = network.observations, truth.observations
     same = len(rays) == len(others) and (rays.image == others.image).all()
     if not (same and (rays.point == others.point).all()):
@@ -104,12 +104,12 @@ def _residuals(declared, seen, values):
         jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], values[name])
         for name, rows in zip(seen.kind.of, seen.rows)
     ]
-    found = np.asarray(_evaluated(seen.kind, tuple(spaces), touched, seen.measured))
+    found = np.asarray(_evaluate(seen.kind, tuple(spaces), touched, seen.measured))
     return found.reshape(np.shape(jax.tree.leaves(seen.measured)[0]))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _evaluated(kind, spaces, touched, measured):
+def _evaluate(kind, spaces, touched, measured):
     def one(touched, measured):
         blocks = [space.prepare(value) for space, value in zip(spaces, touched)]
         return jnp.stack(evaluate(kind, blocks, measured))

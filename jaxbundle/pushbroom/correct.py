@@ -84,14 +84,14 @@ def block_places(
     seen = np.isfinite(starts[0])
     if not seen.any():
         return None
-    starts = _filled(starts.reshape(2, *nodes.X.shape[1:]))
+    starts = _fill(starts.reshape(2, *nodes.X.shape[1:]))
     scanner = scanner_of(image)
     line, pixel, ground = map(np.asarray, _places(scanner, search, surface, nodes, starts))
     lost = np.isnan(line)
     if lost.any():
         # on a rough trajectory the interpolated start may not converge
         line, pixel = line.copy(), pixel.copy()
-        line[lost], pixel[lost] = _searched(image, search, ground[:, lost], starts[0].size)
+        line[lost], pixel[lost] = _search(image, search, ground[:, lost], starts[0].size)
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
     if occlusion and isinstance(surface, Terrain):
@@ -99,7 +99,7 @@ def block_places(
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
-def _searched(image, search, X, portion):
+def _search(image, search, X, portion):
     """Lines and pixels of points [3, n] by a search of the image, in batches of points."""
     places = np.empty((2, X.shape[1]))
     for k in range(0, X.shape[1], portion):
@@ -128,14 +128,14 @@ def _errors(truth, search, surface, nodes, places):
     ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
 
     def of_point(line, pixel, X):
-        true = _located(truth, search, surface, line, pixel)
+        true = _locate(truth, search, surface, line, pixel)
         return horizontal(east_north(surface, true), true, tuple(X))
 
     of_row = lambda args: jax.vmap(of_point)(*args)
     return jnp.moveaxis(jax.lax.map(of_row, (*places, ground)), -1, 0)
 
 
-def _located(image, search, surface, line, pixel):
+def _locate(image, search, surface, line, pixel):
     """The point seen at an image position, by the pieces of the search."""
     numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
     pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
@@ -152,14 +152,14 @@ def _occluded(image, search, surface, line, pixel, ground):
 
     def of_point(line, pixel, X):
         _, _, (P, _) = sample(search.pieces, image.times.time(line))
-        gap = difference(X, _located(image, search, surface, line, pixel))
+        gap = difference(X, _locate(image, search, surface, line, pixel))
         return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
 
     of_row = lambda args: jax.vmap(of_point)(*args)
     return jax.lax.map(of_row, (line, pixel, jnp.moveaxis(ground, 0, -1)))
 
 
-def _filled(starts):
+def _fill(starts):
     """Positions of unseen nodes, from a plane through the others: sufficient as start values."""
     seen = np.isfinite(starts[0])
     if seen.all():

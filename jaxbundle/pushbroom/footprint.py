@@ -88,7 +88,7 @@ def make_footprint(
     D, _ = _speeds_at(pieces, k, tau, xi, eta, levels, line, earth)
     if not np.isfinite(D).all():
         return None
-    footprint, errors = _fitted(D, times, u, heights)
+    footprint, errors = _fit(D, times, u, heights)
     period = float(image.times.time(1.0) - image.times.time(0.0))
     if not (errors <= FAR * np.array([period, 1.0])).all():
         return None
@@ -151,7 +151,7 @@ def _speeds(c, tau, half, origin, xi, eta, heights, line, earth):
     return jax.vmap(over_slopes, (0, 0, 0, None, None, None))(c, tau, half, xi, eta, heights)
 
 
-def _fitted(D, times, u, heights):
+def _fit(D, times, u, heights):
     """The footprint through a lattice, and the largest errors of t and u there."""
     points = D.reshape(-1, 3)
     middle = points.mean(0)

@@ -237,7 +237,7 @@ def _in_chunks(function, arrays):
 def _found(image, search, X, most, margin):
     """The positions of a chunk of points, a triple of arrays."""
     if search.footprint is None:
-        return _searched(image, search, X, most, margin)
+        return _search(image, search, X, most, margin)
     start = search.footprint.start(difference(X, search.pieces.origin))
     t, u, settled = refine(image, search.pieces, search.earth, X, *start)
     once = settled & _inside(image, t, u, 0.0) & search.footprint.level(search.earth, X)
@@ -249,13 +249,13 @@ def _found(image, search, X, most, margin):
     def search_on(state):
         found, known = state
         chosen = first_of(~known, min(SEARCHED, known.size))
-        few = _searched(image, search, collected(X, chosen), most, margin)
+        few = _search(image, search, collected(X, chosen), most, margin)
         return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
     return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
 
 
-def _searched(image, search, X, most, margin):
+def _search(image, search, X, most, margin):
     """The positions of arbitrary points."""
     starts, count, ahead, behind, hidden = passages(image, search, X, most, margin)
     there = count > jnp.arange(most)[:, None]

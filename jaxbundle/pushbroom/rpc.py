@@ -107,7 +107,7 @@ def locate(
     def newton(_, state):
         place, _ = state
         J, v = jax.jacfwd(_twice_misclosure, has_aux=True)(place, held)
-        step = _solved(J, v)
+        step = _solve(J, v)
         return place - step, jnp.max(jnp.abs(step))
 
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
@@ -260,7 +260,7 @@ def _inside(values):
     return jnp.where(inside, int(RpcStatus.INSIDE), int(RpcStatus.OUTSIDE))
 
 
-def _solved(J, v):
+def _solve(J, v):
     """J⁻¹·v of 2 × 2."""
     determinant = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
     return jnp.stack([

@@ -117,7 +117,7 @@ def fit_rpc(
     table = RpcTable(*(np.asarray(column, float) for column in table))
     _check(table, source)
     offsets = _offsets(table)
-    places = _normalised(table, offsets)
+    places = _normalise(table, offsets)
     T = np.stack(np.broadcast_arrays(*monomials(*places[:3])), 1)
     found = [
         _fit_one(T, y, offsets[f"{name}_scale"], ridge, sigma)
@@ -228,7 +228,7 @@ def _offsets(table: RpcTable) -> dict[str, float]:
     return offsets
 
 
-def _normalised(table, offsets):
+def _normalise(table, offsets):
     east = np.degrees(table.longitude) - offsets["longitude_offset"]
     columns = {
         "longitude": east - 360 * np.round(east / 360),
@@ -246,20 +246,20 @@ def _fit_one(T, y, scale, ridge, sigma):
     D = np.r_[np.full(4, LINEAR), np.ones(UNKNOWNS - 4)]
     U, s, Vt = np.linalg.svd(np.hstack([T, -y[:, None] * T[:, 1:]]) / D, full_matrices=False)
     tau = max(s[0] * START, ridge or 0.0)
-    c, settled = _ridged(U, s, Vt, D, y, tau), False
+    c, settled = _solve_with_ridge(U, s, Vt, D, y, tau), False
     tau = tau if ridge is None else ridge
     for k in range(STEPS):
-        v, J = _linearised(c, T, y)
+        v, J = _linearise(c, T, y)
         U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
         target = J @ c - v
         if ridge is None and k in CHOOSING:
             tau = _ridge(U, s, target, scale)
-        step = _ridged(U, s, Vt, D, target, tau) - c
-        c = c + _shortened(c, step, T, y, tau * D)
+        step = _solve_with_ridge(U, s, Vt, D, target, tau) - c
+        c = c + _shorten(c, step, T, y, tau * D)
         settled = np.abs(J @ step).max() < SETTLED * np.sqrt(np.mean(v**2)) + EXACT / scale
         if settled and k > max(CHOOSING):
             break
-    v, J = _linearised(c, T, y)
+    v, J = _linearise(c, T, y)
     U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
     redundancy = len(y) - float(np.sum(s**2 / (s**2 + tau**2)))
     if sigma is None:
@@ -268,7 +268,7 @@ def _fit_one(T, y, scale, ridge, sigma):
     return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
 
 
-def _shortened(c, step, T, y, ridge):
+def _shorten(c, step, T, y, ridge):
     """The step, halved until the sum of squares falls and no denominator vanishes."""
 
     def square(c):
@@ -289,7 +289,7 @@ def _shortened(c, step, T, y, ridge):
     return 0 * step
 
 
-def _ridged(U, s, Vt, D, y, tau):
+def _solve_with_ridge(U, s, Vt, D, y, tau):
     """The least squares solution of U·diag(s)·Vᵀ·D·c = y with the ridge τ."""
     return Vt.T @ (s / (s**2 + tau**2) * (U.T @ y)) / D
 
@@ -306,7 +306,7 @@ def _ridge(U, s, y, scale):
     return float(s[0] * LADDER[(press <= AS_GOOD * press.min() + ENOUGH / scale).argmax()])
 
 
-def _linearised(c, T, y):
+def _linearise(c, T, y):
     return tuple(np.asarray(a) for a in _value_and_jacobian(c, T, y))
 
 

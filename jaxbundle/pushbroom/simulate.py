@@ -80,11 +80,11 @@ def measured_image(flight: Flight) -> PushbroomImage:
     )
     if not any(np.any(sigma) for sigma in flight.noise):
         return image
-    return _measured(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
+    return _measure(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
 
 
 @jax.jit
-def _measured(image, sigma, key):
+def _measure(image, sigma, key):
     return with_errors_in_rows(image, draw(sigma, key))
 
 

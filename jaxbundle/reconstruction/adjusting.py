@@ -76,11 +76,11 @@ def adjust_weighted(
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
-    """As `_weighted`, without tie points undetermined by the rays left after data snooping."""
+    """As `_weight`, without tie points undetermined by the rays left after data snooping."""
     tie = network.points.has_role("tie")
     for _ in range(LOSSES):
         try:
-            return _weighted(network, kinds, names, significance, tell)
+            return _weight(network, kinds, names, significance, tell)
         except NotSolvedError as error:
             lost = {name.rpartition(" ")[2] for name in error.undetermined}
             kept = ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
@@ -88,7 +88,7 @@ def _without_lost(network: Network, kinds, names, significance, tell) -> Weighte
                 raise
             network, kinds = _keep(network, kinds, kept)
             tie = network.points.has_role("tie")
-    return _weighted(network, kinds, names, significance, tell)
+    return _weight(network, kinds, names, significance, tell)
 
 
 def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " rays"]]:
@@ -96,7 +96,7 @@ def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " r
     return keep_points(network, points), kinds[points[network.observations.point]]
 
 
-def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
+def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
     with ThreadPoolExecutor(1) as ahead:
         # compiled during the compilation of the adjustment
@@ -108,7 +108,7 @@ def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
         (w, r), rows = _of_residuals(result), _rows(result, network)
         total[rows] = _factors(w, r, kinds[rows])
         beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[rows, None]
-        doubtful = _named(result, beyond.any(1))
+        doubtful = _name(result, beyond.any(1))
     for _ in range(ROUNDS):
         tell("data snooping")
         network = _with_sigma(network, given * total[:, None])
@@ -122,7 +122,7 @@ def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
             break
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0
-        doubtful = _named(result, ~used.any(1))
+        doubtful = _name(result, ~used.any(1))
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
     return Weighted(result, kept)
@@ -140,7 +140,7 @@ def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
     """For every image point of a result its row in the network, without excluded ones."""
     rays = network.observations
     index = {one: k for k, one in enumerate(_ids(network, rays.image, rays.point))}
-    return np.array([index[one] for one in _named(result, slice(None))], int)
+    return np.array([index[one] for one in _name(result, slice(None))], int)
 
 
 def _ids(network: Network, image, point):
@@ -148,7 +148,7 @@ def _ids(network: Network, image, point):
     return [(images[i], points[p]) for i, p in zip(image.tolist(), point.tolist())]
 
 
-def _named(result: Adjustment, rows) -> list[tuple[str, str]]:
+def _name(result: Adjustment, rows) -> list[tuple[str, str]]:
     """Image and point, by id, of image points."""
     problem = result.problem
     return _ids(result.network, problem.image[rows], problem.point[rows])

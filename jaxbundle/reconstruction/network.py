@@ -53,7 +53,7 @@ def tie_network(
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
     lenses = [cameras.lens[c] for c in of]
-    free = [_freed(cameras.cameras[c], of.count(c), lenses.count(cameras.lens[c]), cameras.given)
+    free = [_free(cameras.cameras[c], of.count(c), lenses.count(cameras.lens[c]), cameras.given)
             for c in used]  # fmt: skip
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     named = extra.named.take(np.isin(extra.named.image, rows))
@@ -104,7 +104,7 @@ def _with_ties(network: Network, lens: Sequence[int]) -> Network:
     return network.replace(further=(*network.further, *make_further({"ties": columns}, 1.0)))
 
 
-def _freed(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
+def _free(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
     """A camera with the parameters determined by the number of its photographs, and of its lens."""
     if given:
         return camera

@@ -42,7 +42,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
     found, failed = [], None
     for tolerance in (CLOSE, TOLERANCE):
         try:
-            found.append(_oriented(network, tolerance))
+            found.append(_orient(network, tolerance))
         except NotSolvedError as error:
             failed = error
         else:
@@ -52,7 +52,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
     others = []
     for changed in _with_other_distances(network, guessed):
         try:
-            others.append(_oriented(changed, CLOSE))
+            others.append(_orient(changed, CLOSE))
         except NotSolvedError:
             continue
     enough = [one for one in others
@@ -62,7 +62,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
         raise failed
 
 
-def _oriented(network: Network, tolerance: float) -> Oriented:
+def _orient(network: Network, tolerance: float) -> Oriented:
     """Start values, without photographs weakly connected to the others."""
     found = orient(network, tolerance=tolerance)
     network, images = found.network, dict(found.images)
@@ -118,7 +118,7 @@ def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Ori
     }
     cameras = tuple(better.get(c.id, c) for c in network.cameras)
     try:
-        found = _oriented(network.replace(cameras=cameras), CLOSE)
+        found = _orient(network.replace(cameras=cameras), CLOSE)
     except NotSolvedError:
         return None
     return found if len(found.images) < len(oriented.images) else None

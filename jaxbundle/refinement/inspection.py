@@ -57,7 +57,7 @@ class Inspection:
 
     def __init__(self, declared: Declared, solution: Solution, steps: int, removed=()):
         self.declared, self.solution, self.steps = declared, solution, steps
-        self.removed = tuple(_named(declared, one) for one in removed)
+        self.removed = tuple(_name(declared, one) for one in removed)
 
     @property
     def redundancy(self) -> int:
@@ -173,7 +173,7 @@ def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
     )
 
 
-def _named(declared: Declared, one) -> Removed:
+def _name(declared: Declared, one) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
     given, chosen = declared.given, declared.rays.points

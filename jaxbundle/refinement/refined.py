@@ -80,14 +80,14 @@ def _attitude(image, form, change) -> Attitude:
     centres = form.spline.centres
     times = np.union1d(times, centres[(centres > first) & (centres < last)])
     gaps = rows[1:][np.diff(rows) > old.table.gap]
-    R = lambda t: _padded(lambda t: _rotations(image, form, change, t), t)
+    R = lambda t: _pad(lambda t: _rotations(image, form, change, t), t)
     rotations, pending = R(times), np.ones(len(times) - 1, bool)
     while pending.any():
         left = np.flatnonzero(pending)
         middle = (times[left] + times[left + 1]) / 2
         there = R(middle)
         turn = _turns(rotations[left], rotations[left + 1])
-        half = rotations[left] @ _padded(_exponentials, turn / 2)
+        half = rotations[left] @ _pad(_exponentials, turn / 2)
         wrong = np.linalg.norm(_turns(half, there), axis=1) > TOLERANCE
         wrong &= ~np.isin(times[left + 1], gaps)
         # both halves of what was split are looked at again
@@ -102,7 +102,7 @@ def _attitude(image, form, change) -> Attitude:
                 f"attitude: more than {LONGEST} rows would be needed to write it; the table is too "
                 "rough between its rows"
             )
-    quaternions = _padded(_quaternions, rotations)
+    quaternions = _pad(_quaternions, rotations)
     longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
     return attitude_table(
         times, quaternions, method="slerp", reference=old.reference, gap=1.01 * longest
@@ -111,7 +111,7 @@ def _attitude(image, form, change) -> Attitude:
 
 def _turns(a, b):
     """Rotation vectors from matrices a to b."""
-    return _padded(_logarithms, a.transpose(0, 2, 1) @ b)
+    return _pad(_logarithms, a.transpose(0, 2, 1) @ b)
 
 
 @jax.jit
@@ -129,7 +129,7 @@ def _quaternions(R):
     return jax.vmap(quaternion_from_matrix)(R)
 
 
-def _padded(function, rows):
+def _pad(function, rows):
     """The function of rows padded to few shapes, to compile little."""
     n = len(rows)
     size = FEWEST << max(int(np.ceil(np.log2(n / FEWEST))), 0)

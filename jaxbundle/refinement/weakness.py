@@ -41,7 +41,7 @@ class Weakness(NamedTuple):
 
 def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
     """All weak directions, the weakest first; jitter is one per axis."""
-    S, names = _observed(declared, found)
+    S, names = _observe(declared, found)
     if not np.isfinite(S).all():
         vague = undetermined(found.problem, found.values)
         sentence = f"the points do not determine {', '.join(vague[:MOST])}"
@@ -88,7 +88,7 @@ def _shares(vector, names):
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
 
-def _observed(declared: Declared, found: Solution):
+def _observe(declared: Declared, found: Solution):
     """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
     points that distances keep in the engine's reduced system are eliminated here."""
     priors = [given.kind.snooped == "" and given.kind.of != ("image",)

@@ -46,7 +46,7 @@ def text(
     lines = [*head.title(adjustment, date), *head.settings(adjustment), *head.counts(adjustment)]
     if not adjustment.converged:
         lines += [*head.why_not_solved(adjustment), *head.warnings(adjustment)]
-        return _joined(lines)
+        return _join(lines)
     lines += head.convergence(adjustment)
     lines += head.variance_factor(adjustment)
     lines += head.warnings(adjustment)
@@ -63,8 +63,8 @@ def text(
     lines += observations.downweighted(adjustment, max_rows)
     lines += observations.removals(adjustment)
     lines += [] if budget is None else budget_lines(budget)
-    return _joined(lines)
+    return _join(lines)
 
 
-def _joined(lines: list[str]) -> str:
+def _join(lines: list[str]) -> str:
     return "\n".join(line.rstrip() for line in lines) + "\n"

@@ -151,18 +151,18 @@ def count_rows(adjustment) -> list[tuple[str, str, str]]:
     rows = [
         ("Cameras", len(network.cameras), ""),
         ("Images", len(network.images), ""),
-        ("Points", len(network.points), _listed(roles)),
+        ("Points", len(network.points), _list(roles)),
         ("Image points", used, ""),
         ("Observations", n.observations, "image coordinates"),
-        ("Pseudo-observations", n.pseudo_observations, _listed(kinds)),
+        ("Pseudo-observations", n.pseudo_observations, _list(kinds)),
         ("Datum conditions", n.datum, ""),
-        ("Unknowns", n.unknowns, _listed(groups)),
+        ("Unknowns", n.unknowns, _list(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
     return [(name, str(n), detail) for name, n, detail in rows]
 
 
-def _listed(groups) -> str:
+def _list(groups) -> str:
     """Names with their non-zero counts."""
     return ", ".join(f"{name} {n}" for name, n in groups if n)
 

@@ -62,7 +62,7 @@ def _cause(problem: Problem, values: Values, name, given) -> Cause:
     sigma = positive(f"the σ of {text}", given)
     found = _held_places(problem, kind, id, parameter)
     errors = tuple(
-        ((table.name, row, _scaled(sigma, _direction(table, values, row, column))),)
+        ((table.name, row, _scale(sigma, _direction(table, values, row, column))),)
         for table, row, column, _ in found
     )
     table, row, _, of = found[0]
@@ -80,7 +80,7 @@ def _common(problem: Problem, values: Values, name: str, given: Mapping) -> Caus
         kind, id, parameter = split_name(one)
         amount = number(f"{name}, {':'.join((kind, id, parameter))}", amount)
         change += [
-            (table.name, row, _scaled(amount, _direction(table, values, row, column)))
+            (table.name, row, _scale(amount, _direction(table, values, row, column)))
             for table, row, column, _ in _held_places(problem, kind, id, parameter)
         ]
     if not change:
@@ -202,5 +202,5 @@ def _turns(rotation):
     return (of_quaternion @ jnp.linalg.inv(of_angles)).T
 
 
-def _scaled(factor: float, direction):
+def _scale(factor: float, direction):
     return jax.tree.map(lambda x: factor * x, direction)

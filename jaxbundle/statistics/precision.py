@@ -135,12 +135,12 @@ def predicted(problem: Problem, data: Data) -> Data:
     for table in problem.layout.cameras:
         rows = np.flatnonzero(np.isin(problem.camera, table.cameras))
         touched = (index[rows] for index in (problem.image, problem.camera, problem.point))
-        xy = _projected(cameras.get_model(table.model), data.start, xy, rows, *touched)
+        xy = _project(cameras.get_model(table.model), data.start, xy, rows, *touched)
     return eqx.tree_at(lambda d: d.image_xy, data, xy)
 
 
 @partial(jax.jit, static_argnums=0)
-def _projected(model, values: Values, xy, rows, image, camera, point):
+def _project(model, values: Values, xy, rows, image, camera, point):
     """The image coordinates with those of `rows` computed."""
 
     def one(pose, interior, X):

@@ -54,11 +54,11 @@ def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyram
     """The image and the coarser ones."""
     found = [np.asarray(grey)]
     for _ in range(levels):
-        found.append(_halved(found[-1]))
+        found.append(_halve(found[-1]))
     return Pyramid(tuple(found))
 
 
-def _halved(a):
+def _halve(a):
     """Means over 2 × 2 pixels, by strips."""
     rows, columns = (max(n // 2, 1) for n in a.shape)
     out = np.empty((rows, columns), np.float32)

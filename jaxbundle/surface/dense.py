@@ -98,7 +98,7 @@ class Disparities:
 
 def match_dense(pair: RowPair, span: int) -> Disparities:
     """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
-    left, right = _prepared(pair)
+    left, right = _prepare(pair)
     inside = np.isfinite(pair.left)
     even, right_even = alike(left, right, inside, np.isfinite(pair.right))
     start = semi_global(even, right_even, span)
@@ -199,7 +199,7 @@ def _with_windows(left, coefficients, start, half, wanted):
 
     def of_rows(first):
         low, high = max(first - MARGIN, 0), min(first + BAND + MARGIN, rows)
-        found = _refined(left[low:high], coefficients[low:high], start[low:high], half)
+        found = _refine(left[low:high], coefficients[low:high], start[low:high], half)
         return [a[first - low : first - low + BAND] for a in found]
 
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -219,7 +219,7 @@ def _with_windows(left, coefficients, start, half, wanted):
     return Disparities(keep(d), keep(sigma), keep(rho), factor), stepped
 
 
-def _refined(left, coefficients, start, half):
+def _refine(left, coefficients, start, half):
     """Disparities (NaN: none), their σ, ρ, and shifts across the rows over their σ, of some rows;
     `coefficients`: of the spline through the right image."""
     known = np.isfinite(start)
@@ -352,7 +352,7 @@ def _smooth(disparity, known, half):
     return np.where(known, smooth, np.nan).astype(np.float32)
 
 
-def _prepared(pair: RowPair):
+def _prepare(pair: RowPair):
     """Both images between 0 and 255, without gaps."""
     grey = [a[np.isfinite(a)] for a in (pair.left, pair.right)]
     if not all(len(g) for g in grey):

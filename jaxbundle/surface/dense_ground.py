@@ -83,7 +83,7 @@ def _piece(base, other, guide, bounds, window, step):
     d = d + slopes[0] * (ab - place)[:, 0] + slopes[1] * (ab - place)[:, 1]
     uv, ab, d, sigma = uv[keep], ab[keep], d[keep] + pair.lowest, sigma[keep]
     parts = [
-        _intersected(base, other, pair, *(a[k : k + TOGETHER] for a in (uv, ab, d, sigma)))
+        _intersect(base, other, pair, *(a[k : k + TOGETHER] for a in (uv, ab, d, sigma)))
         for k in range(0, len(uv), TOGETHER)
     ]
     if not parts:
@@ -91,7 +91,7 @@ def _piece(base, other, guide, bounds, window, step):
     return merge(parts), found.factor
 
 
-def _intersected(base, other, pair, uv, ab, d, sigma):
+def _intersect(base, other, pair, uv, ab, d, sigma):
     shifted = pair.base_places(ab - np.stack([d, np.zeros_like(d)], 1))
     seen_at = base.points(shifted, np.full(len(shifted), pair.q0))
     match = other.project(seen_at)

@@ -90,7 +90,7 @@ def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
     shape = rows, columns
     found = Dsm(height.reshape(shape), sigma.reshape(shape), count.reshape(shape),
                 float(left * size), float(-top * size), size, cloud.system)  # fmt: skip
-    return _filled(found, fill) if fill else found
+    return _fill(found, fill) if fill else found
 
 
 def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
@@ -140,7 +140,7 @@ def _sorted_medians(values, first, count):
     return (values[low] + values[high]) / 2
 
 
-def _filled(dsm: Dsm, reach: int) -> Dsm:
+def _fill(dsm: Dsm, reach: int) -> Dsm:
     """Gaps near heights filled by the mean of those around, weighted by distance."""
     known = np.isfinite(dsm.height)
     if known.all():

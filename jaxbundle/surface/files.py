@@ -22,7 +22,7 @@ TOGETHER = 1 << 16
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
     """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
-    names = np.array([*map(_quoted, cloud.images), ""], dtype=object)
+    names = np.array([*map(_quote, cloud.images), ""], dtype=object)
     starts = range(0, len(cloud), TOGETHER)
     lines = (_lines(cloud, names, slice(k, k + TOGETHER)) for k in starts)
     write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
@@ -41,7 +41,7 @@ def _lines(cloud, names, part):
     return "".join(",".join(row) + "\n" for row in zip(*columns))
 
 
-def _quoted(name):
+def _quote(name):
     """A name in the form of csv."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow([name])

@@ -84,7 +84,7 @@ def straighten(
 
 def _left(base, pair, shape):
     r, c = np.indices(shape).reshape(2, -1)
-    return _sampled(base, pair.base_places(np.stack([c, r], 1).astype(float))).reshape(shape)
+    return _sample(base, pair.base_places(np.stack([c, r], 1).astype(float))).reshape(shape)
 
 
 def _right(base, other, pair, shape):
@@ -98,10 +98,10 @@ def _right(base, other, pair, shape):
     y, x = np.mgrid[0:rows, 0:columns]
     at = [y * ((NODES - 1) / max(rows - 1, 1)), x * ((NODES - 1) / max(columns - 1, 1))]
     fine = [ndimage.map_coordinates(places[..., k], at, order=3, mode="nearest") for k in (0, 1)]
-    return _sampled(other, np.stack(fine, -1).reshape(-1, 2)).reshape(shape)
+    return _sample(other, np.stack(fine, -1).reshape(-1, 2)).reshape(shape)
 
 
-def _sampled(view, uv):
+def _sample(view, uv):
     """Grey values by cubic splines, NaN outside the image."""
     inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
     if not inside.any():

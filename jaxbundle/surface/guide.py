@@ -95,7 +95,7 @@ def make_guide(
                 return None
         else:
             found = _search_near(base, others, pyramids, uv, q, level, shape, guide)
-        guide = _smoothed(base, level, *found)
+        guide = _smooth(base, level, *found)
     return guide
 
 
@@ -216,7 +216,7 @@ def _taken(record, rows):
     return type(record)(**fields)
 
 
-def _smoothed(base, level, uv, shape, q, rate, rho, _):
+def _smooth(base, level, uv, shape, q, rate, rho, _):
     """A guide from matches: poor or isolated nodes follow their neighbours."""
     step = SPACING * 2.0**level
     q, rate, rho = (np.asarray(a, float).reshape(shape) for a in (q, rate, rho))

@@ -147,7 +147,7 @@ def match_points(
         np.concatenate([mean[:, None], np.where(used[..., None, None], covariance, 1)], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
     )  # fmt: skip
-    return _accepted(table, X, uv, rhos, settings, lost)
+    return _accept(table, X, uv, rhos, settings, lost)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +161,7 @@ class _Rays:
         return intersect(self.views, self.uv, self.covariance, self.used, start)
 
 
-def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
+def _accept(table, X, uv, rhos, settings, lost) -> Matches:
     """Intersect; inconsistent rays are left out, inconsistent points are rejected."""
     found = table.intersect(X)
     factor = variance_factor(found.vtpv, found.redundancy)

@@ -39,7 +39,7 @@ def _sweep(cost, total, shift, small, large):
         if before is None:
             path = line.copy()
         else:
-            came = _moved(before, shift)
+            came = _move(before, shift)
             least = came.min(1, keepdims=True)
             path = np.minimum(came, least + large)
             np.minimum(path[:, 1:], came[:, :-1] + small, out=path[:, 1:])
@@ -49,7 +49,7 @@ def _sweep(cost, total, shift, small, large):
         before = path
 
 
-def _moved(a, shift):
+def _move(a, shift):
     """Shifted rows; missing costs are 0."""
     if shift == 0:
         return a

@@ -98,15 +98,15 @@ def parse_toml(path: str | Path, text: str) -> dict[str, Any]:
 
     **Raises:** `InputError` naming the line of too deep nesting or too large a number.
     """
-    return _parsed(path, text, tomllib.loads, "TOML")
+    return _parse(path, text, tomllib.loads, "TOML")
 
 
 def parse_json(path: str | Path, text: str) -> Any:
     """The same of a text in JSON."""
-    return _parsed(path, text, json.loads, "JSON")
+    return _parse(path, text, json.loads, "JSON")
 
 
-def _parsed(path: str | Path, text: str, parse: Callable[[str], Any], kind: str):
+def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str):
     try:
         document = parse(text)
         wrong = _beyond(document)

@@ -76,11 +76,11 @@ def estimate_interior(
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in FACTORS]
     if len(pairs) > PAIRS:
         first = tried if known else tried[1::3]
-        _, _, part, _, angle = _oriented([_with(camera, f) for f in first], xy1, xy2, limit)
+        _, _, part, _, angle = _orient([_with(camera, f) for f in first], xy1, xy2, limit)
         worth = (part * np.sqrt(np.minimum(angle, WIDE))).max(0)
         chosen = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
         xy1, xy2 = ([side[k] for k in chosen] for side in (xy1, xy2))
-    M, b, part, costs, _ = _oriented([_with(camera, f) for f in tried], xy1, xy2, limit)
+    M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)
     unusual = np.abs(np.log(np.array(tried) / (USUAL * size)))
     usual = 1 + DOUBT * unusual * (1 + unusual) / 2
     best = int(np.argmin(costs.sum(1) * (1 if known else usual)))
@@ -88,7 +88,7 @@ def estimate_interior(
     use = np.flatnonzero(part > 0.3)
     if not len(use):
         return Start(_with(camera, f), 0, np.nan)
-    f, k1, e = _adjusted(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
+    f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
     sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < FARTHEST
     sane &= 1 / KNOWN < f / tried[best] < KNOWN
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
@@ -101,7 +101,7 @@ def prepare() -> None:
     many.orient_pairs(list(xy), list(xy), np.full(PAIRS, 1e-3))
     camera = Camera("camera", "opencv", {"fx": 1.0, "fy": 1.0})
     M, b = np.tile(np.eye(3), (PAIRS, 1, 1)), np.tile([1.0, 0, 0], (PAIRS, 1))
-    _adjusted(camera, list(zip(xy, xy)), M, b, 1.0)
+    _adjust(camera, list(zip(xy, xy)), M, b, 1.0)
 
 
 def _with(camera, f, k1=0.0):
@@ -110,7 +110,7 @@ def _with(camera, f, k1=0.0):
     )
 
 
-def _oriented(cameras, xy1, xy2, limit):
+def _orient(cameras, xy1, xy2, limit):
     """Relative orientations of all pairs with each camera, shares of agreeing matches, robust sums,
     and angles of intersection."""
     f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
@@ -134,7 +134,7 @@ def _sampson(M, b, xy1, xy2):
     return (jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2),)
 
 
-def _adjusted(camera, pairs, M, b, limit):
+def _adjust(camera, pairs, M, b, limit):
     """f, k1 and the misclosures after an adjustment of all pairs together."""
     rows = np.arange(PAIRS) % len(pairs)
     there = (np.arange(PAIRS) < len(pairs)).astype(float)

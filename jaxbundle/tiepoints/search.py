@@ -128,7 +128,7 @@ def start_cameras(
         own = [c for c in range(len(cameras)) if lens[c] == number]
         found = [_once(m) for m in matches if {of[k] for k in m.images} <= set(own)]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
-        xy = _centred(cameras, of, features, _various(found))
+        xy = _centre(cameras, of, features, _various(found))
         begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
         start = estimate_interior(begin, xy, told)
         if start.pairs:
@@ -157,7 +157,7 @@ def _once(matches: Matches) -> Matches:
     return matches.take(use) if use.sum() >= ENOUGH else matches
 
 
-def _centred(cameras, of, features, matches):
+def _centre(cameras, of, features, matches):
     """Matches of pairs, relative to the image centres."""
     centred = lambda k: features[k].xy - _middle(cameras[of[k]])
     return [tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T)) for m in matches]

@@ -30,7 +30,7 @@ def make_tracks(
         return []
     clarity = np.concatenate([pair.clarity for pair in pairs if len(pair)])
     edges = same[np.concatenate(rows)[np.argsort(clarity, kind="stable")]]
-    members = _joined(edges, np.searchsorted(first, np.arange(first[-1]), side="right") - 1)
+    members = _join(edges, np.searchsorted(first, np.arange(first[-1]), side="right") - 1)
     tracks = []
     for nodes in members:
         images = np.searchsorted(first, nodes, side="right") - 1
@@ -44,7 +44,7 @@ def _first_at_a_place(xy):
     return first[back.ravel()]
 
 
-def _joined(edges, image):
+def _join(edges, image):
     """The groups of nodes joined by edges, none with two nodes of an image."""
     parent: dict[int, int] = {}
     group: dict[int, dict[int, int]] = {}

@@ -149,7 +149,7 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
     )  # fmt: skip
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
     for limit in (LOOSE, 1.0):
-        poses = _improved(poses, rows, xy1, xy2, tolerance, limit)
+        poses = _improve(poses, rows, xy1, xy2, tolerance, limit)
     found = {}
     for k, (M, b) in poses.items():
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
@@ -221,7 +221,7 @@ def _distances(M, b, xy1, xy2):
     return e, front
 
 
-def _improved(poses, of, xy1, xy2, tolerance, limit):
+def _improve(poses, of, xy1, xy2, tolerance, limit):
     """The relative orientations refined by the matches (`of` these rows) within `limit`
     tolerances."""
     keys, rows = [], []

@@ -34,14 +34,14 @@ from jaxbundle.network.tables import EXTERIOR, Camera
 POSES = ("epoch", "mounting")
 
 
-def _scaled(motion, mounting: PoseValue) -> PoseValue:
+def _scale(motion, mounting: PoseValue) -> PoseValue:
     """The bases scale with the object."""
     return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
 
 
 _OF_OBJECT = similarity(("point",), ("epoch",))
 FLOATING = Motions(
-    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scaled)), _OF_OBJECT.curved
+    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved
 )
 """A similarity of the object that also transforms poses and bases."""
 

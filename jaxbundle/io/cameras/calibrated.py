@@ -41,7 +41,7 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
             raise InputError(f"{path}: was not solved; there is no camera in it")
         parts = document.get("calibrations", {"": document})
         return [
-            _calibrated(path, id, entry, part.get("calibration", {}))
+            _calibrate(path, id, entry, part.get("calibration", {}))
             for part in parts.values() for id, entry in part["cameras"].items()
         ]
     except InputError:
@@ -53,7 +53,7 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
         raise InputError(f"{path}: not the result of adjust or calibrate: {what}") from None
 
 
-def _calibrated(path, id, entry, about) -> Calibrated:
+def _calibrate(path, id, entry, about) -> Calibrated:
     parameters = entry["parameters"]
     row = {"id": id, "model": entry["model"]} | {n: p["value"] for n, p in parameters.items()}
     if about.get("image_size"):

@@ -105,10 +105,10 @@ def read_opencv(path: str | Path) -> Camera:
         image_size=_image_size(path, entries),
     )
     check_camera(camera, f"{path}, ")
-    return camera if K[0, 1] == 0 and not any(tilt) else _fitted(path, camera, K[0, 1], tilt)
+    return camera if K[0, 1] == 0 and not any(tilt) else _fit(path, camera, K[0, 1], tilt)
 
 
-def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
+def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
     """The nearest of our cameras to one with a skew or a tilted sensor."""
     if camera.image_size is None:
         raise InputError(
@@ -116,7 +116,7 @@ def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> F
             "the image size is needed: give image_width and image_height"
         )
     p = all_parameters(camera)
-    parameters = {"camera": p, "skew": skew, "H": _tilted(*tilt) if tilt else np.eye(3)}
+    parameters = {"camera": p, "skew": skew, "H": _tilt(*tilt) if tilt else np.eye(3)}
     has = [f"skew {skew:g}"] if skew else []
     has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
     foreign = Foreign(FORMULAS[str(camera.model)], parameters, p, camera.image_size,
@@ -137,7 +137,7 @@ def _image(name: str, p: Mapping, X, Y, Z):
 FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt")}
 
 
-def _tilted(tx: float, ty: float) -> np.ndarray:
+def _tilt(tx: float, ty: float) -> np.ndarray:
     cx, sx, cy, sy = np.cos(tx), np.sin(tx), np.cos(ty), np.sin(ty)
     about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     R = about_y @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])

@@ -114,7 +114,7 @@ def read_column_map(
         where = f"{path}, [table.{name}]"
         columns = _read(path.parent, where, entry)
         if name == "images":
-            columns = _rotated(where, entry, columns, ANGLE_UNITS.get(angle_unit, 1.0))
+            columns = _rotate(where, entry, columns, ANGLE_UNITS.get(angle_unit, 1.0))
         if name == "points" and "role" not in columns.values:
             rows = ["tie"] * len(columns)
             columns = Columns({**columns.values, "role": rows}, columns.source)
@@ -194,7 +194,7 @@ def _comment(where: str, entry: Mapping) -> str:
     return given
 
 
-def _rotated(where: str, entry: Mapping, columns: Columns, radians: float) -> Columns:
+def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Columns:
     """The table of images with ω, φ, κ in the unit of the project."""
     kind = entry.get("rotation", "omega-phi-kappa")
     if kind not in ROTATIONS:

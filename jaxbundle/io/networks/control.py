@@ -179,7 +179,7 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
         return network
     source = points.position[at]
     if np.isnan(source).any():
-        source = _intersected(network, at)
+        source = _intersect(network, at)
     known = np.isfinite(source).all(1)
     source, target = source[known], target[known]
     found = similarity(source, target) if len(source) >= 3 else None
@@ -200,7 +200,7 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
     )  # fmt: skip
 
 
-def _intersected(network: Network, at):
+def _intersect(network: Network, at):
     """The coordinates of points by the orientations of the input; NaN if there are none."""
     points = network.points
     roles = np.array(points.role, dtype=object)

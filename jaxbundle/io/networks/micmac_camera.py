@@ -156,7 +156,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
     return found | {"x": float(x), "y": float(y)}
 
 
-def _distorted(p: Parameters, x: Scalar, y: Scalar) -> Pair:
+def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     """D of a point, relative to the centre of distortion."""
     R1, R2, R3, R4, R5, P1, P2, b1, b2 = p
     r2 = x * x + y * y
@@ -165,7 +165,7 @@ def _distorted(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     return x + dx, y + y * R + P2 * (r2 + 2 * y * y) + 2 * P1 * x * y
 
 
-_from_world = implicit_inverse(_distorted, lambda p, x, y: (x, y), ITERATIONS)
+_from_world = implicit_inverse(_distort, lambda p, x, y: (x, y), ITERATIONS)
 
 
 def _image(direction: Formula, p: Mapping, X, Y, Z):
@@ -175,7 +175,7 @@ def _image(direction: Formula, p: Mapping, X, Y, Z):
     return jnp.stack([x + p["x"], y + p["y"]])
 
 
-FORMULAS = (partial(_image, _distorted), partial(_image, _from_world))
+FORMULAS = (partial(_image, _distort), partial(_image, _from_world))
 """Where the distortion leads to the camera, and where it leads to the world."""
 
 

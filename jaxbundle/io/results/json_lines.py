@@ -131,15 +131,15 @@ def _text(row: dict) -> str:
 def _is_torn(line: bytes) -> bool:
     """Whether a line is the beginning of a row, and not other content."""
     begin = b'{"key": "'
-    return begin.startswith(line[: len(begin)]) and _parsed(line) is None
+    return begin.startswith(line[: len(begin)]) and _parse(line) is None
 
 
 def _row(line: bytes) -> dict | None:
-    row = _parsed(line)
+    row = _parse(line)
     return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
 
 
-def _parsed(line: bytes):
+def _parse(line: bytes):
     try:
         return json.loads(line)
     except (ValueError, RecursionError):

@@ -90,9 +90,9 @@ def result_text(
         return
     yield _text(head | {"variance_components": _components(adjustment)})[:-1]
     yield ', "points": {'
-    yield from _joined(_text(dict(some))[1:-1] for some in in_portions(_points(adjustment.points)))
+    yield from _join(_text(dict(some))[1:-1] for some in in_portions(_points(adjustment.points)))
     yield '}, "residuals": ['
-    yield from _joined(_text(some)[1:-1] for some in in_portions(_residuals(adjustment.residuals)))
+    yield from _join(_text(some)[1:-1] for some in in_portions(_residuals(adjustment.residuals)))
     yield "]}\n"
 
 
@@ -100,7 +100,7 @@ def _text(value) -> str:
     return json.dumps(without_nan(value), ensure_ascii=False)
 
 
-def _joined(pieces: Iterator[str]) -> Iterator[str]:
+def _join(pieces: Iterator[str]) -> Iterator[str]:
     for number, piece in enumerate(pieces):
         yield ", " + piece if number else piece
 

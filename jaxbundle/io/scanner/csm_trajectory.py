@@ -80,7 +80,7 @@ def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
             f"{did_you_mean(interpolation, INTERPOLATIONS)}"
         )
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
-    return _given(isd, lines) if older else _resampled(isd, lines, interpolation)
+    return _given(isd, lines) if older else _resample(isd, lines, interpolation)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -121,7 +121,7 @@ def _given(isd, lines):
     return States(t, P, rows, R, limits, sources, tuple(warnings))
 
 
-def _resampled(isd, lines, interpolation):
+def _resample(isd, lines, interpolation):
     given = _times(isd, "instrument_position")
     _check_rows(isd, "instrument_position", given)
     body_times, body = _turns(isd, "body_rotation")

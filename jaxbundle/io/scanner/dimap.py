@@ -70,7 +70,7 @@ def read_dimap(file: XmlFields) -> Scanner:
     check_times(rows, source)
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
     warnings = told_extrapolation(rows, when, source)
-    rows, angles = _continued(rows, angles, when[0], when[-1])
+    rows, angles = _extrapolate(rows, angles, when[0], when[-1])
     check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
@@ -91,7 +91,7 @@ def read_dimap(file: XmlFields) -> Scanner:
     return Scanner(name, image, WGS84, warnings)
 
 
-def _continued(t, angles, first, last):
+def _extrapolate(t, angles, first, last):
     """The rows, extrapolated linearly before and after if required."""
     if len(t) < 2:
         return t, angles

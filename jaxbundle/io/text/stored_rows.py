@@ -87,7 +87,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
                 return None
             if member.compress_type != zipfile.ZIP_STORED:
-                unpacked = _unpacked(stream)
+                unpacked = _unpack(stream)
                 rows = StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
                 weakref.finalize(rows, unpacked.close)
                 return rows
@@ -102,7 +102,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
     return StoredRows(Path(path), offset, tuple(shape), dtype)
 
 
-def _unpacked(stream) -> BinaryIO:
+def _unpack(stream) -> BinaryIO:
     """The rest of a stream in a temporary file."""
     unpacked = tempfile.TemporaryFile()
     try:

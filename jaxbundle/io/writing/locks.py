@@ -51,7 +51,7 @@ def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
 
     **Raises:** `InputError` as `locked`."""
     try:
-        while (stream := _opened(lock, needed)) is None:
+        while (stream := _open(lock, needed)) is None:
             pass
     except BlockingIOError:
         raise InputError(
@@ -64,7 +64,7 @@ def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
     return stream
 
 
-def _opened(lock: Path, needed: bool) -> BinaryIO | None:
+def _open(lock: Path, needed: bool) -> BinaryIO | None:
     """The file, locked; None if it vanished meanwhile.
 
     **Raises:** `BlockingIOError` if another process has the lock."""

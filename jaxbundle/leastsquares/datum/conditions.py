@@ -164,7 +164,7 @@ def move_to_datum(
         near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
         slope = jnp.where(before > NEAR * size, slope, near)
         step = limited(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
-        moved = _moved(declared, plan, step, values)
+        moved = _move(declared, plan, step, values)
         differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
                        for name in datum.weight}  # fmt: skip
         return moved, largest(datum.weight, differences), before, count + 1
@@ -222,7 +222,7 @@ def _missing(tau, fixed, given):
     plan = leave_held(declared, plan, values)
     datum = present(plan.datum)
     tables = {name: values[name] for name in datum.weight}
-    moved = _moved(declared, plan, datum.gauge @ tau, tables)
+    moved = _move(declared, plan, datum.gauge @ tau, tables)
     return _datum_equations(declared, plan, moved, start)[0]
 
 
@@ -235,7 +235,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
 
     def along(tau, of, values):
         datum = present(leave_held(declared, plan, of).datum)
-        return _moved(declared, plan, datum.gauge @ tau, values)
+        return _move(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.
     known = jax.lax.stop_gradient((values, start))
@@ -245,7 +245,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     return along(tau, values, values)
 
 
-def _moved(declared, plan, motion, values):
+def _move(declared, plan, motion, values):
     """All tables moved, except held values."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
     for name, act in declared.motions.actions:

@@ -103,14 +103,14 @@ class Residual:
         moved = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
-                block = _stacked(block)
+                block = _stack(block)
                 if change.shape[0]:
                     columns, of = (jnp.array(x, int) for x in space.moves)
                     block = block.at[columns].add(change[of])
             else:
-                block = _stacked(space.moved(block, tuple(change)))
+                block = _stack(space.moved(block, tuple(change)))
             moved.append(block)
-        given = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
+        given = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is tuple)
         found, w = self.kind.residual(*moved, given), jnp.stack(weight)
         v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
         return jnp.where(w > 0, w * v, 0.0)
@@ -129,18 +129,18 @@ def residual_of(declared: Declared, part: Part) -> Residual:
 def evaluate(kind: Kind, blocks, measured):
     """The residuals of one observation as a tuple of scalars."""
     if not kind.scalars:
-        blocks = (_stacked(b) for b in blocks)
-        measured = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
+        blocks = (_stack(b) for b in blocks)
+        measured = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is tuple)
     found = kind.residual(*blocks, measured)
     if isinstance(found, tuple):
         return found
     return (found,) if jnp.ndim(found) == 0 else tuple(found)
 
 
-def _stacked(block) -> Any:
+def _stack(block) -> Any:
     """Tuples of scalars as arrays; other blocks as they are."""
     if type(block) is tuple and block:
-        return jnp.stack([_stacked(x) for x in block])
+        return jnp.stack([_stack(x) for x in block])
     return block
 
 

@@ -61,7 +61,7 @@ def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknown
     start, data = stop_gradient((start, data))
 
     def linearise(x):
-        N, g, v = _linearised(residuals, retract, x, data, unknowns)
+        N, g, v = _linearise(residuals, retract, x, data, unknowns)
         there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
         return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
 
@@ -114,10 +114,10 @@ def _half_gradient(delta, fixed, data):
 
 def normal_equations(residuals, retract, x, data, unknowns):
     """N = JᵀJ and Jᵀv at x."""
-    return _linearised(residuals, retract, x, data, unknowns)[:2]
+    return _linearise(residuals, retract, x, data, unknowns)[:2]
 
 
-def _linearised(residuals, retract, x, data, unknowns):
+def _linearise(residuals, retract, x, data, unknowns):
     """N = JᵀJ, Jᵀv and v at x."""
 
     def twice(delta):

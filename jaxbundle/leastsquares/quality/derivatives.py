@@ -140,7 +140,7 @@ def attach_derivatives(
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
-        return at.moved(_propagated(change, at, data), data)
+        return at.moved(_propagate(change, at, data), data)
     change = implicit_root(gradient_after, _solve_structured, step, at, data)
     return datum.attach_motion(declared, plan, at.moved(change, data), data.start)
 
@@ -190,12 +190,12 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
 
 
 @eqx.filter_custom_jvp
-def _propagated(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def _propagate(change: Tangent, at: Linearised, data: Data) -> Tangent:
     """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
 
-@_propagated.def_jvp
+@_propagate.def_jvp
 def _(primals, tangents):
     change, at, data = primals
     data, still = differentiable_once(data, ONCE), zero_tangent(at.plan)

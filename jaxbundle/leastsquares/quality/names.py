@@ -82,13 +82,13 @@ def scaled_system(problem: Problem, values: Values):
     plan, data = problem.plan, pad_data(problem, problem.data)
     values = pad_values(problem, values)
     moves = None if plan.datum is None else directions_of_motions(problem.declared, values)
-    found = _scaled(problem.declared, plan, values, data, moves)
+    found = _scale(problem.declared, plan, values, data, moves)
     S, V, G = jax.tree.map(np.asarray, found)
     return np.tril(S) + np.tril(S, -1).T, V, G
 
 
 @eqx.filter_jit
-def _scaled(declared: Declared, plan: Plan, values: Values, data: Data, moves):
+def _scale(declared: Declared, plan: Plan, values: Values, data: Data, moves):
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     S, scale, *_ = reduced_system(Normal(plan, blocks), regular=False)
     G = jnp.zeros((sum(plan.groups[g].free.size for g in plan.kept), 0))

@@ -132,7 +132,7 @@ def snoop(
             removed = kept
         found = readjust(without(whole, removed), found.values, adjust_from)
     if doubtful:
-        removed = list(_tested(whole, found, removed))
+        removed = list(_test(whole, found, removed))
     return adjust_from(found.problem, found.values) if removed else found, removed
 
 
@@ -268,7 +268,7 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
     }  # fmt: skip
 
 
-def _tested(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
+def _test(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
     """The same with the tests of initially doubtful observations."""
     tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
     for r in removed:

@@ -223,7 +223,7 @@ class Shapes(Further):
             if len(own) < 3:
                 raise InputError(f"{self.source(own[0])}: shape {name!r}: {len(own)} points, "
                     "at least 3 are needed")  # fmt: skip
-            X0, M = _placed(self.place[own], places[point[own]])
+            X0, M = _place(self.place[own], places[point[own]])
             centre.append(X0)
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
@@ -234,7 +234,7 @@ class Shapes(Further):
         return Declared((frame,), (seen,), (("shape", move_pose),))
 
 
-def _placed(x, X):
+def _place(x, X):
     """X0 and M of x = M·(X − X0), by Kabsch (1976)."""
     a, b = x.mean(0), X.mean(0)
     U, _, Vt = np.linalg.svd((x - a).T @ (X - b))
