@@ -21,7 +21,7 @@ from jaxbundle.bundle.minimum import (
     weakness_without_solution,
 )
 from jaxbundle.bundle.orient import orient, orient_again, screen
-from jaxbundle.bundle.repeated import eliminated_parameters, robustly, snooped, with_components
+from jaxbundle.bundle.repeated import eliminate_parameters, robustly, snoop_network, with_components
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
@@ -196,7 +196,7 @@ class _Found:
         self.said["doubts"] = (doubt,) if doubt else ()
 
     def remove_blunders(self, again, test: str, significance: float, doubtful) -> None:
-        self.problem, self.minimum, removed, doubt = snooped(
+        self.problem, self.minimum, removed, doubt = snoop_network(
             present(self.inspection), self.minimum, again, test, significance, doubtful
         )
         self.said |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
@@ -206,7 +206,7 @@ class _Found:
         self.said["sigma_factors"] = factors
 
     def eliminate_parameters(self, again, critical_t: float) -> None:
-        self.problem, self.minimum, names = eliminated_parameters(
+        self.problem, self.minimum, names = eliminate_parameters(
             self.problem, self.minimum, again, critical_t
         )
         self.said["eliminated"] = tuple(names)

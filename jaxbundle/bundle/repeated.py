@@ -29,7 +29,7 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
 
 
-def snooped(
+def snoop_network(
     found: Inspection, minimum, again, test: str, significance: float, doubtful: Iterable = ()
 ):
     """The problem and its minimum without blunders, the removed observations, and warnings about a
@@ -125,7 +125,7 @@ def _doubts(components: dict[str, Component], unsettled: list[str]):
             yield f"variance components: {name} {why}; their σ are unchanged"
 
 
-def eliminated_parameters(problem, minimum, again, critical_t):
+def eliminate_parameters(problem, minimum, again, critical_t):
     """Fix insignificant additional parameters at their default (mostly 0), the weakest first."""
     names = []
     models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}

@@ -7,12 +7,12 @@ from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     clean,
+    cut_lines,
     estimate,
     facts,
     fixed,
     heading,
     paragraph,
-    shortened,
     significant,
     table,
 )
@@ -39,7 +39,7 @@ def _photographs(calibration):
     if views.failed:
         lines += heading("Photographs not used")
         rows = facts((clean(name), clean(why)) for name, why in views.failed)
-        lines += shortened(rows, MOST_FAILED, "…")
+        lines += cut_lines(rows, MOST_FAILED, "…")
     return lines
 
 

@@ -57,7 +57,7 @@ def refine(image, pieces, earth, X, t, u):
     def few_again(state):
         *place, settled, rounds = state
         chosen = first_of(open_(state), few)
-        found = round_(*collected((X, *place), chosen))
+        found = round_(*gather((X, *place), chosen))
         return *replaced((*place, settled), found, chosen), rounds.at[chosen].add(1, mode="drop")
 
     def again(state):
@@ -74,7 +74,7 @@ def first_of(wanted, few):
     return jnp.nonzero(wanted, size=few, fill_value=wanted.size)[0]
 
 
-def collected(arrays, chosen):
+def gather(arrays, chosen):
     """Arrays [n] at indices; any value for n."""
     return jax.tree.map(lambda a: a.at[chosen].get(mode="clip"), arrays)
 

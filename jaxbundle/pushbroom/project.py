@@ -30,7 +30,7 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import Corrections, seen_point
 from jaxbundle.pushbroom.footprint import Footprint, make_footprint
 from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
-from jaxbundle.pushbroom.newton import collected, first_of, refine, replaced
+from jaxbundle.pushbroom.newton import first_of, gather, refine, replaced
 from jaxbundle.pushbroom.passages import (
     FINE_SEARCH,
     line_of_detectors,
@@ -249,7 +249,7 @@ def _found(image, search, X, most, margin):
     def search_on(state):
         found, known = state
         chosen = first_of(~known, min(SEARCHED, known.size))
-        few = _search(image, search, collected(X, chosen), most, margin)
+        few = _search(image, search, gather(X, chosen), most, margin)
         return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
     return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]

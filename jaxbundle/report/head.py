@@ -13,11 +13,11 @@ from jaxbundle.network.tables import ROLES
 from jaxbundle.report.layout import (
     WIDTH,
     clean,
+    cut_lines,
     facts,
     fixed,
     heading,
     paragraph,
-    shortened,
     significant,
     table,
 )
@@ -298,7 +298,7 @@ def variance_facts(adjustment) -> list[tuple[str, str]]:
 def warnings(adjustment) -> list[str]:
     """Excluded or suspicious data."""
     lines = [line for text in adjustment.warnings for line in paragraph(f"- {clean(text)}", 0, 2)]
-    return [*heading("Warnings"), *shortened(lines, 60, "…")] if lines else []
+    return [*heading("Warnings"), *cut_lines(lines, 60, "…")] if lines else []
 
 
 def why_not_solved(adjustment) -> list[str]:

@@ -166,7 +166,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> l
     return [line(header), *(line(row) for row in rows)]
 
 
-def shortened(lines: Sequence[str], most: int, note: str) -> list[str]:
+def cut_lines(lines: Sequence[str], most: int, note: str) -> list[str]:
     """A list cut after `most` lines, with a note if it was cut."""
     lines = list(lines)
     return lines if len(lines) <= most else [*lines[:most], note]

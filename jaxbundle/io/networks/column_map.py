@@ -49,7 +49,7 @@ import numpy as np
 from jaxbundle import geometry
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.poses import angles_of, are_rotations, batched
+from jaxbundle.io.networks.poses import angles_of, apply_in_batches, are_rotations
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.rows import Rows
@@ -211,7 +211,7 @@ def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Col
         for row in np.flatnonzero(~are_rotations(M))[:1]:
             raise InputError(f"{columns.source(row)}: m11 … m33 are not a rotation matrix")
     else:
-        M = batched(formula, given * radians, (3,), (3, 3))
+        M = apply_in_batches(formula, given * radians, (3,), (3, 3))
     rest = {name: column for name, column in columns.values.items() if name not in names}
     angles = dict(zip(("omega", "phi", "kappa"), angles_of(M).T / radians))
     return Columns({**rest, **angles}, columns.source)

@@ -54,7 +54,7 @@ from jaxbundle.io.networks.losses import (
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
-from jaxbundle.io.text.json_fields import JsonFields, read_object, stacked
+from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Camera, Network, Points, Source
 from jaxbundle.system.file_content import beginning
@@ -130,7 +130,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told,
     )  # fmt: skip
     if control and len(network.points):
-        at = stacked(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
+        at = stack_rows(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
         at = at * mirror
         datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
         unknown = np.full((len(control), 3), np.nan)
@@ -250,14 +250,14 @@ def _image_points(path: Path, rays: Sequence) -> np.ndarray:
     def place(k: int) -> tuple[str, str]:
         return f"{path}, point {rays[k][1]}, view {rays[k][0]}", "x"
 
-    return stacked([x for *_, x in rays], 2, place).reshape(-1, 2)
+    return stack_rows([x for *_, x in rays], 2, place).reshape(-1, 2)
 
 
 def _points(
     path: Path, tie: Mapping, control: Sequence[str], mirror: np.ndarray
 ) -> Columns:
     place = lambda k: (f"{path}, structure[{k}]", "X")
-    known = stacked(list(tie.values()), 3, place).reshape(-1, 3) * mirror
+    known = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
     position = np.concatenate([known, np.full((len(control), 3), np.nan)])
     columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
     return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))

@@ -55,7 +55,7 @@ from jaxbundle.io.networks.poses import (
     rotation_vectors_of,
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
-from jaxbundle.io.text.json_fields import JsonFields, read_object, stacked
+from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.io.text.rows import Rows
 from jaxbundle.io.writing.folders import replaced_folder
 from jaxbundle.network.columns import Columns, count, some
@@ -144,7 +144,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{why}; left out {count(len(lost), 'shot')}: {some(lost)}")
     gps = _positions(shots)
     points = scene.objects("points")
-    at = stacked([p.get("coordinates") for p in points.values()], 3,
+    at = stack_rows([p.get("coordinates") for p in points.values()], 3,
                  lambda k: (str([*points.values()][k].path), "coordinates")).reshape(-1, 3)
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
@@ -255,7 +255,7 @@ def _dual(p: Mapping, X, Y, Z):
 def _images(file: Path, shots: Mapping[str, JsonFields]) -> Columns:
     paths = [str(shot.path) for shot in shots.values()]
     turn, t = (
-        stacked([shot.get(name) for shot in shots.values()], 3, lambda k, n=name: (paths[k], n))
+        stack_rows([shot.get(name) for shot in shots.values()], 3, lambda k, n=name: (paths[k], n))
         for name in ("rotation", "translation")
     )
     M, X0 = exterior_from_cv(matrices_of_rotation_vectors(turn), t)

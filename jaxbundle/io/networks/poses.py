@@ -24,32 +24,32 @@ Quaternions = Float[np.ndarray, "images 4"]
 
 def angles_of(M: Matrices) -> Triples:
     """ω, φ, κ in radians of rotation matrices."""
-    return batched(geometry.omega_phi_kappa_from_matrix, M, (3, 3), (3,))
+    return apply_in_batches(geometry.omega_phi_kappa_from_matrix, M, (3, 3), (3,))
 
 
 def matrices_of(angles: Triples) -> Matrices:
     """M of ω, φ, κ in radians."""
-    return batched(geometry.matrix_from_omega_phi_kappa, angles, (3,), (3, 3))
+    return apply_in_batches(geometry.matrix_from_omega_phi_kappa, angles, (3,), (3, 3))
 
 
 def quaternions_of(M: Matrices) -> Quaternions:
     """Unit quaternions (w, x, y, z) of rotation matrices."""
-    return batched(geometry.quaternion_from_matrix, M, (3, 3), (4,))
+    return apply_in_batches(geometry.quaternion_from_matrix, M, (3, 3), (4,))
 
 
 def matrices_of_quaternions(q: Quaternions) -> Matrices:
     """Rotation matrices of quaternions (w, x, y, z) of any length but 0."""
-    return batched(geometry.matrix_from_quaternion, q, (4,), (3, 3))
+    return apply_in_batches(geometry.matrix_from_quaternion, q, (4,), (3, 3))
 
 
 def rotation_vectors_of(M: Matrices) -> Triples:
     """v with M = exp([v]×)."""
-    return batched(geometry.rotation_vector_from_matrix, M, (3, 3), (3,))
+    return apply_in_batches(geometry.rotation_vector_from_matrix, M, (3, 3), (3,))
 
 
 def matrices_of_rotation_vectors(v: Triples) -> Matrices:
     """M = exp([v]×)."""
-    return batched(geometry.matrix_from_rotation_vector, v, (3,), (3, 3))
+    return apply_in_batches(geometry.matrix_from_rotation_vector, v, (3,), (3, 3))
 
 
 def are_rotations(R: Float[np.ndarray, "*images 3 3"]) -> Bool[np.ndarray, "*images"]:
@@ -71,7 +71,7 @@ def _batch(function, rows):
     return jax.vmap(function)(rows)
 
 
-def batched(function, rows, shape, result_shape):
+def apply_in_batches(function, rows, shape, result_shape):
     """A function of one image's array applied to all, in batches of one shape.
 
     **Arguments:** `rows` [images, *shape]. **Returns:** [images, *result_shape].

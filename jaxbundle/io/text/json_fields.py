@@ -104,7 +104,7 @@ def _object(where: str, value: Any) -> JsonFields:
     return JsonFields(where, value)
 
 
-def stacked(
+def stack_rows(
     values: Sequence[Any], size: int, place: Callable[[int], tuple[str, str]]
 ) -> np.ndarray:
     """Many lists of numbers as one array [len(values), size]; of the k-th, `place(k)` names file
