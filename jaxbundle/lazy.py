@@ -1,12 +1,9 @@
 """Public names of a package that are imported on first use (PEP 562)."""
 
 import importlib
-from collections.abc import Callable, Mapping
 
 
-def import_on_use(
-    package: dict, homes: Mapping[str, tuple[str, ...]]
-) -> tuple[Callable, Callable, list[str]]:
+def import_on_use(package: dict, homes: dict[str, tuple[str, ...]]) -> tuple:
     """`__getattr__`, `__dir__` and `__all__` of a package, given its `globals()` and the names of
     each module."""
     module = {name: home for home, names in homes.items() for name in names}

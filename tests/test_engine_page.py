@@ -37,6 +37,9 @@ def test_an_own_kind(page):
 
 def test_every_module_has_its_place(page):
     folder = Path(__file__).parents[1] / "jaxbundle" / "leastsquares"
-    modules = {path.name for path in folder.glob("*.py")} - {"__init__.py"}
-    named = set(re.findall(r"`(\w+\.py)`", PAGE))
+    modules = {(path.parent.name, path.name) for path in folder.rglob("*.py")}
+    modules = {found for found in modules if found[1] != "__init__.py"}
+    named = set()
+    for room, names in re.findall(r"^\| (?:`(\w+)/`: )?(`\w+\.py`.*?) \|", PAGE, re.MULTILINE):
+        named |= {(room or folder.name, name) for name in re.findall(r"`(\w+\.py)`", names)}
     assert modules - named == set() and named - modules == set()

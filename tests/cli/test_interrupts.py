@@ -71,7 +71,7 @@ def test_it_is_handled_before_anything_else_is_imported(tmp_path):
 import signal, sys
 class Interrupting:
     def find_spec(self, name, *_):
-        if name.partition(".")[2] not in ("", "__main__", "system", "system.interrupts"):
+        if name.partition(".")[2] not in ("", "__main__", "lazy", "system", "system.interrupts"):
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
 from jaxbundle.__main__ import main
