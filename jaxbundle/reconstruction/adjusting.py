@@ -13,19 +13,15 @@
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.network.check import check_network
-from jaxbundle.network.sightings import keep_points, split_check_points
+from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
-from jaxbundle.statistics.inspection import Inspection
 
 GROSS, DOUBTFUL = 4.0, 5.0
 SETTLED = 0.004
@@ -98,10 +94,7 @@ def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " r
 
 def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
-    with ThreadPoolExecutor(1) as ahead:
-        # compiled during the compilation of the adjustment
-        ahead.submit(_inspect, network)
-        result = adjust(network, max_iterations=MOST_ITERATIONS)
+    result = adjust(network, max_iterations=MOST_ITERATIONS)
     total = np.ones(len(network.observations))
     given, doubtful = network.observations.sigma, []
     if result.converged:
@@ -126,14 +119,6 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
     return Weighted(result, kept)
-
-
-def _inspect(network: Network) -> None:
-    """Compute all statistics for data snooping, at the start values."""
-    problem = make_problem(split_check_points(check_network(network))[0]).with_factor()
-    found = Inspection(problem, problem.data.start)
-    found.reliability  # noqa: B018
-    found.solution.by_eliminated  # noqa: B018
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
