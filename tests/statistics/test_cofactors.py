@@ -17,13 +17,16 @@ from adjustment_checks import (
 )
 
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.cameras import get_model
 from jaxbundle.geometry import quaternion_difference
 from jaxbundle.leastsquares.datum.conditions import move_to_datum
 from jaxbundle.leastsquares.iterations.solver import minimise
 from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.problem import make_solver, pad_data
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
+from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.projection import images_through_scene
 
 NAMES = ("cameras of two models", "everything given", "free", "minimal")
 
@@ -145,13 +148,13 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     termination, found, vtpv = sample(solver, data.image_xy + part * noise)
     assert (np.asarray(termination) == SETTLED).all()
     true = solved(problem).values
-    at = lambda rows, name: rows[:, : system.table(name).rows]
-    position, rotation = (at(x, "image") for x in found["image"])
+    at_all = lambda rows, name: rows[:, : system.table(name).rows]
+    position, rotation = (at_all(x, "image") for x in found["image"])
     turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(rotation, true.rotation)
     changes = {
         "image": jnp.concatenate([position - true.position, turn], 2),
-        "camera": (at(found["camera"], "camera") - true.camera)[:, :, problem.interior(0)[1]],
-        "point": at(found["point"], "point") - true.point,
+        "camera": (at_all(found["camera"], "camera") - true.camera)[:, :, problem.interior(0)[1]],
+        "point": at_all(found["point"], "point") - true.point,
     }
     dense = linearise(problem, true)
     Q, x = dense.Q, np.zeros((DRAWS, len(dense.free)))
@@ -172,6 +175,16 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     square = np.einsum("di,ij,dj->d", x[:, at], weight, x[:, at])
     assert_between(square.mean(), 4, np.sqrt(2 * 4 / DRAWS))
     assert_between(mean[at] * sigma[at] @ weight @ (mean[at] * sigma[at]), 4, np.sqrt(2 * 4))
+    # The image of points held in the scene, near and at infinity: the cameras move, nothing of the
+    # object is known.
+    drawn = (at_all(found["camera"], "camera"), position, rotation, at_all(found["point"], "point"))
+    grid = np.stack(np.meshgrid([-6.0, 0.0, 6.0], [-4.0, 4.0]), -1).reshape(-1, 2)
+    for distance in (12.0, np.inf):
+        images = images_through_scene(get_model("brown"), 0, np.arange(6), true, grid, distance)
+        of = jax.jit(jax.vmap(lambda c, X0, q, X, f=images: f(Values(c, X0, q, X)) - f(true)))
+        stated = np.sqrt(np.diag(Inspection(problem, true).propagate(images)))
+        ratio = np.sqrt((np.asarray(of(*drawn)) ** 2).mean(0)) / part / stated
+        assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * DRAWS)
     # vᵀPv is χ² of the redundancy.
     f = problem.counts.redundancy
     assert_between(np.mean(vtpv), f, np.sqrt(2 * f / DRAWS))
