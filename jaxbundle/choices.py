@@ -52,7 +52,7 @@ ORDERS = {
 DESIGNED = ("position", "direction", "roll", "targets")
 """Variables of a first-order design."""
 
-BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco")
+BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
 CODED_TARGETS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
 FEATURES = ("sift", "akaze", "orb")
 MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")

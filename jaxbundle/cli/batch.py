@@ -37,8 +37,8 @@ def batch(
         float | None, typer.Option(help="side of a square, distance of circles")
     ] = None,
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
-    marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
-    dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
+    marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
+    dictionary: Annotated[str, typer.Option(help="of markers or tags")] = "DICT_4X4_50",
     rig: Annotated[
         bool,
         typer.Option("--rig", help="folders of rigs: in each a folder of photographs a camera"),

@@ -23,7 +23,7 @@ def board_given(
         raise InputError("--square is missing: the side of a square, or the spacing of circles")
     circles = ("circles", "asymmetric-circles")
     for value, option, kinds in (
-        (diameter, "--diameter", circles), (marker, "--marker", ("charuco",)),
+        (diameter, "--diameter", circles), (marker, "--marker", ("charuco", "aprilgrid")),
     ):  # fmt: skip
         if value is not None and kind not in kinds:
             raise InputError(f"{option} is not for --kind {kind}, but for {' and '.join(kinds)}")

@@ -44,8 +44,8 @@ def calibrate(
     diameter: Annotated[
         float | None, typer.Option(help="of the circles, to correct their eccentricity")
     ] = None,
-    marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
-    dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
+    marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
+    dictionary: Annotated[str, typer.Option(help="of markers or tags")] = "DICT_4X4_50",
     board_sigma: Annotated[
         float | None, typer.Option(help="σ of a board coordinate, for an inexact board")
     ] = None,

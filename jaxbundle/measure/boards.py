@@ -10,6 +10,7 @@ last row.
 | `circles` | centres of the circles | circles |
 | `asymmetric-circles` | the same, every other row shifted by half a step | circles of a row, rows |
 | `charuco` | corners of the squares; may be hidden in part | squares |
+| `aprilgrid` | corners of AprilTags (Kalibr); may be hidden in part | tags |
 
 The first corner of a chessboard has a black square beyond it, to the upper left; if a half turn
 does not change the colours (columns + rows even), the upper of the two possible corners in the
@@ -28,9 +29,11 @@ from jaxbundle.choices import BOARDS
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
-LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3}
+LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2}
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
+ARUCO, APRILTAGS = "DICT_4X4_50", "DICT_APRILTAG_36h11"
+"""Dictionaries of `charuco` and `aprilgrid`, if none is given."""
 
 
 def _is_length(x: float) -> bool:
@@ -45,10 +48,12 @@ class Board:
 
     - `columns`, `rows`: as the table above counts them.
     - `square`: side of a square, or distance of neighbouring circles, in the object unit; for
-      `asymmetric-circles` the distance of neighbouring rows, half that of circles in a row.
+      `asymmetric-circles` the distance of neighbouring rows, half that of circles in a row, for
+      `aprilgrid` the distance of neighbouring tags, side and gap.
     - `kind`: see the table.
     - `diameter`: of the circles, object unit: their images are then corrected for eccentricity.
-    - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`.
+    - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`, or of the tags
+      of `aprilgrid`.
 
     **Raises:** `InputError` for an impossible board.
     """
@@ -59,7 +64,7 @@ class Board:
     kind: str = "chessboard"
     diameter: float | None = None
     marker: float | None = None
-    dictionary: str = "DICT_4X4_50"
+    dictionary: str = ARUCO
 
     def __post_init__(self):
         if not isinstance(self.kind, str) or self.kind not in BOARDS:
@@ -77,6 +82,10 @@ class Board:
             if value is not None or name == "square":
                 length = number(f"board: {name}", value, "a positive length", _is_length)
                 object.__setattr__(self, name, length)
+        if self.kind == "aprilgrid":
+            given = self.marker, self.dictionary
+            object.__setattr__(self, "marker", given[0] or MARKER * self.square)
+            object.__setattr__(self, "dictionary", APRILTAGS if given[1] == ARUCO else given[1])
         if self.marker is not None and self.marker >= self.square:
             raise InputError(
                 f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
@@ -85,6 +94,8 @@ class Board:
     @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of points."""
+        if self.kind == "aprilgrid":
+            return 2 * self.rows, 2 * self.columns
         less = self.kind == "charuco"
         return self.rows - less, self.columns - less
 
@@ -99,6 +110,9 @@ class Board:
         """Coordinates in the object unit, in the order of `ids`."""
         rows, columns = self.grid
         i, j = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+        if self.marker is not None and self.kind == "aprilgrid":
+            place = lambda k: k // 2 * self.square + k % 2 * self.marker
+            return np.stack([place(j), place(rows - 1 - i), np.zeros(len(i))], 1)
         along = 2 * j + i % 2 if self.kind == "asymmetric-circles" else j
         return self.square * np.stack([along, rows - 1 - i, np.zeros(len(i))], 1)
 
@@ -109,7 +123,7 @@ class Board:
             return (self.columns + self.rows) % 2 == 1
         if self.kind == "asymmetric-circles":
             return self.rows % 2 == 1
-        return self.kind == "charuco"
+        return self.kind in ("charuco", "aprilgrid")
 
     def __str__(self) -> str:
         return f"{self.kind} {self.columns}x{self.rows}, square {self.square:g}"

@@ -14,21 +14,19 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import LEAST, MARKER, Board
+from jaxbundle.measure.corner_windows import half_window, refine_by_gradients
+from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.photographs.opencv import need_opencv
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
-WINDOW = 0.35
-"""Half a window relative to the distance to the next corner: no other corner is in it."""
 SIDES = (1600, 3200)
 """Longer sides of the reduced copies in which boards are searched in turn, in pixels."""
 MARKERS = 3
 """More markers than this prove another dictionary: false ones are rare."""
 QUICK = 800
 """The same for boards of other sizes."""
-SMALLEST, LARGEST = 2, 15
-"""Limits of half a window, in pixels."""
 
 
 def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
@@ -39,7 +37,8 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
     cv2 = need_opencv()
     if min(grey.shape) < 16:
         raise InputError(f"the image of {grey.shape[1]} × {grey.shape[0]} pixels is too small")
-    find = {"chessboard": _chessboard, "charuco": _charuco}.get(board.kind, _circles)
+    finders = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": find_tags}
+    find = finders.get(board.kind, _circles)
     try:
         return find(cv2, grey, board)
     except cv2.error as error:
@@ -57,6 +56,8 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
         return None if other == board else other
     if board.kind == "charuco":
         return _with_other_markers(grey, board)
+    if board.kind == "aprilgrid":
+        return None
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     grey, _ = _reduce(need_opencv(), grey, QUICK)
@@ -153,15 +154,8 @@ def _reduce(cv2, grey, side):
 def _refine(cv2, grey, xy):
     """Refined corners [rows, columns, 2], each in a window without other corners."""
     near = [np.linalg.norm(np.diff(xy, axis=axis), axis=2) for axis in (0, 1)]
-    half = int(np.clip(WINDOW * min(d.min() for d in near), SMALLEST, LARGEST))
-    return _by_gradients(cv2, grey, xy.reshape(-1, 2), half).reshape(xy.shape)
-
-
-def _by_gradients(cv2, grey, xy, half):
-    corners = np.ascontiguousarray(xy, np.float32).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
-    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop).reshape(-1, 2)
-    return refined.astype(float)
+    half = half_window(min(d.min() for d in near))
+    return refine_by_gradients(grey, xy.reshape(-1, 2), half).reshape(xy.shape)
 
 
 def _turned_right(xy):
@@ -194,13 +188,7 @@ def _contrast(grey, xy):
 
 
 def _charuco(cv2, grey, board):
-    aruco = cv2.aruco
-    names = [name for name in dir(aruco) if name.startswith("DICT_")]
-    if board.dictionary not in names:
-        raise InputError(
-            f"there is no dictionary {board.dictionary!r} of markers; known: {', '.join(names)}"
-        )
-    dictionary = aruco.getPredefinedDictionary(getattr(aruco, board.dictionary))
+    aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
     marker = board.marker or MARKER * board.square
     best = None
     for legacy in (False, True):
@@ -219,9 +207,9 @@ def _charuco(cv2, grey, board):
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=2)
     # no markers beside a corner in its window
     free = 0.5 * (1 - marker / board.square)
-    half = int(np.clip(min(WINDOW, free) * apart[apart > 0].min(), SMALLEST, LARGEST))
+    half = half_window(apart[apart > 0].min(), free)
     found = np.full((len(board.ids), 2), np.nan)
-    found[ids] = _by_gradients(cv2, grey, xy, half)
+    found[ids] = refine_by_gradients(grey, xy, half)
     return found
 
 

@@ -51,6 +51,7 @@ def test_broken_corners(tmp_path, old, new, message):
 
 @pytest.mark.parametrize("board", [
     Board(6, 7, 0.06), Board(6, 7, 0.02, "circles"), Board(4, 11, 0.01, "asymmetric-circles"),
+    Board(6, 5, 0.0625, "aprilgrid", marker=0.05),
 ])  # fmt: skip
 def test_targets_there_and_back(tmp_path, board):
     write_target(board, tmp_path / "target.yaml")
@@ -69,8 +70,15 @@ def test_a_target_by_hand(tmp_path):
     path = tmp_path / "target.yaml"
     path.write_text(CHECKERBOARD)
     assert read_target(path) == Board(6, 7, 0.06)
+    path.write_text("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088 #[m]\n"
+                    "tagSpacing: 0.3 #ratio of space between tags to tagSize\n")
+    grid = read_target(path)
+    assert (grid.kind, grid.grid, grid.marker) == ("aprilgrid", (10, 12), 0.088)
+    # the last corner of the first row: five steps and a side to the right, four and a side up
+    right, up = 0.088 * (5 * 1.3 + 1), 0.088 * (4 * 1.3 + 1)
+    np.testing.assert_allclose(grid.points[11], [right, up, 0], rtol=1e-15)
     for old, new, message in [
-        ("'checkerboard'", "aprilgrid", "target_type aprilgrid: a grid of AprilTags is no"),
+        ("'checkerboard'", "hexagons", "target_type hexagons: checkerboard or"),
         ("colSpacingMeters: 0.06", "colSpacingMeters: 0.05", "squares are expected"),
         ("targetRows", "rows", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
     ]:  # fmt: skip

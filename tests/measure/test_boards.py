@@ -18,6 +18,7 @@ CHESS = Board(9, 6, 0.03)
 CIRCLES = Board(8, 6, 0.03, "circles", diameter=0.012)
 UNEVEN = Board(4, 7, 0.02, "asymmetric-circles", diameter=0.012)
 CHARUCO = Board(9, 6, 0.03, "charuco")
+TAGS = Board(5, 4, 0.052, "aprilgrid", marker=0.04)
 POSES = [(25, -20, 90, 0.5), (-20, 15, -80, 0.5), (10, 20, 175, 0.5)]
 
 
@@ -32,6 +33,21 @@ def printed(board):
         picture = drawn.generateImage((120 * board.columns, 120 * board.rows), marginSize=0)
         pattern = render.print_of(picture, board.columns * board.square, MARGIN)
         return lambda X, Y: pattern(X + board.square, Y + board.square)
+    if board.kind == "aprilgrid":
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+        side, step, gap = 120, 156, 36
+        picture = np.full((board.rows * step + gap, board.columns * step + gap), 255, np.uint8)
+        for row in range(board.rows + 1):
+            for column in range(board.columns + 1):
+                v, u = row * step, column * step
+                picture[v : v + gap, u : u + gap] = 0
+                if row < board.rows and column < board.columns:
+                    number = (board.rows - 1 - row) * board.columns + column
+                    tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)
+                    picture[v + gap : v + step, u + gap : u + step] = np.rot90(tag, 2)
+        gap *= board.marker / side
+        pattern = render.print_of(picture, board.columns * board.square + gap, MARGIN)
+        return lambda X, Y: pattern(X + gap, Y + gap)
     return render.discs(board.points[:, :2], board.diameter / 2, margin=MARGIN)
 
 
@@ -41,7 +57,7 @@ def taken(board, omega, phi, kappa, distance, seed=0):
     return picture, render.LENS.image_of(M, X0, board.points)
 
 
-@pytest.mark.parametrize("board", [CHESS, CIRCLES, UNEVEN, CHARUCO], ids=lambda b: b.kind)
+@pytest.mark.parametrize("board", [CHESS, CIRCLES, UNEVEN, CHARUCO, TAGS], ids=lambda b: b.kind)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_point_is_found_and_numbered(board, seed):
     picture, true = taken(board, *POSES[seed], seed)

@@ -3,7 +3,7 @@
     target_type: checkerboard    targetCols, targetRows: inner corners; rowSpacingMeters,
                                  colSpacingMeters, which must be equal
     target_type: circlegrid      targetCols, targetRows, spacingMeters, asymmetricGrid
-    target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: refused by name
+    target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: gap / tagSize
 
 The spacing of an asymmetric grid is between neighbouring rows, as `Board.square`. Metres.
 
@@ -19,21 +19,25 @@ from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import shown
 
-TYPES = ("checkerboard", "circlegrid")
+TYPES = ("checkerboard", "circlegrid", "aprilgrid")
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
 
 
 def read_target(path: str | Path) -> Board:
     """The board of a file.
 
-    **Raises:** `InputError` naming file and key, also for a grid of AprilTags.
+    **Raises:** `InputError` naming file and key.
     """
     fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
     kind = fields.text("target_type")
     if kind not in TYPES:
-        more = "a grid of AprilTags is no board of calibrate, but reconstruct --targets aprilgrid "
-        more = f"{more}measures it; " if kind == "aprilgrid" else ""
-        raise InputError(f"{path}: target_type {kind}: {more}{' or '.join(TYPES)} is expected")
+        raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
+    if kind == "aprilgrid":
+        columns, rows = (fields.whole(key, least=1) for key in ("tagCols", "tagRows"))
+        side, gap = fields.number("tagSize"), fields.number("tagSpacing")
+        if not gap > 0:
+            raise InputError(f"{path}: tagSpacing {gap:g}: a positive part of tagSize is expected")
+        return Board(columns, rows, side * (1 + gap), kind, marker=side)
     columns, rows = (fields.whole(key, least=1) for key in ("targetCols", "targetRows"))
     if kind == "circlegrid":
         asymmetric = fields.get("asymmetricGrid", False)
@@ -56,6 +60,12 @@ def write_target(board: Board, path: str | Path) -> None:
     """
     if board.kind == "charuco":
         raise InputError(f"{path}: Kalibr has no board of kind charuco")
+    if board.kind == "aprilgrid" and board.marker:
+        lines = [f"tagCols: {board.columns}", f"tagRows: {board.rows}"]
+        gap = board.square / board.marker - 1
+        lines += [f"tagSize: {board.marker!r}", f"tagSpacing: {gap!r}"]
+        write_text(Path(path), "\n".join(["target_type: 'aprilgrid'", *lines]) + "\n")
+        return
     lines = [f"targetCols: {board.columns}", f"targetRows: {board.rows}"]
     if board.kind == "chessboard":
         lines = ["target_type: 'checkerboard'", *lines, f"rowSpacingMeters: {board.square!r}",

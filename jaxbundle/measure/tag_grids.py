@@ -1,0 +1,114 @@
+"""Grids of AprilTags as Kalibr prints them: tag 0 at the lower left, numbers to the right and then
+up, black squares in the gaps between the corners of tags, borders of two bits.
+
+Tags are found and read by OpenCV. Which corner of a tag is which follows from the place of the tag
+among the others (a homography of all of them), not from how the tag itself is turned. Grids
+numbered from the upper left, and borders of one bit, are recognised.
+
+Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.boards import MARKER, Board
+from jaxbundle.measure.corner_windows import Grey, half_window, refine_by_gradients
+
+BORDERS = (2, 1)
+"""Bits of the border: of Kalibr, of other printed tags."""
+FEWEST = 4
+"""Fewest tags of a grid."""
+NEIGHBOURS = 9
+"""Tags whose middles give the places of the corners of a tag."""
+FAR = 0.25
+"""Largest distance of a corner from its place by the homography, in sides of its tag."""
+
+
+def get_dictionary(name: str) -> Any:
+    """OpenCV's dictionary of this name.
+
+    **Raises:** `InputError` for an unknown one."""
+    import cv2
+
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    if name not in names:
+        raise InputError(
+            f"there is no dictionary {name!r} of markers; known: {', '.join(names)}"
+        )
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def find_tags(cv2, grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
+    """The corners of the tags in a photograph, in the order of `board.ids`; NaN where missing.
+
+    **Raises:** `InputError` for fewer than four tags, or tags in one row.
+    """
+    ids, seen = max((_read_tags(cv2, grey, board, bits) for bits in BORDERS),
+                    key=lambda found: len(found[0]))  # fmt: skip
+    rows, columns = np.divmod(ids, board.columns)
+    if len(ids) < FEWEST or not (np.ptp(rows) and np.ptp(columns)):
+        raise InputError(
+            f"fewer than {FEWEST} tags of a grid of {board.columns} × {board.rows} tags "
+            f"({board.dictionary}), or only of one row, found"
+        )
+    for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
+        corners = _corners_of_tags(board, place, columns)
+        near = _places(cv2, board.points[corners, :2], seen)
+        if near is not None:
+            break
+    else:
+        raise InputError(f"the tags found are not those of a flat grid: {board}")
+    found = np.full((len(board.ids), 2), np.nan)
+    side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
+    for which, there, four, length in zip(corners, near, seen, side):
+        apart = np.linalg.norm(there[:, None] - four, axis=2)
+        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < FAR * length:
+            found[which] = there  # OpenCV's corners reach into the squares of the gaps
+    known = np.isfinite(found[:, 0])
+    marker = board.marker or MARKER * board.square
+    half = half_window(side.min() * min(1.0, board.square / marker - 1))
+    refined = refine_by_gradients(grey, found[known], half)
+    moved = np.linalg.norm(refined - found[known], axis=1)
+    found[known] = np.where(((moved > 0) & (moved < half + 1))[:, None], refined, np.nan)
+    if np.isnan(found).all():
+        raise InputError(f"the tags found are not those of a flat grid: {board}")
+    return found
+
+
+def _read_tags(
+    cv2, grey, board: Board, bits: int
+) -> tuple[Int[np.ndarray, " tags"], Float[np.ndarray, "tags 4 2"]]:
+    """Numbers and corners of the tags of a board; those read twice are left out."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = bits
+    detector = cv2.aruco.ArucoDetector(get_dictionary(board.dictionary), parameters)
+    corners, ids, _ = detector.detectMarkers(grey)
+    ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
+    once = (ids < board.columns * board.rows) & (np.bincount(ids, minlength=1)[ids] == 1)
+    seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
+    return ids[once], seen[once]
+
+
+def _corners_of_tags(board: Board, rows, columns) -> Int[np.ndarray, "tags 4"]:
+    """The points of the board that are the corners of tags, by their row from the top."""
+    i, j = (2 * rows[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0])
+    return i * 2 * board.columns + j
+
+
+def _places(cv2, X, seen) -> Float[np.ndarray, "tags 4 2"] | None:
+    """Corners [tags, 4, 2] by homographies of the middles of neighbouring tags, so that distortion
+    matters little; None for a mirror image."""
+    middle, there = X.mean(1), seen.mean(1)
+    H, _ = cv2.findHomography(middle, there, cv2.LMEDS)
+    if H is None or np.linalg.det(H / H[2, 2]) > 0:  # Y of the board is up, v down
+        return None
+    found = np.empty(X.shape)
+    for tag, four in enumerate(X):
+        near = np.argsort(np.linalg.norm(middle - middle[tag], axis=1))[:NEIGHBOURS]
+        flat = np.linalg.matrix_rank(middle[near] - middle[tag]) == 2
+        local = cv2.findHomography(middle[near], there[near])[0] if flat and len(near) > 3 else H
+        found[tag] = cv2.perspectiveTransform(four[None], H if local is None else local)[0]
+    return found
