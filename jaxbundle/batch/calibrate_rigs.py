@@ -48,7 +48,7 @@ class RigBatch:
     def __str__(self) -> str:
         names, counts = np.unique(self.status, return_counts=True)
         states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
-        rms = [row["rms"] for row in self.rows if row["status"] in SOLVED]
+        rms = [row["rms"] for row in self.rows if row["status"] in SOLVED and "rms" in row]
         said = f"median RMS {np.median(rms):.4g} px" if rms else "no result"
         return f"{len(self)} rigs: {states}; {said}"
 

@@ -62,8 +62,8 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
     except Exception as error:
         failed = error
         if index == 0:
-            _tell(waiting, "begin", str(error))
-    _tell(waiting, str(index), str(failed or ""))
+            _tell(waiting, "begin", _in_words(error))
+    _tell(waiting, str(index), "" if failed is None else _in_words(failed))
     others = _wait(waiting, list(map(str, range(number))))
     jax.distributed.shutdown()  # A barrier: from here every process is on its own.
     if index == 0:
@@ -77,6 +77,10 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
         add_parts(file)
         counts = run_batch(inputs, file, compute=False, **own)
     return counts
+
+
+def _in_words(error: Exception) -> str:
+    return str(error) or type(error).__name__
 
 
 def _clear(file: str | Path, waiting: str) -> None:

@@ -149,8 +149,12 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
         xy = rig.xy.copy()
         xy[:, list(bad)] = np.nan
         rig = dataclasses.replace(rig, xy=xy)
-        network = declare_rig(rig, firsts, settings)
-        result = adjust(network, max_iterations=settings.max_iterations)
+        try:
+            network = declare_rig(rig, firsts, settings)
+            result = adjust(network, max_iterations=settings.max_iterations)
+        except (InputError, NotSolvedError, ValueError) as error:
+            left_out = "; ".join(f"epoch {epoch} {why}" for epoch, why in excluded.items())
+            raise NotSolvedError(f"{left_out}; without these: {error}") from None
     return adjust(network, max_iterations=settings.max_iterations, snooping=settings.snooping,
                   significance=settings.significance), excluded  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Whether the input of a command is small, so that compiling takes longer than computing."""
 
+import re
 from pathlib import Path
 
 SMALL = 100_000
@@ -7,7 +8,8 @@ SMALL = 100_000
 
 
 def is_small(path: Path) -> bool:
-    """Whether a file, the files beside it for a project, or those of a folder, are small."""
+    """Whether a file, the files beside it for a project, or those of a folder, are small; a project
+    with files elsewhere is not."""
     folder = path if path.is_dir() else path.parent if path.suffix == ".toml" else None
     total = 0
     try:
@@ -15,6 +17,8 @@ def is_small(path: Path) -> bool:
             total += file.stat().st_size
             if total > SMALL or file.is_dir():
                 return False
-    except OSError:
+        if path.suffix == ".toml" and re.search(r"""["'](\.\.|/|\w:)""", path.read_text()):
+            return False
+    except (OSError, ValueError):
         return False  # The command says so.
     return True

@@ -155,7 +155,8 @@ def _project(model, values: Values, xy, rows, image, camera, point):
 @jax.jit
 def _root(variance, rounding=ROUNDING):
     """σ, with derivative 0 where it is 0; NaN stays NaN. `rounding`: see `ROUNDING`."""
-    none = variance <= rounding * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
+    none = variance <= 0
+    none |= variance <= rounding * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 

@@ -66,23 +66,34 @@ def split_contradicted(
         if found.count(False) <= found.count(True) and (needed or any(found)):
             taken.add((i, j))
             group = {k: group[i] if g == group[j] else g for k, g in group.items()}
-    taken -= _beside_the_best(pairs, taken)
+    taken = _without_weak(pairs, taken)
     return ([p for p in pairs if p.images in taken], [p for p in pairs if p.images not in taken])
 
 
-def _beside_the_best(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tuple[int, int]]:
-    """The weaker pairs of photographs most of whose pairs contradict others, except the only pair
-    of another photograph."""
-    every = {k for pair in pairs for k in pair.images}
-    of = {k: [p for p in pairs if k in p.images] for k in every}
-    left = {k: [p for p in of[k] if p.images in taken] for k in every}
-    alone = {p.images for found in left.values() if len(found) == 1 for p in found}
-    weak = set()
-    for k in every:
-        if len(left[k]) < FEW * len(of[k]):
-            most = max(map(len, left[k]), default=0)
-            weak |= {p.images for p in left[k] if 2 * len(p) < most}
-    return weak - alone
+def _without_weak(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """The accepted pairs without the weaker ones of photographs most of whose pairs contradict
+    others; a pair that alone connects photographs stays."""
+    weak = []
+    for k in {k for pair in pairs for k in pair.images}:
+        of = [p for p in pairs if k in p.images]
+        left = [p for p in of if p.images in taken]
+        if len(left) < FEW * len(of):
+            most = max(map(len, left), default=0)
+            weak += [p for p in left if 2 * len(p) < most]
+    for pair in sorted(weak, key=len):
+        others = taken - {pair.images}
+        if _are_connected(others, *pair.images):
+            taken = others
+    return taken
+
+
+def _are_connected(pairs: set[tuple[int, int]], i: int, j: int) -> bool:
+    """Whether a chain of pairs leads from a photograph to another."""
+    reached, before = {i}, set()
+    while reached != before and j not in reached:
+        before = reached
+        reached = before | {k for pair in pairs if before & {*pair} for k in pair}
+    return j in reached
 
 
 def _pair(i: int, j: int) -> tuple[int, int]:

@@ -36,7 +36,9 @@ NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 Without redundancy all residuals vanish and there is no σ0 for stopping: this wider floor is used.
 """
 NEAR = 0.1
-"""Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction."""
+"""Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction. A
+rejected undamped step makes the limit of its problem ten times narrower, and nothing else: only
+those after a damped step that settled count as `REFUSALS`."""
 KEPT, FALLING = 0.95, 0.5
 """The fraction of its prediction that it must achieve, and its limit relative to the one before."""
 REFUSALS = 2
