@@ -32,9 +32,12 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
+from jaxbundle.system.memory import return_freed_memory
 
 LARGE = 200_000
 """Problems with more observations are compiled for their exact sizes."""
+WORTH_RETURNING = 10_000
+"""Planning more observations leaves memory worth returning to the system."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +122,10 @@ def make_problem(
     data = make_data(declared, tables, observations)
     problem = Problem(tables, observations, declared, planned[0], data, *planned[1:],
                       count(tables, data), (retraction or Retraction)(declared))  # fmt: skip
-    return problem if motions is None else _with_datum(problem, datum)
+    problem = problem if motions is None else _with_datum(problem, datum)
+    if sum(o.number for o in observations) > WORTH_RETURNING:
+        return_freed_memory()
+    return problem
 
 
 def _make_plan(tables, observations, eliminate, ways):
