@@ -17,12 +17,11 @@ import machine
 
 memory = {"import_mb": machine.peak_mb()}
 
-import equinox as eqx  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxbundle  # noqa: E402
 from jaxbundle.choices import REDUCTIONS  # noqa: E402
-from jaxbundle.leastsquares.iterations.solver import minimise  # noqa: E402
+from jaxbundle.leastsquares.iterations.solver import find  # noqa: E402
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS  # noqa: E402
 from jaxbundle.leastsquares.problem import make_solver, pad_data  # noqa: E402
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards  # noqa: E402
@@ -38,8 +37,8 @@ def prepare(path: str, evaluations: int, reduction: str | None):
     if len(jax.devices()) > 1:
         shards = distribute(problem)
         return problem, lambda: find_minimum_of_shards(shards, solver)
-    compiled, data = eqx.filter_jit(minimise), pad_data(problem, problem.data)
-    return problem, lambda: compiled(solver, data, data.start)
+    data = pad_data(problem, problem.data)
+    return problem, lambda: find(solver, data, data.start)
 
 
 def main() -> None:

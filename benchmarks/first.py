@@ -2,17 +2,21 @@
 
     python benchmarks/first.py [--input PROJECT] [--repeat N] [--json FILE]
 
-`jaxbundle adjust PROJECT --quiet`, in processes of their own and in pairs: the first finds an empty
-folder of compiled programs (a temporary one), the second what the first left there. Told are the
-seconds from the start of a process to its end, on the clock and of the processor, the best of the
-pairs; beside them a process that only imports JAX. Demanded of a small network on two cores: below
-10 s and below 3 s; a demand that is not met is told, and does not change the exit status.
+`jaxbundle adjust PROJECT` in processes of their own. The first finds an empty (temporary) folder of
+programs; the second, and a third on a pseudo-terminal, find what the first left there. The first
+two are run with `--quiet`; the third prints its report and shows its progress, as for a person.
+Reported are the seconds from the start of a process to its end, on the clock and of the processor,
+the best of the rounds, beside those of a process that only imports JAX. On a quiet machine with two
+cores the limits for a small network are 4 s and 2 s; missing one is reported and does not change
+the exit status.
 """
 
 import os
+import pty
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -21,36 +25,56 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import machine
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "convergent4" / "project.toml"
-DEMANDED = {"empty folder of programs": 10.0, "full folder of programs": 3.0}
+EMPTY, FULL, TERMINAL = "empty folder of programs", "full folder of programs", "full, on a terminal"
+LIMITS = {EMPTY: 4.0, FULL: 2.0}
 
 
-def seconds_of(command: list[str], folder: str) -> tuple[float, float]:
+def seconds_of(command: list[str], folder: str, terminal: bool = False) -> tuple[float, float]:
     """Seconds of a process, on the clock and of the processor."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder}
+    controller, output = pty.openpty() if terminal else (None, subprocess.DEVNULL)
     begin = time.perf_counter()
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, env=environment, stdout=output,
+                               stderr=output if terminal else None)  # fmt: skip
+    if controller is not None:
+        threading.Thread(target=read_all, args=(controller,), daemon=True).start()
     _, status, usage = os.wait4(process.pid, 0)
     clock = time.perf_counter() - begin
+    if terminal:
+        os.close(output)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{' '.join(command)} ended with status {process.returncode}")
     return clock, usage.ru_utime + usage.ru_stime
 
 
+def read_all(controller: int) -> None:
+    """Read what is printed on a pseudo-terminal, until it is closed."""
+    try:
+        while os.read(controller, 1 << 16):
+            pass
+    except OSError:
+        pass  # how Linux reports the end
+    os.close(controller)
+
+
 def main() -> None:
     parser = machine.parser_of(__doc__)
     parser.add_argument("--input", default=str(EXAMPLE), help="anything `adjust` reads")
-    parser.add_argument("--repeat", type=machine.positive, default=3, help="pairs of processes")
+    parser.add_argument("--repeat", type=machine.positive, default=3, help="rounds of processes")
     parser.add_argument("--json", type=machine.target, metavar="FILE",
                         help="write the figures; - for standard output")  # fmt: skip
     given = parser.parse_args()
-    adjust = [sys.executable, "-m", "jaxbundle", "adjust", given.input, "--quiet"]
-    runs = {"import of JAX": [], **{name: [] for name in DEMANDED}}
+    adjust = [sys.executable, "-m", "jaxbundle", "adjust", given.input]
+    runs = {"import of JAX": [], EMPTY: [], FULL: [], TERMINAL: []}
     for _ in range(given.repeat):
         with tempfile.TemporaryDirectory() as folder:
             runs["import of JAX"].append(seconds_of([sys.executable, "-c", "import jax"], folder))
-            for name in DEMANDED:
-                runs[name].append(seconds_of(adjust, folder))
+            for name in LIMITS:
+                runs[name].append(seconds_of([*adjust, "--quiet"], folder))
+            for _ in range(2):  # the report has programs of its own
+                last = seconds_of(adjust, folder, terminal=True)
+            runs[TERMINAL].append(last)
     best = {
         name: dict(zip(("clock_s", "processor_s"), map(min, zip(*pairs))))
         for name, pairs in runs.items()
@@ -62,12 +86,12 @@ def main() -> None:
     if given.json != "-":
         print(machine.in_words(found["machine"]))
         for name, seconds in best.items():
-            demand = ""
-            if name in DEMANDED:
-                met = "met" if seconds["clock_s"] <= DEMANDED[name] else "NOT MET"
-                demand = f"   demanded {DEMANDED[name]:.0f}: {met}"
+            limit = ""
+            if name in LIMITS:
+                met = "met" if seconds["clock_s"] <= LIMITS[name] else "NOT MET"
+                limit = f"   limit {LIMITS[name]:.0f} s: {met}"
             print(f"{name:26}{seconds['clock_s']:6.2f} s, processor "
-                  f"{seconds['processor_s']:6.2f} s{demand}")  # fmt: skip
+                  f"{seconds['processor_s']:6.2f} s{limit}")  # fmt: skip
     machine.write_json(found, given.json)
 
 

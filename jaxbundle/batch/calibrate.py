@@ -49,6 +49,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.programs import compile_once
 
 OF_A_START = ("quaternion", "shift")
 """Poses in the form of the solver, only for data snooping."""
@@ -222,7 +223,7 @@ def _snoop(
     return rows
 
 
-@partial(jax.jit, static_argnums=range(3))
+@partial(compile_once, static=range(3))
 def _tests_program(model, free, on_cpu, seen, used, interior, quaternion, shift, views):
     def one(arguments):
         seen, used, at, views = arguments
@@ -242,7 +243,7 @@ def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion
     return jax.tree.map(np.array, result)
 
 
-@partial(jax.jit, static_argnums=range(5))
+@partial(compile_once, static=range(5))
 def _portion_program(
     model, free, known, flat, on_cpu, max_steps, size, seen, interior, axes, middle
 ):

@@ -43,6 +43,7 @@ from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, data_frame, some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
+from jaxbundle.system.programs import compile_once
 
 MOST_TOGETHER = 1500
 """Coordinates of points whose joint covariance is formed; of more, portions of so many are."""
@@ -293,7 +294,7 @@ def _frames(a: Adjustment, b: Adjustment, held: Sequence[str]):
     return (one, other), tau
 
 
-_move = jax.jit(jax.vmap(transform_point, (None, 0)))
+_move = compile_once(jax.vmap(transform_point, (None, 0)), ())
 
 
 def _scale_is_open(problem: Problem) -> bool:
@@ -353,7 +354,7 @@ class _In:
         return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
 
 
-@eqx.filter_jit
+@compile_once
 def _call(chosen, values):
     return chosen(values)
 

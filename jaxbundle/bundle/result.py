@@ -6,6 +6,7 @@ computed on first access. Without a solution every accessor raises `NotSolvedErr
 
 import functools
 from collections.abc import Callable, Mapping
+from functools import partial
 from os import PathLike
 
 import jax
@@ -53,6 +54,7 @@ from jaxbundle.statistics.inspection import Inspection, OfNetwork
 from jaxbundle.statistics.misfit import doubt_of_fit
 from jaxbundle.statistics.validity import Reach, distortion_reach
 from jaxbundle.statistics.weakness import Weakness, weakness
+from jaxbundle.system.programs import compile_once
 
 
 class Adjustment:
@@ -518,7 +520,7 @@ class Adjustment:
         return data_frame(self.table(name), self.units(name), heads=units)
 
 
-@jax.jit
+@partial(compile_once, static=())
 @jax.vmap
 def _all_angles(rotation, given):
     """ω, φ, κ of all images nearest to the given ones, and their Jacobians by δθ."""

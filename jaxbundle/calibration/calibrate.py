@@ -39,6 +39,7 @@ from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 SIGMA = 0.1
@@ -199,7 +200,7 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
     )
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _shifts(model, p, poses, centres, radius):
     up = jnp.array([0.0, 0.0, 1.0])
     one = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)

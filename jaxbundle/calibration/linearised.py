@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.network.kinds import ImagePoint
+from jaxbundle.system.programs import compile_once
 
 
 class Linearised(NamedTuple):
@@ -67,7 +68,7 @@ def lagrange_multipliers(
     return flat.T @ found.v.ravel(), S
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(compile_once, static=(0, 1, 2))
 def _linearise(of, spaces, columns, touched, xy, weight):
     """v/σ [n, 2] of all image points and their derivatives [n, 2, directions]: by the changes of
     pose, camera and point, and by b."""

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
+from jaxbundle.system.programs import compile_once
 
 
 def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
@@ -25,7 +26,7 @@ def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
     return pixel_size
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _images(model, p, position, rotation, points):
     def one(X0, M, X):
         return jnp.stack(project(model, tuple(p), *(M @ (X - X0))))

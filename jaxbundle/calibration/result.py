@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from functools import partial
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
+from jaxbundle.system.programs import compile_once
 
 DISTANCES = 400
 """Number of distances of an uncertainty curve, dense enough to show every dip."""
@@ -231,6 +233,6 @@ class Calibration:
         )
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _matrices(rotation):
     return jax.vmap(matrix_from_quaternion)(rotation)

@@ -30,6 +30,7 @@ from jaxbundle.display import data_set, shows_itself
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.iterations.small import minimise
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 SAME_RAY = 1e-6
@@ -179,14 +180,14 @@ def _unfolded(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarr
     return there & (np.linalg.norm(unit(back) - unit(rays), axis=1) < SAME_RAY)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _turn(model, p, rotation, rays):
     """Images of the rotated rays [n, 2]."""
     R = matrix_from_rotation_vector(rotation)
     return jax.vmap(lambda ray: jnp.stack(project(model, tuple(p), *(R @ ray))))(rays)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _best_turn(model, p, rays, xy, weight):
     """θ that minimises the distances of the images of the rays to xy; rays of weight 0 may have no
     image."""

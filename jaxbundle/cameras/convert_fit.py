@@ -29,6 +29,7 @@ from jaxbundle.cameras.model import CameraModel, image_ray, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.float64 import local_x64
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": ("K4",)}
@@ -183,17 +184,17 @@ def _one_image(model, p, ray):
     return jnp.stack(project(model, tuple(p), *ray))
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _rays(model, p, xy):
     return jax.vmap(lambda xy: jnp.stack(image_ray(model, tuple(p), *xy)))(xy)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _images(model, p, rays):
     return jax.vmap(lambda ray: _one_image(model, p, ray))(rays)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _jacobian(model, p, rays):
     derivative: Callable = jax.jacfwd(_one_image, 1)
     return jax.vmap(lambda ray: derivative(model, p, ray))(rays)

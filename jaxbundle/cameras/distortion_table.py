@@ -16,6 +16,7 @@ import numpy as np
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.float64 import local_x64
+from jaxbundle.system.programs import compile_once
 
 AZIMUTHS = 12
 ROUNDING = 1e-13
@@ -60,11 +61,11 @@ def distortion_table(
     return {"r": radius, "radial": without(radial), "decentring": without(decentring)}
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _to_ideal(model, p, xy):
     return jax.vmap(lambda xy: jnp.stack(model.to_ideal(tuple(p), *xy)))(xy)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _of_ideal(model, p, xy):
     return jax.vmap(lambda xy: jnp.stack(model.from_ideal(tuple(p), *xy)))(xy)

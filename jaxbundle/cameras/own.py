@@ -10,6 +10,7 @@ import numpy as np
 from jaxbundle.cameras.inverse import value_and_derivative
 from jaxbundle.cameras.model import FORMULAS, CameraModel
 from jaxbundle.float64 import local_x64
+from jaxbundle.system.programs import compile_once
 
 ROUND_TRIP = 1e-9
 """Tolerance of an inverse relative to the principal distance."""
@@ -75,7 +76,7 @@ def _check_form(model: CameraModel) -> None:
             raise ValueError(f"{expected}; for {given.shape or 'numbers'} it gave {out!r:.160}")
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _near_the_axis(model: CameraModel, p):
     """Image of the axis, derivative of the formula there, and by how much a point near it misses
     itself through formula and inverse."""

@@ -11,13 +11,13 @@ in the MEASURED image, in the model's unit, so that it can be compared with the 
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.cameras.inverse import value_and_derivative
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
+from jaxbundle.system.programs import compile_once
 
 AZIMUTHS = 36
 STEPS = 400
@@ -95,7 +95,7 @@ def _in_order(model, parameters):
     return [values[name] for name in model.parameters]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _along(model, p, azimuth, radius):
     """Jacobian determinant and radius in the measured image, `radius` out from the centre."""
     formula = getattr(model, model.own_formula)

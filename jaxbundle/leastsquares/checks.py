@@ -5,7 +5,6 @@ With V and W of their own observations and Q of the solution,
     Q_XX = V⁻¹ + V⁻¹·Wᵀ·Q·W·V⁻¹.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jaxbundle.leastsquares.indexing.rows import Data, Values, lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 STEPS = 20
@@ -60,7 +60,7 @@ def _by_row(at, W):
     return eliminated[order], kept[order], np.asarray(W).reshape(-1, *W.shape[2:])[order]
 
 
-@eqx.filter_jit
+@compile_once
 def _intersect(declared, plan, data: Data):
     laid, e = lay_out_data(plan, data), present(plan.eliminated)
     group = plan.groups[e]

@@ -7,7 +7,6 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +30,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
+    LARGE,
     Problem,
     make_solver,
     open_at,
@@ -46,6 +46,7 @@ from jaxbundle.leastsquares.quality.cofactors import (
 )
 from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
+from jaxbundle.system.programs import compile_once
 
 HERE = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
@@ -61,14 +62,24 @@ Rows = dict[int, Float[np.ndarray, "n r"]]
 """By set of observations, in the given order."""
 
 
-def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum[Values]:
+def find_minimum(
+    problem: Problem, start: Values | None = None, *, progress: Callable | None = None, **options
+) -> Minimum[Values]:
     """Iterate from `start` (default: that of the problem) and move the solution to the datum;
-    `options`: of the solver (`make_solver`). Held values and datum are those of the problem."""
+    `options`: of the solver (`make_solver`). Held values and datum are those of the problem.
+
+    `progress(step, cost, λ)` is called during the iterations of large problems, otherwise at their
+    end: JAX compiles a program that calls the host in every process anew."""
+    large = sum(o.number for o in problem.observations) > LARGE
+    if large and progress is not None:
+        options["progress"] = progress
     given = pad_values(problem, problem.data.start)
     start = given if start is None else pad_values(problem, start)
     minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
     minimise_from = minimise_from(problem, make_solver(problem, **options))
     first = minimum = minimise_from(start)
+    if not large and progress is not None:
+        report(minimum, progress)
     for _ in range(RETURNS):
         there = open_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
@@ -84,6 +95,14 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
         minimum = minimise_from(values)
     values = without_filling(problem, values)
     return dataclasses.replace(first, termination=minimum.termination, values=values)
+
+
+def report(minimum: Minimum[Values], progress: Callable) -> None:
+    """Call `progress(step, cost, λ)` for every evaluation of a search that has ended."""
+    history = jax.tree.map(np.asarray, minimum.history)
+    steps = min(int(minimum.iterations), len(history.cost))
+    for step in range(steps):
+        progress(step, history.cost[step], history.damping[step])
 
 
 def _on_one_device(problem: Problem, solver: LeastSquares):
@@ -119,7 +138,7 @@ def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
     return moved
 
 
-_move_by_newton = eqx.filter_jit(move_to_datum)
+_move_by_newton = compile_once(move_to_datum)
 
 
 def take_step(problem: Problem, values: Values) -> Values:
@@ -131,7 +150,7 @@ def take_step(problem: Problem, values: Values) -> Values:
     return without_filling(problem, moved)
 
 
-@eqx.filter_jit
+@compile_once
 def _step(declared, plan, values, data, retraction):
     _, gradient, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     factor = factorise(Normal(plan, blocks))
@@ -257,12 +276,12 @@ class Solution:
         return {o: np.asarray(x)[: sets[o].number] for o, x in by_set.items()}
 
 
-@eqx.filter_jit
+@compile_once
 def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
     return in_given_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
 
 
-@eqx.filter_jit
+@compile_once
 def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Factor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     return without_plan(factorise(Normal(plan, blocks)))
@@ -279,11 +298,11 @@ def with_plan(factor: Factor, plan: Plan) -> Factor:
     return jax.tree.map(lambda x: plan if isinstance(x, str) else x, factor)
 
 
-_cofactors = eqx.filter_jit(cofactors)
-_of_tables = eqx.filter_jit(blocks_of_tables)
+_cofactors = compile_once(cofactors)
+_of_tables = compile_once(blocks_of_tables)
 
 
-@eqx.filter_jit
+@compile_once
 def _by_eliminated(declared, plan, values, data):
     laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
     width = plan.groups[plan.eliminated].width
@@ -293,7 +312,7 @@ def _by_eliminated(declared, plan, values, data):
     return in_given_order(plan, found)
 
 
-@eqx.filter_jit
+@compile_once
 def _rows_of(function, declared, values, still):
     """The derivatives of a function of the tables by their changes, [n, rows, width] each."""
 
@@ -306,7 +325,7 @@ def _rows_of(function, declared, values, still):
     return jax.jacrev(of_change)(still)
 
 
-@eqx.filter_jit
+@compile_once
 def _propagate(declared, values, factor, rows, moves):
     plan = factor.plan
     rows = jax.vmap(lambda r: of_groups(plan, r))(rows)

@@ -24,6 +24,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
 from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.network.columns import did_you_mean
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
@@ -71,7 +72,7 @@ def transform(
     return affine.apply(p, point) / scale
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _transform_all(kind, p, xy):
     return jax.vmap(partial(transform, kind), (None, 0))(p, xy)
 
@@ -123,7 +124,7 @@ def fit_fiducials(
     return dataclasses.replace(result, residuals=result(source) - target)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(compile_once, static=(0, 1))
 def _fit(kind, unknowns, source, target, p):
     start = jnp.zeros(unknowns).at[jnp.array([0, 1] if unknowns == 4 else [0, 4])].set(1.0)
     root = jnp.sqrt(p)[:, None]
@@ -138,7 +139,7 @@ def _fit(kind, unknowns, source, target, p):
     return adjust(residuals, jnp.add, start, (source, target, root), unknowns)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _in_source_units(kind, q, middle, size):
     """Parameters for (x, y) from those for (x − middle)/size, and their derivatives."""
 

@@ -16,7 +16,6 @@ Source: Bethel (1986), The DSR11 image correlator; Kraus (2007), section 6.8.
 import dataclasses
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from jaxtyping import Array, Float, Real
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, ground_point, image_point
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 STEP = 0.5
@@ -105,19 +105,19 @@ def _peak(rho, best):
     return 0.5 * (left - right) / bend if bend < 0 else 0.0
 
 
-_ground = eqx.filter_jit(ground_point)
+_ground = compile_once(ground_point)
 
 
 def _carry(view, other_view, xy, Z):
     return image_point(other_view, ground_point(view, xy, Z))
 
 
-@eqx.filter_jit
+@compile_once
 def _locus(view, other_view, xy, Z):
     return jax.vmap(lambda Z: _carry(view, other_view, xy, Z))(Z)
 
 
-@eqx.filter_jit
+@compile_once
 def _correlations(base, other, view, other_view, xy, Z, half: int):
     offset = jnp.arange(-half, half + 1.0)
     window = xy + jnp.stack(jnp.meshgrid(offset, offset), -1).reshape(-1, 2)

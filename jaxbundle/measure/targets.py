@@ -15,8 +15,8 @@ Both centres are those of the ellipse, not of the circle: `circle_centre_shift`.
 """
 
 import dataclasses
+from functools import partial
 
-import jax
 import numpy as np
 import scipy  # its parts are loaded on use
 from jaxtyping import Float
@@ -25,6 +25,7 @@ from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.measure.ellipses import fit_ellipse
 from jaxbundle.measure.spots import MARGIN, find_spot
+from jaxbundle.system.programs import compile_once
 
 PROFILES = (16, 32, 64)
 """Numbers of profiles: the largest not above the circumference in pixels, so that no pixel is
@@ -154,7 +155,7 @@ def _edge_points(spot, xy, axes, angle):
     return np.where(good[:, None], start + at[:, None] * normal, np.nan)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _fit(xy, weights):
     return fit_ellipse(xy, weights)
 

@@ -31,6 +31,7 @@ from jaxbundle.network.camera_tables import CameraTable, camera_tables, start_of
 from jaxbundle.network.further.base import among
 from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.system.programs import compile_once
 
 LEAST_IMAGES = 64
 """Smallest batch of rotations, so that small networks share the program."""
@@ -281,7 +282,7 @@ def _quaternions(angles):
     return np.asarray(_quaternions_of(wide))[: len(angles)]
 
 
-_quaternions_of = jax.jit(jax.vmap(quaternion_from_omega_phi_kappa))
+_quaternions_of = compile_once(jax.vmap(quaternion_from_omega_phi_kappa), ())
 
 
 def _data(network: Network, origin):

@@ -18,6 +18,7 @@ from jaxbundle.cameras.model import project
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
+from jaxbundle.system.programs import compile_once
 
 AT_ONCE = 4096
 """Batch size of image points: all networks share one program per camera model."""
@@ -66,7 +67,7 @@ def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
     return found
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _portion(model, values, position, angles, points):
     def one(p, X0, angles, X):
         ray = matrix_from_omega_phi_kappa(angles) @ (X - X0)

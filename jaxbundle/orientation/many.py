@@ -5,6 +5,7 @@ more observations a well-spread subset is used. On the host, with numpy input an
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
 from jaxbundle.orientation.status import Status
 from jaxbundle.system.compilation import quick_jit
+from jaxbundle.system.programs import compile_once
 
 SLOTS = 64
 """Padded numbers of points of an image, of a pair, of two models."""
@@ -156,7 +158,7 @@ def _orient_pair(xy1, xy2, weights, tolerance):
     return found.M, found.b, part, jnp.where(number > 0, ordered[number // 2], 0.0)
 
 
-@jax.jit
+@partial(compile_once, static=())
 @jax.vmap
 def _intersect(X0, rays, weights):
     found = intersection(X0, rays, weights)
@@ -192,19 +194,19 @@ def _as_matrix(tau):
     return jax.vmap(transform_point, (None, 0), 1)(tau, jnp.eye(3)) - t[:, None], t
 
 
-@jax.jit
+@partial(compile_once, static=())
 @jax.vmap
 def _matrix(angles):
     return (matrix_from_omega_phi_kappa(angles),)
 
 
-@jax.jit
+@partial(compile_once, static=())
 @jax.vmap
 def _matrix_of_quaternion(q):
     return (matrix_from_quaternion(q),)
 
 
-@jax.jit
+@partial(compile_once, static=())
 @jax.vmap
 def _angles(M):
     return (omega_phi_kappa_from_matrix(M),)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.cameras import default_parameters, get_model, image_ray
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Index
 
 STEEPEST = -0.15
@@ -84,7 +85,7 @@ def ideal_points(camera: Camera, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarr
     return found[: len(xy)]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _portion(model, p, xy):
     def one(xy):
         r, s, q = image_ray(model, tuple(p), xy[0], xy[1])

@@ -14,7 +14,6 @@ sharp and without aliasing, and agrees with the true surface to far below 0.01 p
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -28,6 +27,7 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.planning.shapes import Shape
 from jaxbundle.planning.texture import Texture
 from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.programs import compile_once
 
 STRIP = 1 << 17
 """Pixels that are rendered together."""
@@ -177,7 +177,7 @@ def visible(
     return t[0] >= length * (1 - tolerance)
 
 
-@eqx.filter_jit
+@compile_once
 def _rays(model, parameters, x, y):
     return image_ray(model, parameters, x, y)
 

@@ -40,6 +40,7 @@ from jaxbundle.network.tables import (
     Source,
 )
 from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
+from jaxbundle.system.programs import compile_once
 
 RAYS_AT_ONCE = 2_000_000
 """Rays projected in one call, so that memory does not grow with stations × targets."""
@@ -388,7 +389,7 @@ def _look(stations, targets, cameras, of_station, image_format):
     return image[order], point[order], xy[order]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _images_of(model, p, position, angles, targets):
     """Image coordinates [i, P, 2], and whether their rays lead back to the targets [i, P]."""
     matrices = jax.vmap(matrix_from_omega_phi_kappa)(angles)

@@ -17,6 +17,7 @@ from jaxbundle.network.declare import declare
 from jaxbundle.network.further import RollingShutter
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
+from jaxbundle.system.programs import compile_once
 
 MOST_ROUNDS, SETTLED = 50, 1e-13
 """Of the search for the line of an image point, and the change that ends it, relative to the
@@ -108,7 +109,7 @@ def _residuals(declared, seen, values):
     return found.reshape(np.shape(jax.tree.leaves(seen.measured)[0]))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(compile_once, static=(0, 1))
 def _evaluate(kind, spaces, touched, measured):
     def one(touched, measured):
         blocks = [space.prepare(value) for space, value in zip(spaces, touched)]

@@ -14,6 +14,7 @@ from jaxbundle.arguments import number, numeric_array, positive, shown, vector, 
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 COORDINATES = "finite coordinates X, Y, Z"
@@ -200,7 +201,7 @@ def _angles(matrices: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "ima
     return np.asarray(_all_angles(matrices), float)
 
 
-_all_angles = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
+_all_angles = compile_once(jax.vmap(omega_phi_kappa_from_matrix), ())
 
 
 def grid_of_targets(

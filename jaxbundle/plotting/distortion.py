@@ -21,6 +21,7 @@ from jaxtyping import Float
 from jaxbundle.cameras import get_model
 from jaxbundle.display import shows_itself
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
+from jaxbundle.system.programs import compile_once
 
 AZIMUTHS = 12
 
@@ -85,7 +86,7 @@ def _model(adjustment, camera):
     return get_model(adjustment.problem.network.cameras[camera_index(adjustment, camera)].model)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _ideal(model, p, xy):
     """Ideal coordinates of measured ones [radii, azimuths, 2]."""
     return jnp.stack(jnp.vectorize(partial(model.to_ideal, tuple(p)))(xy[..., 0], xy[..., 1]), -1)
@@ -114,7 +115,7 @@ def distortion_at(model, parameters, radius):
     return values, slopes
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _harmonics(model, p, centre, ideal, radius, out):
     """Values and derivatives, only by the formula of the model.
 

@@ -26,6 +26,7 @@ from jaxbundle.plotting.style import (
     round_number,
     title,
 )
+from jaxbundle.system.programs import compile_once
 
 LETTER, LINE, GAP = 4.9, 8.0, 4.0
 """Width of a letter, height of a line and distance from the place, of ids, in points."""
@@ -151,7 +152,7 @@ def camera_pyramids(adjustment, size: float) -> np.ndarray:
     return np.concatenate([centres[:, None], centres[:, None] + edges @ M], 1)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _corner_rays(model, parameters, frames):
     """Rays of the four corners of every frame (lowest and highest x, y) [cameras, 4, 3]."""
     x, y = frames[:, jnp.array([0, 1, 1, 0]), 0], frames[:, jnp.array([0, 0, 1, 1]), 1]

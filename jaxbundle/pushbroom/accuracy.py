@@ -14,6 +14,8 @@ with V = tan(FOV/2), an error of attitude gives over the line
 Monte Carlo: the same errors are drawn, the ground coordinates recomputed, quantiles counted.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.noise import Noise, disturbed, draw, no_errors, sigmas
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 TINY = 1e-300
@@ -129,7 +132,7 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _covariances(image, surface, lines, pixels, sigma):
     """`sigma` by the kinds of errors that there are."""
     no_rows = jnp.zeros((0, 3))
@@ -151,7 +154,7 @@ def _covariances(image, surface, lines, pixels, sigma):
     return jax.vmap(of_place)(lines, pixels)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _draws(image, surface, lines, pixels, sigma, keys):
     def one(key):
         wrong = disturbed(image, draw(sigma, key))
@@ -160,7 +163,7 @@ def _draws(image, surface, lines, pixels, sigma, keys):
     return jax.lax.map(one, keys)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _differences(image, truth, surface, lines, pixels):
     def of_place(line, pixel):
         X0 = locate_point(truth, surface, line, pixel)

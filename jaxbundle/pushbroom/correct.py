@@ -11,6 +11,7 @@ optionally the first intersection of every pixel's ray is computed, and points f
 half a map pixel are not shown.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ from jaxbundle.pushbroom.passages import sample
 from jaxbundle.pushbroom.project import Search, project_from, project_points, scanner_of
 from jaxbundle.pushbroom.surfaces import Ground, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 BLOCK, STEP = 256, 16
@@ -55,7 +57,7 @@ def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarr
     return Nodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _ground_and_up(earth, place):
     return jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))
 
@@ -123,7 +125,7 @@ def block_errors(
     return np.asarray(_errors(scanner_of(truth), search, surface, nodes, places))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _errors(truth, search, surface, nodes, places):
     ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
 
@@ -142,7 +144,7 @@ def _locate(image, search, surface, line, pixel):
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _occluded(image, search, surface, line, pixel, ground):
     """Whether the rays of image positions end before their points [3, rows, columns].
 
@@ -177,7 +179,7 @@ def _level(surface):
     return 0.0 if isinstance(surface, Ground) else surface.level
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _places(image, search, surface, nodes, starts):
     ground = _ground(surface, nodes)
     return *project_from(image, search, tuple(ground), *_spread(starts)), ground

@@ -15,6 +15,8 @@ turns back, rotates, or is too rough for the polynomials has no footprint: all i
 searched for.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,7 @@ from jaxbundle.pushbroom.passages import ahead, slopes
 from jaxbundle.pushbroom.pieces import CHUNK, Pieces
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import Ground, Plane
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 HEIGHTS = -1000.0, 10_000.0
@@ -135,7 +138,7 @@ def _speeds_at(pieces, k, tau, xi, eta, heights, line, earth):
     return D, speed
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _speeds(c, tau, half, origin, xi, eta, heights, line, earth):
     def at(c, tau, half, xi, eta, h):
         numbers, rates = value_and_rate(c, tau)

@@ -18,6 +18,7 @@ from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import difference, dot
 from jaxbundle.pushbroom.newton import line_period, motion, seen_from
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
+from jaxbundle.system.programs import compile_once
 
 SEARCH, FINE_SEARCH = 128, 512
 """Largest number of search steps; the finer one if the camera may turn back."""
@@ -39,7 +40,7 @@ def line_of_detectors(optics, pixels):
     return jnp.asarray(np.polynomial.polynomial.polyfit(xi, eta, 5))
 
 
-slopes = jax.jit(lambda optics, u: optics.slopes(u))
+slopes = compile_once(lambda optics, u: optics.slopes(u), ())
 
 
 def ahead(numbers, D, along):

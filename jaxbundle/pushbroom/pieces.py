@@ -8,6 +8,7 @@ while interpolation and rotation cost hundreds. Degree 3 needs more pieces than 
 time.
 """
 
+from functools import partial
 from math import comb
 
 import equinox as eqx
@@ -22,6 +23,7 @@ from jaxbundle.geometry.vectors import turned
 from jaxbundle.leastsquares.indexing.indices import rounded
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 DEGREE = 3
@@ -117,7 +119,7 @@ def _numbers(image, origin, left, right, span):
     return numbers[:, : DEGREE + 1], numbers[:, DEGREE + 1 :]
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _pose_numbers(image, origin, times):
     def at(t):
         P, R, _ = pose_at(image, t)
@@ -126,7 +128,7 @@ def _pose_numbers(image, origin, times):
     return jax.vmap(at)(times)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _middle(image):
     pose = pose_at(image, image.middle_time)
     u = (image.pixels - 1) / 2

@@ -40,6 +40,7 @@ from jaxbundle.pushbroom.passages import (
 )
 from jaxbundle.pushbroom.pieces import Pieces, make_pieces
 from jaxbundle.pushbroom.scanner import LineTimes, Optics, Pair
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 CHUNK = 2048
@@ -160,7 +161,7 @@ def project_from(
     return _project_from(scanner_of(image), search, X, line, pixel)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _project_from(image: Scanner, search, X, line, pixel):
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
     place = lambda args: refine(image, search.pieces, search.earth, args[:3], *args[3:])

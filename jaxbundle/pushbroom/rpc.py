@@ -20,6 +20,7 @@ line, sample, height and every coefficient.
 """
 
 from enum import IntEnum
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -32,6 +33,7 @@ from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpacked
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import require_ellipsoid
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 TERMS = 20
@@ -187,7 +189,7 @@ def sight(
     return unpacked(top), unit(difference(bottom, top))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def project_points(
     rpc: Rpc,
     longitude: Float[AnyArray, " n"],
@@ -199,7 +201,7 @@ def project_points(
     return jax.vmap(place)(longitude, latitude, height)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def locate_points(
     rpc: Rpc,
     line: Float[AnyArray, " n"],
@@ -210,7 +212,7 @@ def locate_points(
     return jax.vmap(lambda l, s, h: locate(rpc, l, s, h))(line, sample, height)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def locate_points_on(
     rpc: Rpc, surface: Surface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
 ) -> tuple[Array, Array, Scalar, Array]:

@@ -14,6 +14,8 @@ For correlated observations (Baarda, 1968), with Q the cofactors of the unknowns
 """
 
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,7 @@ from jaxbundle.geometry.vectors import along
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.rpc import MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
@@ -204,7 +207,7 @@ def _terms(rpc, line, sample):
     ])  # fmt: skip
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _images(rpc, earth, longitude, latitude, height):
     """(l, s) [n, 2] and their derivatives by east, north, up [n, 2, 3]."""
 

@@ -23,6 +23,7 @@ The covariance is that of the effect of table noise on the coefficients,
 the residuals, like everything that rational polynomials of degree 3 cannot represent.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -39,6 +40,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.rpc import TERMS, Rpc, monomials, project_points
 from jaxbundle.pushbroom.surfaces import Height
+from jaxbundle.system.programs import compile_once
 
 UNKNOWNS = 2 * TERMS - 1
 FEWEST = UNKNOWNS + 1
@@ -186,7 +188,7 @@ def check_rpc(rpc: Rpc, table: RpcTable) -> RpcCheck:
     return RpcCheck(v, np.sqrt(np.mean(v**2, 0)), np.abs(v).max(0), table)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _ground(image, earth, height, lines, pixels):
     X = locate_points(image, Height(level=height, earth=earth), lines, pixels)
     return jnp.stack(geodetic(earth, tuple(X)))
@@ -310,7 +312,7 @@ def _linearise(c, T, y):
     return tuple(np.asarray(a) for a in _value_and_jacobian(c, T, y))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _value_and_jacobian(c, T, y):
     """v and ∂v/∂c of all points."""
 

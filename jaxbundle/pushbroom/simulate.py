@@ -8,6 +8,7 @@ Without errors only the interpolation error remains.
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.trajectory import Trajectory
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 MARGIN = 6
@@ -83,7 +85,7 @@ def measured_image(flight: Flight) -> PushbroomImage:
     return _measure(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _measure(image, sigma, key):
     return with_errors_in_rows(image, draw(sigma, key))
 
@@ -125,8 +127,8 @@ def taken_image(
     return np.asarray(_resample(scene, row, column, resampling))
 
 
-_ground = jax.jit(locate_lines)
-_resample = jax.jit(resample, static_argnums=3)
+_ground = compile_once(locate_lines, ())
+_resample = compile_once(resample, 3)
 
 
 def _image(flight, position, attitude):

@@ -13,7 +13,6 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxbundle.choices import AttitudeError
@@ -30,6 +29,7 @@ from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.scanner import slopes_of
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 TRAJECTORIES = {
@@ -133,6 +133,6 @@ def altitude_and_view(image: PushbroomImage, surface: Surface) -> tuple[float, f
     return heights[0] - heights[1], float(np.arccos(cosine))
 
 
-_position = jax.jit(lambda image: pose_at(image, image.middle_time).P)
-_locate = jax.jit(locate_points)
-_slopes = jax.jit(slopes_of)
+_position = compile_once(lambda image: pose_at(image, image.middle_time).P, ())
+_locate = compile_once(locate_points, ())
+_slopes = compile_once(slopes_of, ())

@@ -1,6 +1,5 @@
 """The observations and start values of a refinement; unusable input is reported before."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from jaxbundle.refinement.tables import (
     check_observations,
     check_points_table,
 )
+from jaxbundle.system.programs import compile_once
 
 KNOTS = 10
 """Largest number of jitter knots with a prior per measured point: more only cost time."""
@@ -92,7 +92,7 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
     return X
 
 
-_meet = jax.jit(jax.vmap(intersection))
+_meet = compile_once(jax.vmap(intersection), ())
 
 
 def _sights(given: Given, rays: Rays):
@@ -117,7 +117,7 @@ def _sights(given: Given, rays: Rays):
         yield centre, np.asarray(direction), given.frame_point[frames.observations.point[rows]]
 
 
-@eqx.filter_jit
+@compile_once
 def _scanner_sights(image, places):
     def one(place):
         pose = pose_at(image, image.times.time(place[0]))

@@ -10,7 +10,6 @@ image gives it at its given height, east and north only.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +25,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
 from jaxbundle.refinement.inspection import Inspection, Shared
+from jaxbundle.system.programs import compile_once
 
 
 @shows_itself
@@ -76,7 +76,7 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
     )  # fmt: skip
 
 
-@eqx.filter_jit
+@compile_once
 def _slopes(declared, plan, values, data, shared: Shared, estimate):
     """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""
     plan, laid = fill_places(plan, lay_out_data(plan, data))

@@ -33,6 +33,7 @@ from jaxbundle.pushbroom.image import Offsets, PushbroomImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial, Optics
 from jaxbundle.pushbroom.trajectory import orbital_frame, position_at, velocity_at
 from jaxbundle.refinement.spline import NO_SPLINE, JitterSpline, make_spline
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 Three = tuple[float, float, float]
@@ -151,7 +152,7 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
     return Form(axes, spline, Sizes(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, across, along))
 
 
-@eqx.filter_jit
+@compile_once
 def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
     """F: across, along, up at the middle line."""
     t, of = image.middle_time, image.trajectory

@@ -18,6 +18,7 @@ from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.refinement.declare import Declared
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 ROUNDS, SAME = 10, 1e-9
@@ -49,7 +50,7 @@ class Shared(eqx.Module):
         return moved
 
 
-_estimate = eqx.filter_jit(lambda shared, values: shared(values))
+_estimate = compile_once(lambda shared, values: shared(values))
 
 
 class Inspection:

@@ -29,7 +29,6 @@ each of which it may be held, controlled with σ, or free.
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +49,7 @@ from jaxbundle.refinement.freedom import (
     changed_slopes,
     middle_and_half,
 )
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 
@@ -163,7 +163,7 @@ def lines_of(
     return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
 
-@eqx.filter_jit
+@compile_once
 def _lines_of(kind, image, form, origin, own, sensor, X, places):
     def one(X, place):
         def misclosure(place):

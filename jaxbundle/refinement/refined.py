@@ -6,8 +6,8 @@ the old table and the knots of the spline, halved until slerp follows within `TO
 """
 
 import dataclasses
+from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,7 @@ from jaxbundle.pushbroom.interpolation import Table, span
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
 from jaxbundle.refinement.freedom import Change, Form, changed, changed_optics
+from jaxbundle.system.programs import compile_once
 
 TOLERANCE = 1e-9
 """Radians: a millimetre from 1000 km."""
@@ -55,7 +56,7 @@ def _position(moved: PushbroomImage) -> Table:
     return dataclasses.replace(table, values=values, rates=rates)
 
 
-@eqx.filter_jit
+@compile_once
 def _rotations(image, form, change, times):
     """R of the platform in the frame of the attitude table, changed, at many times."""
 
@@ -114,17 +115,17 @@ def _turns(a, b):
     return _pad(_logarithms, a.transpose(0, 2, 1) @ b)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _logarithms(R):
     return jax.vmap(rotation_vector_from_matrix)(R)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _exponentials(turns):
     return jax.vmap(matrix_from_rotation_vector)(turns)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _quaternions(R):
     return jax.vmap(quaternion_from_matrix)(R)
 
@@ -154,7 +155,7 @@ def _optics(image, change) -> Optics:
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
 
 
-@eqx.filter_jit
+@compile_once
 def _slopes(optics, u):
     return jnp.stack(jax.vmap(optics.slopes)(u))
 

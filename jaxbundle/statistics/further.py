@@ -11,6 +11,7 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation
 from jaxbundle.network.further.rigs import MOUNTING
+from jaxbundle.system.programs import compile_once
 
 ANGLES = ("omega", "phi", "kappa")
 
@@ -47,7 +48,7 @@ def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
     return every
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _read_rows(space, values):
     """Every row as reported numbers [rows, n], and their derivatives by its changes [rows, n,
     width]."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
 from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.further.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.system.programs import compile_once
 
 EVERY = "*"
 """Wildcard for all ids, or all names, of held quantities."""
@@ -189,7 +191,7 @@ def _direction(table: Table, values: Values, row: int, column: int):
     return np.ones(()) if np.ndim(value) == 0 else np.eye(len(value))[column]
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _turns(rotation):
     """∂q/∂(ω, φ, κ) of a unit quaternion, one row per angle: via a small rotation δθ, whose
     derivative of the angles is invertible."""

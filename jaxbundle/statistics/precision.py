@@ -32,6 +32,7 @@ from jaxbundle.leastsquares.quality.precision import redundancy as engine_redund
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.declare import Rows
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 ROUNDING = 1e-14
@@ -139,7 +140,7 @@ def predicted(problem: Problem, data: Data) -> Data:
     return eqx.tree_at(lambda d: d.image_xy, data, xy)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _project(model, values: Values, xy, rows, image, camera, point):
     """The image coordinates with those of `rows` computed."""
 
@@ -152,7 +153,7 @@ def _project(model, values: Values, xy, rows, image, camera, point):
     return jnp.asarray(xy).at[rows].set(found)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _root(variance, rounding=ROUNDING):
     """σ, with derivative 0 where it is 0; NaN stays NaN. `rounding`: see `ROUNDING`."""
     none = variance <= 0
@@ -160,7 +161,7 @@ def _root(variance, rounding=ROUNDING):
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 
-@jax.jit
+@partial(compile_once, static=())
 def image_variances(angles, rotation, Q):
     """Variances [images, 6] of X0, Y0, Z0 and of ω, φ, κ near `angles`, by the Jacobian of the
     angles; `Q`: cofactors of the poses, `rotation`: their quaternions."""
@@ -179,7 +180,7 @@ def _camera_sigma(problem: Problem, values: Values, own):
     return sigma
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _with_cameras(sigma, Q, rows, columns, of):
     """σ of all cameras with those of a table."""
     root = _root(jnp.diagonal(Q, axis1=1, axis2=2), 0.0)

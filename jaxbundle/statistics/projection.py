@@ -29,11 +29,12 @@ from jaxtyping import Float
 from jaxbundle.cameras import CameraModel, image_ray, project
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.arrays import Values
+from jaxbundle.system.programs import compile_once
 
 FRAMES = ("camera", "rotation", "scene")
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _slopes(model, p, xy):
     """∂x/∂p [n, 2, parameters] and ∂x/∂θ [n, 2, 3] of the rays that have the images `xy`."""
 
@@ -123,7 +124,7 @@ def _images_through_scene(model, column, views, X0, directions, near, values: Va
     return jnp.mean(image, 0).ravel()
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _directions(model, p, rotation, xy):
     """Lines of sight in the object frame [views, n, 3]; with 1/d homogeneous points, infinity
     included."""

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.held import split_name
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.precision import image_variances
+from jaxbundle.system.programs import compile_once
 
 CAMERAS, IMAGES, POINTS = WORDS = ("cameras", "images", "points")
 """All free camera parameters; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of X,
@@ -143,7 +143,7 @@ def _of_images(inspection: Inspection):
     return poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None))
 
 
-_variances = jax.jit(image_variances)
+_variances = compile_once(image_variances, ())
 
 
 def _of_points(inspection: Inspection):
@@ -172,7 +172,7 @@ def effects_on(
     return np.asarray(_along(results.function, problem.layout.values, values, tangents))
 
 
-@eqx.filter_jit
+@compile_once
 def _along(function, as_values, tables, tangents):
     of_tables = lambda tables: function(as_values(tables))
     return jax.vmap(lambda d: jax.jvp(of_tables, (tables,), (d,))[1])(tangents)

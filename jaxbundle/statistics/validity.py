@@ -3,7 +3,6 @@
 import dataclasses
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import CameraModel, get_model, validity_message
 from jaxbundle.network.arrays import Values
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 
@@ -62,7 +62,7 @@ def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray,
     return farthest
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def measured_centre(model: CameraModel, p: Float[AnyArray, " parameters"]) -> Float[Array, "2"]:
     """The image of a camera's axis, the centre of its distortion."""
     return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))

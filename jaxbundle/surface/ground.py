@@ -25,6 +25,7 @@ from jaxbundle.pushbroom.project import make_search, project_near, project_point
 from jaxbundle.pushbroom.rpc import Rpc, locate, project
 from jaxbundle.pushbroom.surfaces import Height, Plane
 from jaxbundle.surface.views import in_lanes
+from jaxbundle.system.programs import compile_once
 
 
 class Neighbourhood(eqx.Module):
@@ -132,7 +133,7 @@ class _Scanner(eqx.Module):
         return jnp.stack(earth_fixed(self.earth, self.around.geographic(X)))
 
 
-@eqx.filter_jit
+@compile_once
 def _rpc_points(frame, uv, q):
     rpc, around = frame
 
@@ -149,17 +150,17 @@ def _rpc_pixel(frame, X):
     return jnp.stack([sample, line])
 
 
-@eqx.filter_jit
+@compile_once
 def _rpc_project(frame, X):
     return jax.vmap(partial(_rpc_pixel, frame))(X)
 
 
-@eqx.filter_jit
+@compile_once
 def _rpc_derivative(frame, X):
     return jax.vmap(jax.jacfwd(partial(_rpc_pixel, frame)))(X)
 
 
-@eqx.filter_jit
+@compile_once
 def _scanner_points(frame, uv, q):
     def point(uv, h):
         if frame.around is None or frame.earth is None:
@@ -170,12 +171,12 @@ def _scanner_points(frame, uv, q):
     return jax.vmap(point)(uv, q)
 
 
-@eqx.filter_jit
+@compile_once
 def _ground(frame, X):
     return jax.vmap(frame.fixed)(X).T
 
 
-@eqx.filter_jit
+@compile_once
 def _scanner_derivative(frame, X, places):
     def pixel(X, place):
         line, u = project_near(frame.image, frame.fixed(X), place[1], place[0], frame.earth)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.surface.views import FrameView, OrientedImage, in_lanes, pixel_of
+from jaxbundle.system.programs import compile_once
 
 PORTION = 1 << 16
 """Points computed at once."""
@@ -83,7 +84,7 @@ def by_orientation(view: FrameView, X: Float[np.ndarray, "n 3"]) -> Float[np.nda
     return in_lanes(_derivative, view.frame, X)
 
 
-@eqx.filter_jit
+@compile_once
 def _derivative(frame, X):
     angles = omega_phi_kappa_from_matrix(frame.M)
 

@@ -4,6 +4,7 @@ Both photographs are smoothed first: aliasing and noise shift matches
 towards the middle between pixels, and cause false gradients (Schreier et al., 2000).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxbundle.measure.least_squares_matching import (
     match_least_squares,
 )
 from jaxbundle.surface.views import OrientedImage, is_inside
+from jaxbundle.system.programs import compile_once
 
 LANES = 256
 """Windows matched together."""
@@ -122,7 +124,7 @@ def _pieces(grey, corner, side):
     return grey[rows[:, :, None], columns[:, None]].astype(np.float32)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _match(template, piece, start):
     match = lambda *arrays: match_least_squares(*arrays, blur=BLUR)
     return jax.vmap(match)(_smooth(template), _smooth(piece), start)

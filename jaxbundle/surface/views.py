@@ -33,6 +33,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance
 from jaxbundle.network.tables import Camera
+from jaxbundle.system.programs import compile_once
 
 LANES = 1 << 13
 FEW = 1 << 9
@@ -214,16 +215,16 @@ def pixel_of(frame: _Frame, X: Float[Array, "3"]) -> Float[Array, "2"]:
     return frame.origin + frame.step * xy
 
 
-@eqx.filter_jit
+@compile_once
 def _points(frame, uv, q):
     return jax.vmap(partial(_point, frame))(uv, q)
 
 
-@eqx.filter_jit
+@compile_once
 def _project(frame, X):
     return jax.vmap(partial(pixel_of, frame))(X)
 
 
-@eqx.filter_jit
+@compile_once
 def _derivative(frame, X):
     return jax.vmap(jax.jacfwd(partial(pixel_of, frame)))(X)

@@ -4,13 +4,13 @@ The relative orientation of eight pairs of 64 points (jaxlib 0.10, one core): co
 instead of 11.4 s, run in 0.37 s instead of 0.27 s.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-import jax
+from jaxbundle.system.programs import compile_once
 
 QUICK = {"xla_backend_optimization_level": 0}
 
 
-def quick_jit(function: Callable, **options) -> Callable:
-    """`jax.jit` for functions rarely called from the host; with its options."""
-    return jax.jit(function, compiler_options=QUICK, **options)
+def quick_jit(function: Callable, static: Sequence[int] | int = ()) -> Callable:
+    """`compile_once` for functions rarely called from the host."""
+    return compile_once(function, static, compiler_options=QUICK)

@@ -10,6 +10,8 @@ from typing import NoReturn
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 
+_folders: list[str] = []
+"""The last one is that of kept programs."""
 WORTH_KEEPING = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
@@ -55,9 +57,15 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     if not usable:
         return False
     watch_cache(folder)
+    _folders.append(os.fspath(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
     return True
+
+
+def folder_of_programs() -> str | None:
+    """The folder of kept programs; None if none are kept."""
+    return _folders[-1] if _folders else None
 
 
 def join_processes(

@@ -145,7 +145,7 @@ def _adjust(camera, pairs, M, b, limit):
     return float(f), float(k1), np.asarray(e)[: len(pairs)]
 
 
-@partial(quick_jit, static_argnums=0)
+@partial(quick_jit, static=0)
 def _self_calibrate(model, p, M, b, xy1, xy2, there, limit):
     names = model.parameters
     fx, fy, k1 = (names.index(name) for name in ("fx", "fy", "k1"))

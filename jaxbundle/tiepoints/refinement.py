@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxbundle.measure.least_squares_matching import MatchingStatus, match_least_squares
 from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.system.programs import compile_once
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.tracks import flatten
 
@@ -173,7 +174,7 @@ def _pieces(picture, corner, side):
     return picture[v[:, :, None], u[:, None, :]], inside
 
 
-@partial(jax.jit)
+@partial(compile_once, static=())
 def _match(windows: Array, pieces: Array, start: Array):
     found = jax.vmap(partial(match_least_squares, reach=REACH))(
         windows.astype(np.float32), pieces.astype(np.float32), start

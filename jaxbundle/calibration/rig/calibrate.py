@@ -13,6 +13,7 @@ mounting reveals.
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 
 import jax
 import numpy as np
@@ -31,6 +32,7 @@ from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import some
+from jaxbundle.system.programs import compile_once
 
 
 def calibrate_rig(
@@ -161,7 +163,7 @@ def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
     )  # fmt: skip
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _quaternions(matrices):
     return jax.vmap(quaternion_from_matrix)(matrices)
 

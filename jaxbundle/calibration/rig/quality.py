@@ -25,11 +25,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.statistics.projection import interior_covariance_of_images
+from jaxbundle.system.programs import compile_once
 
 FRAMES = ("rig", "camera", "rotation")
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _slopes(model, p, mounting: PoseValue, xy, nearness):
     """∂x/∂(δb, δθ, p) [n, 2, 6 + parameters] of points at the distance 1/nearness, whose images
     are `xy`."""

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
 from jaxbundle.network.tables import Camera, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 POSE = Pose.width
@@ -268,7 +270,7 @@ class RigCalibration:
         return "\n".join(lines)
 
 
-@jax.jit
+@partial(compile_once, static=())
 def _to_angles(mounting: PoseValue):
     """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
     block = Pose().prepare(mounting)

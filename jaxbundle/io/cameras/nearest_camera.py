@@ -29,6 +29,7 @@ from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import local_x64
 from jaxbundle.network.tables import Camera
+from jaxbundle.system.programs import compile_once
 
 Formula = Callable[..., Float[Array, "2"]]
 """Parameters and one ray X, Y, Z, right, down and forward, to pixels from the centre of the first
@@ -164,7 +165,7 @@ def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
         return np.asarray(jax.vmap(_direction)(m)), (off < ON_THE_POINT) & (det > 0)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _newton(formula: Formula, p, uv, m):
     """Steps of Newton's method, by how much the images miss the points, and the determinants."""
 

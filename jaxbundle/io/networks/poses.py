@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from jaxbundle import geometry
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import local_x64
+from jaxbundle.system.programs import compile_once
 
 AT_ONCE = 256
 ORTHOGONAL = 1e-4
@@ -66,7 +67,7 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
         raise InputError(f"{where} is not a rotation matrix")
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _batch(function, rows):
     return jax.vmap(function)(rows)
 

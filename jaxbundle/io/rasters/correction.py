@@ -5,7 +5,6 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxbundle.choices import Resampling
@@ -20,6 +19,7 @@ from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
+from jaxbundle.system.programs import compile_once
 
 REACH = 3
 """Pixels that resampling may require beyond the outermost position."""
@@ -32,8 +32,8 @@ BORDER = 33
 MOST = 10_000
 """Pixels of a map relative to those of the image: more indicate a wrong spacing."""
 
-_resample = jax.jit(resample, static_argnums=3)
-_locate = jax.jit(locate_lines)
+_resample = compile_once(resample, 3)
+_locate = compile_once(locate_lines, ())
 
 
 def map_of(

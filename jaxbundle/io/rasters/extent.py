@@ -14,6 +14,7 @@ from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Height
+from jaxbundle.system.programs import compile_once
 
 HEIGHTS = -12_000.0, 25_000.0
 """Metres: limits for the Earth with its sea floor, the Moon and Mars."""
@@ -77,6 +78,6 @@ def _around(longitude, latitude):
     )  # fmt: skip
 
 
-_locate = jax.jit(locate_lines)
-_geodetic = jax.jit(geodetic)
-_positions = jax.jit(jax.vmap(lambda image, t: pose_at(image, t).P, (None, 0)))
+_locate = compile_once(locate_lines, ())
+_geodetic = compile_once(geodetic, ())
+_positions = compile_once(jax.vmap(lambda image, t: pose_at(image, t).P, (None, 0)), ())

@@ -6,7 +6,6 @@ Longitudes of a map are continuous: they continue beyond ±180° if required, su
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -14,13 +13,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.system.programs import compile_once
 
 JUMP = 0.25
 """Neighbouring points farther apart than this part of the extent are on both sides of an edge."""
 LARGEST = 2**31 - 1
 """Maximum rows and columns of a GeoTIFF."""
 
-_geodetic = jax.jit(geodetic)
+_geodetic = compile_once(geodetic, ())
 
 
 class MapSystem:

@@ -6,7 +6,6 @@ program for a whole problem would be compiled again for every other shape.
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -16,6 +15,7 @@ from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 HERE = "table"
@@ -89,12 +89,12 @@ def _moved(declared, free, motion, values):
     return moved
 
 
-@eqx.filter_jit
+@compile_once
 def _difference(space, values, origin):
     return jax.vmap(space.difference)(values, origin)
 
 
-@eqx.filter_jit
+@compile_once
 def _move(space, act, motion, values, free):
     one = lambda value, f: space.hold(act(motion, value), value, f)
     return jax.vmap(one)(values, free)
@@ -108,7 +108,7 @@ def _of_rows(program, *given):
     return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
 
 
-_generators = eqx.filter_jit(datum.generators)
-_leave_held = eqx.filter_jit(datum.leave_held)
-_free = eqx.filter_jit(datum.free_of_tables)
-_move_at_once = eqx.filter_jit(move_at_once)
+_generators = compile_once(datum.generators)
+_leave_held = compile_once(datum.leave_held)
+_free = compile_once(datum.free_of_tables)
+_move_at_once = compile_once(move_at_once)

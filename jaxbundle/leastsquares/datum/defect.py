@@ -7,7 +7,6 @@ table and their effect on observations.
 from functools import reduce
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, prepare
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 ROWS = 10_000
@@ -61,7 +61,7 @@ def survey_motions(
     return _survey(declared, plan, data, real, moves)
 
 
-@eqx.filter_jit
+@compile_once
 def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)

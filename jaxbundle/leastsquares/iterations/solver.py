@@ -46,6 +46,7 @@ from jaxbundle.leastsquares.iterations.stopping import (
     Approach,
     Tolerance,
 )
+from jaxbundle.system.programs import compile_once
 
 
 class History(eqx.Module):
@@ -223,7 +224,7 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]
     return Minimum(solution.value, stats["termination"], stats["iterations"], stats["history"])
 
 
-find = eqx.filter_jit(minimise)
+find = compile_once(minimise)
 """`minimise`, compiled once for all callers."""
 
 

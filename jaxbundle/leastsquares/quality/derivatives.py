@@ -46,6 +46,7 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import find, half_square
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, given_data, make_solver, without_filling
+from jaxbundle.system.programs import compile_once
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
@@ -122,7 +123,7 @@ class Linearised(eqx.Module):
         return retract(self.declared, self.plan, self.given(data), change)
 
 
-@eqx.filter_jit
+@compile_once
 def attach_derivatives(
     declared: Declared, plan: Plan, values: Values, data: Data, sensitivity: Sensitivity = "exact"
 ) -> Values:

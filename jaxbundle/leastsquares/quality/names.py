@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 INDETERMINATE = 1e-12
@@ -87,7 +87,7 @@ def scaled_system(problem: Problem, values: Values):
     return np.tril(S) + np.tril(S, -1).T, V, G
 
 
-@eqx.filter_jit
+@compile_once
 def _scale(declared: Declared, plan: Plan, values: Values, data: Data, moves):
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     S, scale, *_ = reduced_system(Normal(plan, blocks), regular=False)

@@ -26,6 +26,7 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.problem import Problem, given_data, with_factor, without_filling
 from jaxbundle.leastsquares.quality.cofactors import blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.quality.reliability import reliability
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
 
@@ -71,7 +72,7 @@ def precision(
     return jax.tree.map(lambda C: sigma0**2 * C, found)
 
 
-@eqx.filter_jit
+@compile_once
 def covariances(
     declared: Declared, plan: Plan, data: Data, rows: Tangent
 ) -> tuple[dict[str, Float[Array, "rows width width"]], Float[Array, "functions functions"]]:
@@ -84,7 +85,7 @@ def covariances(
     return own, propagate(declared, data.start, factor, rows)
 
 
-@eqx.filter_jit
+@compile_once
 def redundancy(
     declared: Declared, plan: Plan, data: Data
 ) -> Mapping[int, Float[AnyArray, "n r"]]:

@@ -34,6 +34,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     prepare,
 )
 from jaxbundle.leastsquares.quality.cofactors import Cofactors
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
 UNCONTROLLED = 1e-8
@@ -51,7 +52,7 @@ class Reliability(eqx.Module):
     own: Mapping[int, Float[AnyArray, "n r"]]
 
 
-@eqx.filter_jit
+@compile_once
 def reliability(
     declared: Declared, plan: Plan, values: Values, data: Data, Q: Cofactors
 ) -> Reliability:

@@ -16,7 +16,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +30,7 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, in_give
 from jaxbundle.leastsquares.iterations.solver import half_square
 from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_after
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
 AT_ONCE = 16
@@ -112,7 +112,7 @@ def _require(left) -> None:
         )
 
 
-@eqx.filter_jit
+@compile_once
 def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, held):
     at = Linearised(declared, plan, values, data, factor, {})
     still = zero_tangent(plan)
@@ -125,7 +125,7 @@ def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: 
     return jax.lax.map(one, held)
 
 
-@eqx.filter_jit
+@compile_once
 def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
     """By measurement, by residual, and the residual of the equations."""
     at = Linearised(declared, plan, values, data, factor, {})

@@ -14,7 +14,6 @@ no extent is not judged. Eliminated rows count by the σ they have where everyth
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +28,7 @@ from jaxbundle.leastsquares.indexing.rows import lay_out_data
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
+from jaxbundle.system.programs import compile_once
 
 VAGUE = 50.0
 """An unknown whose σ is above a fiftieth of its extent is determined in name only."""
@@ -73,7 +73,7 @@ def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
     return _weak(found, factor, extents, 1.0)
 
 
-@eqx.filter_jit
+@compile_once
 def _lifted_factor(declared, plan, values, data) -> Factor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     return without_plan(factorise(lift(Normal(plan, blocks))))
@@ -158,7 +158,7 @@ def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
     return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
 
 
-@eqx.filter_jit
+@compile_once
 def _products(declared, values, factor: Factor, moves, per_extent, directions):
     """A times each of the directions [m, reduced]."""
     plan = factor.plan

@@ -22,6 +22,7 @@ from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import Declared, Further
 from jaxbundle.network.further.figures import EXACT, sigma_or_exact
+from jaxbundle.system.programs import compile_once
 
 SAMPLE = 256
 """Number of rays used for the effect of a parameter on image points."""
@@ -143,7 +144,7 @@ def parameter_sigmas(network, c: int) -> dict[str, float]:
     return dict(zip(model.parameters, sigma.tolist()))
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compile_once, static=0)
 def _slopes(model, p, xy):
     """∂(x, y)/∂p of the rays of image points [n, 2, parameters]."""
 
