@@ -27,6 +27,7 @@ from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, minimise
 from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
+from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
 AXIS = "devices"
@@ -107,7 +108,7 @@ def find_minimum_of_shards(
     return dataclasses.replace(minimum, values=without_filling(problem, values))
 
 
-@eqx.filter_jit
+@compile_once
 def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
     """The results of all devices; eliminated rows [devices, rows, …]."""
     arrays, static = eqx.partition((solver.plan, data, start), eqx.is_array)

@@ -62,7 +62,7 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
     @functools.wraps(function)
     def run(*args, **kwargs):
         folder = folder_of_programs()
-        if folder is None or jax.config.jax_disable_jit:
+        if folder is None or jax.config.jax_disable_jit or jax.process_count() > 1:
             return jitted(*args, **kwargs)
         given = _Given(args, kwargs, positions)
         try:
@@ -99,8 +99,8 @@ class _Given:
     def key_for(self, function: Callable) -> str:
         """What the program depends on, as a digest."""
         settings = [(name, repr(getattr(jax.config, name))) for name in SETTINGS]
-        place = (jax.default_backend(), jax.device_count(), jax.process_count(),
-                 jax.dtypes.canonicalize_dtype(float))  # fmt: skip
+        number = jax.dtypes.canonicalize_dtype(float)
+        place = jax.default_backend(), jax.device_count(), number
         found = [_state_of_package(), repr(settings), repr(place)]
         _describe(function, found, None)
         for i, x in enumerate(self.args):
@@ -220,6 +220,8 @@ def _describe(x: Any, found: list[str], is_data: Callable | None) -> None:
     elif isinstance(x, enum.Enum):
         _describe_name(type(x), found)
         found.append(x.name)
+    elif isinstance(x, jax.sharding.Mesh):
+        found.append(f"mesh {x} {[device.id for device in x.devices.flat]}")
     elif type(x) is object:  # a sentinel
         found.append("object")
     elif isinstance(x, type | types.FunctionType) or not dataclasses.is_dataclass(x):
@@ -234,10 +236,9 @@ def _describe(x: Any, found: list[str], is_data: Callable | None) -> None:
 
 
 def _describe_data(x, found):
-    if isinstance(x, jax.Array) and len(x.devices()) > 1:
-        raise _CannotDescribe
     kind, weak = getattr(x, "dtype", type(x).__name__), getattr(x, "weak_type", False)
-    found.append(f"data {kind} {np.shape(x)} {weak}")
+    spread = isinstance(x, jax.Array) and len(x.devices()) > 1
+    found.append(f"data {kind} {np.shape(x)} {weak} {x.sharding if spread else ''}")
 
 
 def _describe_function(x, found):
