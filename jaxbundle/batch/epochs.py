@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 
 FEWEST = 3
 """Minimum number of epochs shared by two cameras."""
@@ -56,7 +56,7 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
             return keys
         if once and len(keys) > 2 and _connected(keys):
             return keys
-    shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
+    shown = "; ".join(f"{camera}: {list_some(given, 2)}" for camera, given in names.items())
     raise InputError(
         f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
         "one moment alike, or give them the same last number"

@@ -47,7 +47,7 @@ class Portion:
     middle: np.ndarray
 
 
-def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def single_list(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Object points listed for every view, as for OpenCV, reduced to one list if all are equal."""
     if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
         return X
@@ -123,7 +123,7 @@ class Batch:
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
         xy = numeric_array("image_points", image_points, "numbers [cameras, views, points, 2]")
-        X = once(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
+        X = single_list(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
         size = numeric_array("image_size", image_size, "width and height in pixels")
         if visible is None:
             visible = np.ones(xy.shape[:3], bool)

@@ -26,8 +26,8 @@ from jax.experimental.multihost_utils import broadcast_one_to_all
 from jaxbundle.batch.run import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.json_lines import JsonLines
-from jaxbundle.io.writing.locks import locked
-from jaxbundle.leastsquares.sharding import alone
+from jaxbundle.io.writing.locks import hold_lock
+from jaxbundle.leastsquares.sharding import use_own_devices
 
 ROWS_AT_ONCE = 256
 PAUSE = 0.2
@@ -57,7 +57,7 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
             _tell(waiting, "begin")
         if not _wait(waiting, ["begin"])["begin"]:
             part = f"{file}.part-{index + 1}-of-{number}"
-            with alone():
+            with use_own_devices():
                 run_batch(inputs, part, part=(index + 1, number), known=file, **own)
     except Exception as error:
         failed = error
@@ -119,9 +119,9 @@ def add_parts(file: str | Path) -> None:
     if not found and not waited:
         return
     with ExitStack() as held:
-        held.enter_context(locked(file))
+        held.enter_context(hold_lock(file))
         for _, path in found:
-            held.enter_context(locked(path))
+            held.enter_context(hold_lock(path))
         parts = [JsonLines(path) for _, path in sorted(found)]
         lines, some = JsonLines(file), []
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))

@@ -19,7 +19,7 @@ from jaxbundle.batch.result import BatchCalibration
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
-from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.writing.fingerprints import of_words
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import (
@@ -30,13 +30,13 @@ from jaxbundle.measure.views import (
     name_photographs,
     photographs,
 )
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.system.workers import Failed, Workers
 
 
 def is_photograph_folder(path: str | Path) -> bool:
     """Whether an input is a folder, and none that holds a network."""
-    return os.path.isdir(path) and recognised_format(Path(path)) is None
+    return os.path.isdir(path) and recognise_format(Path(path)) is None
 
 
 def has_photographs(path: str | Path) -> bool:
@@ -120,8 +120,8 @@ def _why_empty(folder) -> str:
     inside = [one.name for one in camera_folders(folder)]
     if not inside:
         return "no photographs in this folder"
-    return (f"no photographs in this folder, but in {some(inside, 3, str)} in it: give --rig for "
-            "cameras on one mounting, or these folders")  # fmt: skip
+    return (f"no photographs in this folder, but in {list_some(inside, 3, str)} in it: give --rig "
+            "for cameras on one mounting, or these folders")  # fmt: skip
 
 
 def calibrate_views(

@@ -7,11 +7,11 @@ from html import escape
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxbundle.arguments import shown as quoted
+from jaxbundle.arguments import show as quoted
 from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
 from jaxbundle.batch.population import Population
 from jaxbundle.cameras import CameraModel
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import data_frame
 
@@ -21,7 +21,7 @@ MOST_REMARKS = 10
 """Remarks that differ, in the text."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class BatchCalibration:
     """The cameras of a batch; all values of a camera without a solution are NaN.

@@ -21,7 +21,7 @@ from jaxbundle.batch.epochs import contradicting
 from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
 from jaxbundle.batch.input import LARGEST
 from jaxbundle.batch.misfit import misfits
-from jaxbundle.batch.weakness import vague
+from jaxbundle.batch.weakness import is_vague
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel, key_of
@@ -192,7 +192,7 @@ def _undetermined(result: Adjustment, settings: RigSettings) -> list[str]:
         of = camera["parameters"]
         values = np.array([[of[name]["value"] for name in model.parameters]])
         sigma = np.array([[of[name]["sigma"] for name in settings.free]])
-        weak = vague(model, free, values, sigma)[0]
+        weak = is_vague(model, free, values, sigma)[0]
         prefix = f"{id} " if len(result.cameras) > 1 else ""
         found += [f"{prefix}{settings.free[k]}" for k in np.flatnonzero(weak)]
     return found

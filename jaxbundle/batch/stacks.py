@@ -25,11 +25,11 @@ import numpy as np
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.batch.calibrate_rigs import check_rigs, rigs_of_arrays
-from jaxbundle.batch.input import check_shapes, once
+from jaxbundle.batch.input import check_shapes, single_list
 from jaxbundle.batch.rigs import Rig
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
-from jaxbundle.io.text.unpacking import most_unpacked
+from jaxbundle.io.text.unpacking import largest_unpacked_size
 from jaxbundle.io.writing.fingerprints import of_arrays
 
 UNREADABLE = (
@@ -132,7 +132,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
         if xy.ndim == 5:
             cameras, _ = check_rigs(X, xy, size, visible, cameras)
         else:
-            X = X if isinstance(X, StoredRows) else once(X, xy)
+            X = X if isinstance(X, StoredRows) else single_list(X, xy)
             every = np.broadcast_to(np.True_, xy.shape[:3])
             check_shapes(X, xy, size, every if visible is None else visible)
     except InputError as error:
@@ -181,5 +181,5 @@ def _check_size(stream: BinaryIO) -> None:
         )  # fmt: skip
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
-    if unpacked > most_unpacked(size):
+    if unpacked > largest_unpacked_size(size):
         raise ValueError(f"{size} bytes that claim to unpack to {unpacked}")

@@ -18,7 +18,7 @@ PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""
 
 
-def vague(
+def is_vague(
     model: CameraModel,
     free: tuple[int, ...],
     interior: Float[np.ndarray, "cameras parameters"],

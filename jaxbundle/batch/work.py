@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import SECTIONS, rig_settings
 from jaxbundle.batch.input import any_model, free_parameters, is_plain
@@ -91,7 +91,7 @@ class BatchSettings:
             need_opencv()
         elif rig:
             raise InputError("rig: give the board that is in the photographs (--board)")
-        adjusting = {"max_iterations": whole("max_iterations", max_iterations)}
+        adjusting = {"max_iterations": integer("max_iterations", max_iterations)}
         if snooping is not None:
             adjusting |= dict(snooping=snooping, significance=significance)
         return cls(any_model(model), str(model), free, board, rig, pixel_size, tuple(overrides),

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.adjustment.problem import HELD, Problem
 from jaxbundle.adjustment.unknowns import angles_near
-from jaxbundle.arguments import number, shown
+from jaxbundle.arguments import number, show
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -40,7 +40,7 @@ from jaxbundle.geometry.similarity import compose, helmert_point
 from jaxbundle.leastsquares.datum.motions import SEVEN
 from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import count, data_frame, some
+from jaxbundle.network.columns import count, data_frame, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
 
@@ -180,10 +180,10 @@ def compare(
     """
     for name, one in (("a", a), ("b", b)):
         if not isinstance(one, Adjustment):
-            raise InputError(f"{name} must be an Adjustment, but is {shown(one)}: jaxbundle.adjust "
+            raise InputError(f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
                              "or jaxbundle.load_adjustment gives one")  # fmt: skip
     if similarity not in (None, True, False):
-        raise InputError(f"similarity must be True, False or None, but is {shown(similarity)}")
+        raise InputError(f"similarity must be True, False or None, but is {show(similarity)}")
     significance = number("significance", significance, "between 0 and 1", lambda x: 0 < x < 1)
     _require_units(a, b)
     rows = _common_rows(a, b)
@@ -243,7 +243,7 @@ def _held(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
         raise InputError("held_by must be a list of ids of points, but is a text")
     missing = [id for id in map(str, wanted) if id not in set(points)]
     if missing:
-        raise InputError(f"held_by: points {some(missing)} are not in both adjustments")
+        raise InputError(f"held_by: points {list_some(missing)} are not in both adjustments")
     held = tuple(map(str, wanted)) or tuple(points)
     if len(held) < 3:
         raise InputError(f"a similarity needs three points in common, but there are {len(held)}; "
@@ -334,7 +334,7 @@ class _In:
     problem: Problem
     like: Problem
 
-    def chosen(self, rows: _Common, angles) -> _Chosen:
+    def choose_rows(self, rows: _Common, angles) -> _Chosen:
         network = self.problem.network
         of = lambda ids, table: np.array([{id: k for k, id in enumerate(table)}[id] for id in ids],
                                          int)  # fmt: skip
@@ -349,7 +349,7 @@ class _In:
 
     def estimate(self, rows: _Common, angles) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns and their covariance."""
-        chosen = self.chosen(rows, angles)
+        chosen = self.choose_rows(rows, angles)
         return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.minimum import adjusted_cameras, minimise, solved
+from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution, minimise
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import FARTHEST, is_at_infinity
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
@@ -54,7 +54,7 @@ def minimise_at_any_distance(
         if chosen is None:
             patience = PATIENCE * (2 if mostly(angle < NARROW) else 1)
             plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
-            if solved(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
+            if inspect_solution(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
             legs, start = [plain], plain.values
             chosen = angle_of_rays(problem, start) < NARROW
@@ -62,7 +62,7 @@ def minimise_at_any_distance(
         far = _with_far_points(problem, start, chosen, make)
         if far is not None:
             found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
-            if solved(found.with_factor(), minimum):
+            if inspect_solution(found.with_factor(), minimum):
                 return found, _join([*legs, minimum])
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]

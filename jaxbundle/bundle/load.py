@@ -18,7 +18,7 @@ from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 
 SAME_SIGMA0 = 1e-6
 """σ0 of a loaded adjustment that differs by more, relatively, is not that of the saved one."""
@@ -47,8 +47,8 @@ def load_adjustment(
         raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
     missing = sorted(set(found.own_models) - {model.name for model in models})
     if missing:
-        raise InputError(f"{path}: the camera models {some(missing)} are not built in; give them "
-                         "as models=[…]")  # fmt: skip
+        raise InputError(f"{path}: the camera models {list_some(missing)} are not built in; give "
+                         "them as models=[…]")  # fmt: skip
     found = dataclasses.replace(found, network=with_own_models(found.network, models))
     try:
         result = _restore(found, _problem(found, also, path))
@@ -76,7 +76,7 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
     if (tables, kinds) != (state.tables, state.kinds):
         other = set(state.tables + state.kinds) ^ set(tables + kinds)
         raise InputError(f"{path}: was adjusted with other tables and observations of one's own "
-                         f"({some(sorted(other))}); give the same as also=[…]")  # fmt: skip
+                         f"({list_some(sorted(other))}); give the same as also=[…]")  # fmt: skip
     start = _tree(problem.data.start, state.start)
     problem = problem.with_data(dataclasses.replace(problem.data, start=start))
     for table, free in zip(problem.system.tables, state.free):

@@ -15,7 +15,7 @@ from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINAT
 from jaxbundle.leastsquares.quality.names import undetermined
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
@@ -40,7 +40,7 @@ def minimise(problem: Problem, start: Values, **options) -> Minimum[Values]:
     return Minimum(values, found.termination, found.iterations, found.history)
 
 
-def solved(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
+def inspect_solution(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
     """The solution if it converged, no camera collapsed and all unknowns are determined; else
     None."""
     if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
@@ -77,8 +77,8 @@ def name_inseparable(problem: Problem, minimum: Minimum[Values]) -> str:
     if not names:
         return ""
     return (
-        f"hardly separated where the iterations ended: {some(names, 8, str)}; hold some of them, "
-        "give them a prior σ, or raise the limit of iterations"
+        f"hardly separated where the iterations ended: {list_some(names, 8, str)}; hold some of "
+        "them, give them a prior σ, or raise the limit of iterations"
     )
 
 
@@ -98,13 +98,13 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
     """The solution of a repeated adjustment; refused if it was not solved.
 
     **Raises:** `NotSolvedError`."""
-    found = solved(problem, minimum)
+    found = inspect_solution(problem, minimum)
     if not found:
         names = names_of_defects(problem, minimum)
         reason = int(minimum.termination)
         why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
         if names:
-            why = f"the network is no longer determined: {some(names, 8, str)}"
+            why = f"the network is no longer determined: {list_some(names, 8, str)}"
         raise NotSolvedError(f"not solved {when}: {why}", names)
     return found
 

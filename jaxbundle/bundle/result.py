@@ -17,7 +17,7 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.unknowns import (
     angles_near,
-    named,
+    find_unknowns,
     place_of,
     value_of,
 )
@@ -29,7 +29,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
@@ -38,7 +38,7 @@ from jaxbundle.leastsquares.quality.components import Component, variance_compon
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import data_frame, some
+from jaxbundle.network.columns import data_frame, list_some
 from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
@@ -206,7 +206,7 @@ class Adjustment:
 
     def _require_solved(self) -> None:
         if not self.converged:
-            names = some(self.undetermined, 8, str)
+            names = list_some(self.undetermined, 8, str)
             what = f"; not determined: {names}" if names else ""
             what += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
             raise NotSolvedError(
@@ -294,7 +294,7 @@ class Adjustment:
         """ω, φ, κ of all images, nearest to the given angles, and their Jacobians by δθ; small
         networks share the program."""
         given = self.problem.network.images.angles
-        rows = max(rounded(len(given)), LEAST_IMAGES)
+        rows = max(round_up(len(given)), LEAST_IMAGES)
         wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
         return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
 
@@ -376,7 +376,7 @@ class Adjustment:
 
         **Raises:** `InputError` without names, or for a name that does not have three parts;
         `KeyError` for an unknown name."""
-        wanted = named(self.problem, names)
+        wanted = find_unknowns(self.problem, names)
 
         def pick(values: Values):
             return jnp.stack([value_of(self.problem, name, values) for name in wanted])

@@ -32,7 +32,7 @@ from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
@@ -88,7 +88,7 @@ def write_calibration(
     """
     if plots:
         need_matplotlib()
-    with replaced_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
+    with replace_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
         _fill(calibration, new, plots, UNKNOWN)
 
 
@@ -136,7 +136,7 @@ def write_calibrations(
     """
     if plots:
         need_matplotlib()
-    with replaced_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
+    with replace_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
         fill_calibrations(found, new, plots)
 
 

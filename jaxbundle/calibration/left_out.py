@@ -14,14 +14,14 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 
 AFFINE = ("b1", "b2")
 CRITICAL = 4.0
 """|b|/σ above which a parameter is missing."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
     """Parameters that were held at 0: their estimates, σ, and the largest image displacement they

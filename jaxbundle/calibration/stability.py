@@ -36,7 +36,7 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
@@ -63,7 +63,7 @@ class Homogeneity:
         return f"χ² = {self.chi2:.1f} ({self.degrees}), p = {self.probability:.2g}"
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Stability:
     """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,

@@ -26,7 +26,7 @@ from jaxbundle.cameras.convert_fit import GRID, image_grid, images_of, rays_of
 from jaxbundle.cameras.model import CameraModel, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
-from jaxbundle.display import data_set, shows_itself
+from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.iterations.small import minimise
@@ -36,7 +36,7 @@ SAME_RAY = 1e-6
 """Directions that differ by less, radians, are the same."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Comparison:
     """A difference map, in the unit and axes of the first calibration.

@@ -88,7 +88,8 @@ def convert_camera(
     - `area`: the corners of the image (low, high) in the source's coordinates; by default the whole
       image.
     - `r0`: of the target, mm, if it has one.
-    - `free`: parameters of a fit (`convert_fit.fitted` if empty); others have their defaults.
+    - `free`: parameters of a fit (`convert_fit.fitted_parameters` if empty); others have their
+      defaults.
 
     **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """

@@ -21,7 +21,7 @@ def say(words: str) -> None:
 
 
 @contextlib.contextmanager
-def telling() -> Iterator[None]:
+def report_times() -> Iterator[None]:
     """Print versions, and at the end the elapsed time."""
     say(", ".join(f"{name} {version}" for name, version in software_versions()))
     made: list[float] = []

@@ -32,7 +32,7 @@ from jaxbundle.geometry import (
     quaternion_from_matrix,
 )
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.columns import count, did_you_mean, shown
+from jaxbundle.network.columns import count, did_you_mean, show
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.plotting.frame import image_frame
 from jaxbundle.report.layout import clean, significant
@@ -118,7 +118,7 @@ class NetworkView:
         check_keys(given, ("moves", "aim"))
         aim, wanted = switch(given, "aim"), given.get("moves", {})
         if not isinstance(wanted, Mapping):
-            raise InputError(f"moves must be values by station, but is {shown(wanted)}")
+            raise InputError(f"moves must be values by station, but is {show(wanted)}")
         return [self._move(str(id), values, aim) for id, values in wanted.items()]
 
     def _move(self, id: str, values: Any, aim: bool) -> Moved:
@@ -129,7 +129,7 @@ class NetworkView:
             for v in values
         ):  # fmt: skip
             raise InputError(f"image {id!r}: six numbers {', '.join(EXTERIOR)} are expected, not "
-                             f"{shown(values)}")  # fmt: skip
+                             f"{show(values)}")  # fmt: skip
         row = self.ids.index(id)
         pose = np.array(values, float) / self.units
         if not aim:
@@ -295,7 +295,7 @@ class NetworkView:
             find(found), found.warnings, facts(row for row in summary(found) if row[0] != "Note")
         )
         sections = [
-            shown_first, network_section(), _chosen(), self._move_section(given, live),
+            shown_first, network_section(), _selection(), self._move_section(given, live),
             photographs(),
         ]  # fmt: skip
         state = {"moves": given.get("moves", {}), "aim": given.get("aim", True)}
@@ -330,7 +330,7 @@ class NetworkView:
         return Section("move", "Move a station", "".join(parts), "Move a station", True)
 
 
-def _chosen() -> Section:
+def _selection() -> Section:
     """The place of what is clicked."""
     parts = [
         paragraph("Click a point, a station, a ray, or an image point in a photograph: its "

@@ -7,7 +7,8 @@ controls too.
 
 Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
 the table, so that the exported flight file has them. Ground places are those of `locate`, the error
-map is `ground_errors`, σ → RMS and CE90 are `propagated` and, for a level camera, `closed_form`.
+map is `ground_errors`, σ → RMS and CE90 are `propagate_accuracy` and, for a level camera,
+`closed_form`.
 """
 
 import dataclasses
@@ -42,7 +43,7 @@ from jaxbundle.explore.tracks import (
     Tracks,
     choose_track,
     idle_controls,
-    rounded,
+    shorten_number,
     track_controls,
     tracks_of,
 )
@@ -56,14 +57,14 @@ from jaxbundle.pushbroom.accuracy import (
     closed_form,
     east_north,
     ground_errors,
-    propagated,
+    propagate_accuracy,
 )
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
 from jaxbundle.pushbroom.interpolation import METHODS, Table
 from jaxbundle.pushbroom.locate import locate_points
-from jaxbundle.pushbroom.noise import Noise, no_errors
+from jaxbundle.pushbroom.noise import Noise, zero_errors
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
@@ -200,7 +201,7 @@ class ScannerView:
         for name, k in ANGLES.items():
             error[k] = np.radians(values[name])
         if error.any():
-            errors = no_errors(image)._replace(attitude_bias=jnp.asarray(error))
+            errors = zero_errors(image)._replace(attitude_bias=jnp.asarray(error))
             image = with_errors_in_rows(image, errors)
         return Chosen(image, earth, _surface_at(values["ground"], earth), truth)
 
@@ -311,7 +312,7 @@ class ScannerView:
         rows = []
         for level in LEVELS:
             sigma = np.radians(level)
-            exact = propagated(image, surface, *self._places(), Noise(attitude_bias=sigma))
+            exact = propagate_accuracy(image, surface, *self._places(), Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
             rows.append({
                 "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,
@@ -476,7 +477,7 @@ def _one(sigma) -> float:
 
 
 def _degrees(sigma) -> float:
-    return rounded(np.degrees(_one(sigma)))
+    return shorten_number(np.degrees(_one(sigma)))
 
 
 _locate = jax.jit(locate_points)

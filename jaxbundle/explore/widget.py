@@ -10,7 +10,7 @@ import functools
 from importlib.resources import files
 from typing import Any
 
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.server import Refused, page_file, respond
 from jaxbundle.explore.view import View
@@ -24,7 +24,7 @@ def show(view: View, *, height: int = 800) -> Any:
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
-    height = whole("height", height, LOWEST, HIGHEST)
+    height = integer("height", height, LOWEST, HIGHEST)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
     widget.on_msg(lambda one, content, buffers: one.send(*reply(view, content)))

@@ -36,7 +36,7 @@ class AnyDistance:
         A, c = _frame(value)
         return tuple(value[:3]), tuple(map(tuple, A)), c
 
-    def moved(self, block, change):
+    def move(self, block, change):
         X, A, c = block
         if not change:
             return X

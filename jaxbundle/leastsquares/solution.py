@@ -23,19 +23,19 @@ from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,
     Values,
-    in_given_order,
     lay_out_data,
     prepare,
     residuals,
+    restore_order,
 )
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
     Problem,
     make_solver,
-    open_at,
     pad_data,
     pad_values,
+    with_motions_at,
     without_filling,
 )
 from jaxbundle.leastsquares.quality.cofactors import (
@@ -70,7 +70,7 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
     minimise_from = minimise_from(problem, make_solver(problem, **options))
     first = minimum = minimise_from(start)
     for _ in range(RETURNS):
-        there = open_at(problem, without_filling(problem, minimum.values))
+        there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
         if there is problem or not bool(converged(minimum.termination)):
             break
@@ -147,7 +147,7 @@ class Solution:
     @functools.cached_property
     def problem(self) -> Problem:
         """The problem with its open motions at these values."""
-        return open_at(self._as_given, self.values)
+        return with_motions_at(self._as_given, self.values)
 
     @functools.cached_property
     def _data(self) -> Data:
@@ -259,7 +259,7 @@ class Solution:
 
 @eqx.filter_jit
 def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
-    return in_given_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
+    return restore_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
 
 
 @eqx.filter_jit
@@ -290,7 +290,7 @@ def _by_eliminated(declared, plan, values, data):
     for number in range(len(plan.parts)):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)
-    return in_given_order(plan, found)
+    return restore_order(plan, found)
 
 
 @eqx.filter_jit

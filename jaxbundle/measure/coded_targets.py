@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.choices import CODED_TARGETS
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.corners import find_board
@@ -42,7 +42,7 @@ CLEAR = 0.3
 """Tolerance of sectors and the gap relative to the contrast."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class NamedPoints:
     """Points found in a photograph: names, pixels, σ in pixels."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import numeric_array
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
@@ -38,7 +38,7 @@ HINT = "give --board"
 HINTS = (HINT, "give --dictionary")
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class BoardViews:
     """The measurements of a board: image points of every view, and failed photographs.
@@ -135,7 +135,7 @@ def measure_boards(
     if not files:
         raise InputError("no photographs are given")
     file_of = name_photographs(files)
-    repeated = _repeated(file_of)
+    repeated = _find_repeated(file_of)
     search = lambda name: repeated.get(name) or search_board(file_of[name], board)
     looks = {}
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -172,7 +172,7 @@ def collect_views(
                 f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
             )
     used = [(name, xy) for name, other, xy in found if other == size]
-    failed |= _saved_again(used)
+    failed |= _find_saved_again(used)
     used = [(name, xy) for name, xy in used if name not in failed]
     order = {name: i for i, name in enumerate(file_of)}
     return BoardViews(
@@ -198,7 +198,7 @@ def search_alone(task: tuple[str | Path, Board]) -> Look:
     return search_board(*task)
 
 
-def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
+def _find_repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     """The files with the content of an earlier one, and the earlier one."""
     first: dict[bytes, str] = {}
     found = {}
@@ -213,7 +213,7 @@ def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     return found
 
 
-def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
+def _find_saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
     """Views with the same points as an earlier one: one photograph in another
     compression or format."""
     found: dict[str, str] = {}

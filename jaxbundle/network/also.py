@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.spaces import Posed
@@ -51,7 +51,7 @@ def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Obser
         if not isinstance(item, Table | Observations):
             raise InputError(
                 "also: tables (leastsquares.Table) and observations (a Kind, called) are expected, "
-                f"but one is {shown(item)}"
+                f"but one is {show(item)}"
             )
     for table in tables:
         if table.name.split(",")[0] in OWN:

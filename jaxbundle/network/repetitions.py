@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network
 
 LEAST = 3
@@ -27,7 +27,7 @@ def warn_of_repetitions(network: Network) -> Network:
     ):
         pairs = _repetitions(of, by, rays.xy)
         if pairs:
-            names = some((f"{ids[b]!r} repeats {ids[a]!r}" for a, b in pairs), 5, str)
+            names = list_some((f"{ids[b]!r} repeats {ids[a]!r}" for a, b in pairs), 5, str)
             network = network.warn(
                 f"{count(len(pairs), thing)} with the same measurements as another: {names}; "
                 f"{remedy} They count twice: remove one"

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further.base import among, rows_of
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
@@ -115,7 +115,7 @@ def leave_out_undetermined(network: Network) -> Network:
     out = ~keep
     messages = [
         f"left out {count(mask.sum(), thing)} {why}: "
-        f"{some(points.id[row] for row in np.flatnonzero(mask))}"
+        f"{list_some(points.id[row] for row in np.flatnonzero(mask))}"
         for mask, thing, why in (
             (out & ~check & (rays == 0), "point", "without any ray"),
             (out & ~check & (rays > 0), "tie point", "with a single ray"),
@@ -161,7 +161,8 @@ def check_images(before: Network, network: Network) -> None:
             raise NotSolvedError(
                 f"{place}not solved: it shares too few points with other images, so that neither "
                 f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-                f"{some(lone)} can be determined; add images of the same points, or control points",
+                f"{list_some(lone)} can be determined; add images of the same points, or "
+                "control points",
                 [f"{name} of image {images.id[row]}" for name in EXTERIOR]
                 + [f"X, Y, Z of point {id}" for id in lone],
             )
@@ -194,8 +195,8 @@ def check_parts(network: Network) -> None:
         raise InputError(
             f"{images.source.name}: the network consists of {len(labels)} parts without common tie "
             f"points, and one part has only {count(known_points[smallest], 'known point')}: "
-            f"{count(len(names), 'image')} {some(names)}; measure common points, or at least 3 "
-            "control points in it"
+            f"{count(len(names), 'image')} {list_some(names)}; measure common points, or at least "
+            "3 control points in it"
         )
 
 

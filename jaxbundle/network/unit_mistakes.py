@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 
 WIDEST = 10.0
@@ -158,8 +158,8 @@ def _distances_against_control(network: Network) -> str:
     if not off:
         return ""
     return (
-        f"distances a thousand times those of the control points, or a thousandth: {some(off)}; "
-        f"are they in {network.object_unit}, like the control points?"
+        f"distances a thousand times those of the control points, or a thousandth: "
+        f"{list_some(off)}; are they in {network.object_unit}, like the control points?"
     )
 
 

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.pairs import FEWEST_RAYS, Pairs
-from jaxbundle.network_design.variables import Start, looked_at, turned
+from jaxbundle.network_design.variables import Start, points_on_axes, turn_axis
 from jaxbundle.network_design.visibility import margins, visible
 
 TRIED = 1024
@@ -40,7 +40,7 @@ def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]
     return np.stack([points.min(0), points.max(0)])
 
 
-_turned = jax.jit(jax.vmap(turned))
+_turned = jax.jit(jax.vmap(turn_axis))
 
 
 def try_stations(
@@ -89,8 +89,8 @@ def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
         ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
         raise InputError(
             f"conditions: {len(ids)} of {len(interest)} targets cannot be measured from any place "
-            f"in the room ({len(position)} tried): {some(ids)}. Widen the conditions, or leave "
-            "these targets out"
+            f"in the room ({len(position)} tried): {list_some(ids)}. Widen the conditions, or "
+            "leave these targets out"
         )
 
 
@@ -130,7 +130,7 @@ def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
 def start_at(pairs: Pairs) -> Start:
     """The start configuration."""
     values = jax.tree.map(np.asarray, pairs.problem.data.start)
-    return Start(values, looked_at(values))
+    return Start(values, points_on_axes(values))
 
 
 def lost_targets(pairs: Pairs, measured) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from jaxbundle.network_design.aims import (
     Aim,
     Task,
     log_aim,
-    of_interest,
+    points_of_interest,
     refuse_arbitrary,
     task_of,
 )
@@ -177,7 +177,7 @@ def make_pairs(
         problem, aim, task_of(problem, aim), conditions, kept.ravel(),
         views=tuple(view_of(c, conditions.edge) for c in problem.network.cameras),
         rules=rules_of(conditions, problem.origin), normals=conditions.of_points(len(points)),
-        interest=of_interest(problem),
+        interest=points_of_interest(problem),
     )  # fmt: skip
 
 

@@ -159,7 +159,7 @@ def _compile(margins):
     return ({"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)},)
 
 
-def kept(
+def satisfies(
     conditions: Conditions, variables: Variables, origin: np.ndarray, start: Start
 ) -> bool:
     """Whether the stations satisfy their conditions, to a thousandth of their lengths."""

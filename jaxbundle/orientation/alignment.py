@@ -21,7 +21,7 @@ MIRRORED, FITS = 5.0, 30.0
 """Mirror image: required improvement of the fit, and fit relative to the extent."""
 
 
-def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | None:
+def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model | None:
     """The model in the frame of control points and of images whose position is given, else of the
     rays to control points, else of the approximate coordinates of points; None without enough."""
     points, images = network.points, network.images
@@ -36,7 +36,7 @@ def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | No
     if found is None:
         tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
         found = similarity(model.X[tie], points.position[tie])
-    return None if found is None else model.moved(*found)
+    return None if found is None else model.transform(*found)
 
 
 def _by_rays(network: Network, sights: Sights, model: Model):
@@ -70,7 +70,7 @@ def to_scale(network: Network, model: Model) -> tuple[Model, str]:
     scale = scale_of_distances(network, model)
     if scale is None:
         return model, "in an arbitrary frame and scale"
-    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
+    return model.transform(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
 
 
 def scale_of_distances(network: Network, model: Model) -> float | None:
@@ -83,7 +83,7 @@ def scale_of_distances(network: Network, model: Model) -> float | None:
     return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
 
 
-def joined(sights: Sights, model: Model, part: Model) -> Model | None:
+def join(sights: Sights, model: Model, part: Model) -> Model | None:
     """A model merged with a second one; None if nothing connects them.
 
     The similarity is found from common points, or from the pose of a common image and the distances
@@ -99,7 +99,7 @@ def joined(sights: Sights, model: Model, part: Model) -> Model | None:
         found = similarity(part.X[both], model.X[both])
     if found is None:
         return None
-    part = part.moved(*found)
+    part = part.transform(*found)
     image, point = part.placed & ~model.placed, part.known & ~model.known
     choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     return Model(
@@ -114,7 +114,7 @@ def _by_an_image(model, part, image, both):
     return A, model.X0[image] - A @ part.X0[image]
 
 
-def mirrored(network: Network, model: Model) -> str:
+def describe_mirror(network: Network, model: Model) -> str:
     """Whether a model in an arbitrary frame fits the control points only as a mirror image, in
     words; empty if not, or if undecidable (fewer than four, or coplanar)."""
     points = network.points

@@ -138,7 +138,7 @@ def project(camera: Camera, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
     return jnp.stack([fx * x + skew * y, fy * y])
 
 
-def corrected(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+def correct(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """A measured point relative to the principal point, corrected for radial distortion."""
     reduced = jnp.asarray(xy) - camera.interior[3:]
     square = reduced @ reduced
@@ -146,7 +146,7 @@ def corrected(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
 
 
 def _misclosures(camera, xy, X, root):
-    one = lambda xy, X, root: root * (project(camera, X) - corrected(camera, xy))
+    one = lambda xy, X, root: root * (project(camera, X) - correct(camera, xy))
     return jax.vmap(one)(xy, X, root).ravel()
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import FITS
@@ -62,9 +62,9 @@ def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> st
     """Control points that contradict the images without an explanation."""
     names = [network.points.id[p] for p in np.flatnonzero(suspects)]
     return (
-        f"the control points {some(names)} contradict the images or each other, and no exchange "
-        "of two explains it: look for wrong numbers, wrong coordinates, wrong units, and a wrong "
-        "principal distance"
+        f"the control points {list_some(names)} contradict the images or each other, and no "
+        "exchange of two explains it: look for wrong numbers, wrong coordinates, wrong units, and "
+        "a wrong principal distance"
     )
 
 

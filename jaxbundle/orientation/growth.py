@@ -71,7 +71,7 @@ class Model:
         """An image, or several, with their poses."""
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
-    def moved(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
+    def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
         """The same model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))
         return dataclasses.replace(

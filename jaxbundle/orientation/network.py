@@ -20,15 +20,15 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
-from jaxbundle.orientation.alignment import joined, mirrored, onto_the_given, to_scale
+from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
     AGREE,
@@ -63,7 +63,7 @@ WIDE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Oriented:
     """A network with start values; `images`, `points`: reasons for those that could not be
@@ -118,15 +118,15 @@ def find_start_values(
     seen = sights(network, tolerance)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
-        why = _mirrored(network, seen) or _why_nothing(network, seen)
+        why = _describe_mirror(network, seen) or _why_nothing(network, seen)
         raise _no_start_values(network, why)
     found = _result(network, seen, model, frame)
-    missed = _missed(network, seen, model)
+    missed = _find_missed(network, seen, model)
     finding = name_contradiction(network, seen, model) if missed.any() else ""
     left = (controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
     why = ""
     if _control_contradicts(network, seen, model):
-        why = _mirrored(network, seen) or (finding if left < LEAST_CONTROL else "")
+        why = _describe_mirror(network, seen) or (finding if left < LEAST_CONTROL else "")
     if why:
         raise _no_start_values(network, why)
     if missed.any() and left < LEAST_CONTROL:
@@ -141,7 +141,7 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
     return NotSolvedError(f"no start values found: {causes}", _names(network))
 
 
-def _missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
+def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
     wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
     return controlled(network.points) & (2 * wrong > _rays_of(seen, model))
@@ -167,14 +167,14 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     )
 
 
-def _mirrored(network: Network, seen: Sights) -> str:
+def _describe_mirror(network: Network, seen: Sights) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
     model = _from_a_pair(seen, Model.empty(seen), None)
-    return "" if model is None else mirrored(network, model)
+    return "" if model is None else describe_mirror(network, model)
 
 
 def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
-    model, frame = _given(network, seen), "in the frame given"
+    model, frame = _given_model(network, seen), "in the frame given"
     grow(seen, model, improve=improve)
     if not model.placed.any():
         approximate = _with_approximate_points(network, model)
@@ -186,11 +186,11 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
         if part is None:
             break
         if model.placed.any():
-            part = joined(seen, model, part)
+            part = join(seen, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
         grow(seen, model, improve=improve)
-        if not fixed and (moved := onto_the_given(network, seen, model)):
+        if not fixed and (moved := move_to_given_frame(network, seen, model)):
             fixed, frame = True, "in the frame given"
             model = _with_control(network, moved)
             grow(seen, model, improve=improve)
@@ -199,7 +199,7 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
     return (model, frame) if fixed else to_scale(network, model)
 
 
-def _given(network: Network, seen: Sights) -> Model:
+def _given_model(network: Network, seen: Sights) -> Model:
     """Images with all six start values, points with all three coordinates known."""
     model, images = Model.empty(seen), network.images
     there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
@@ -234,7 +234,7 @@ def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
         grow(seen, part, new | old, improve)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
-        if good > most and not (linked and joined(seen, model, part) is None):
+        if good > most and not (linked and join(seen, model, part) is None):
             best, most = part, good
         if most >= MOST * rows.sum():
             break
@@ -320,7 +320,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     network = keep_points(keep_images(network, keep), known)
     said = [
         f"left out {count(len(found), thing)} for which no start values were found: "
-        + some((f"{id} ({why})" for id, why in found.items()), 5, str)
+        + list_some((f"{id} ({why})" for id, why in found.items()), 5, str)
         for thing, found in zip(("image", "point"), reasons) if found
     ]  # fmt: skip
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
@@ -332,7 +332,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
 def _in_contradiction(names: Sequence[str]) -> str:
     return (
         f"left out {count(len(names), 'image point')} in contradiction to the start values: "
-        f"{some(names, 5, str)}"
+        f"{list_some(names, 5, str)}"
     )
 
 

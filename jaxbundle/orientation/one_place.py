@@ -12,7 +12,7 @@ reported.
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.sights import sights
 
@@ -39,8 +39,8 @@ def name_one_place(network: Network) -> str:
         return ""
     names = [network.images.id[image] for image in sorted([base, *others])]
     return (
-        f"images {some(names)} were taken from one place, as far as their measurements tell: a "
-        "rotation alone takes one to the other, and points have no depth; add images from other "
+        f"images {list_some(names)} were taken from one place, as far as their measurements tell: "
+        "a rotation alone takes one to the other, and points have no depth; add images from other "
         "places"
     )
 

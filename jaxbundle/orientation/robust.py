@@ -134,7 +134,7 @@ def robust_resection(
         found = refine_resection(pose, xy, X, p * good)
         return found, _good(errors(found.pose, xy, X), p > 0, 3, threshold)
 
-    return _repeated(again, good, pose, lambda found: found.pose)
+    return _repeat(again, good, pose, lambda found: found.pose)
 
 
 def robust_relative_orientation(
@@ -176,7 +176,7 @@ def robust_relative_orientation(
         result = relative_orientation(xy1, xy2, p * good)
         return result, _good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
-    return _repeated(again, found.inliers)
+    return _repeat(again, found.inliers)
 
 
 def robust_homography(
@@ -280,10 +280,10 @@ def _robust_linear(key, solve, errors, data, weights, size, samples, threshold):
         found = solve(*data, p * good)
         return found, _good(errors(found, *data), p > 0, size, threshold)
 
-    return _repeated(again, good)
+    return _repeat(again, good)
 
 
-def _repeated(again, good, model=None, model_of=lambda found: None):
+def _repeat(again, good, model=None, model_of=lambda found: None):
     """The solution by the good observations, `ROUNDS` times chosen anew, and which they are: one
     program for all rounds and the last solution.
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
@@ -42,7 +42,7 @@ def simulate_further(
     and truth have different image points.
     """
     require_x64()
-    random = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
+    random = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
     known: set[str] = set()
     made = []
     for rows in require_network(network).further:

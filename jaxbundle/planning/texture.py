@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.arguments import number, positive, whole
+from jaxbundle.arguments import integer, number, positive
 
 OCTAVES_OF_EDGES = 4
 AT_ONCE = 1 << 15
@@ -54,7 +54,7 @@ class Texture:
 
     def __post_init__(self):
         positive("texture: texel", self.texel)
-        side = whole("texture: side", self.side, least=16, most=1 << 14)
+        side = integer("texture: side", self.side, least=16, most=1 << 14)
         if side & (side - 1):
             raise ValueError(f"texture: side must be a power of two, but is {side}")
         number("texture: contrast", self.contrast)

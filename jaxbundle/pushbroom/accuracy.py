@@ -25,7 +25,7 @@ from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import Vector, difference
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_point
-from jaxbundle.pushbroom.noise import Noise, disturbed, draw, no_errors, sigmas
+from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas, zero_errors
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray
 
@@ -51,7 +51,7 @@ class GroundAccuracy(eqx.Module):
         return float(np.sqrt(np.mean(self.rms**2)))
 
 
-def propagated(
+def propagate_accuracy(
     image: PushbroomImage,
     surface: Surface,
     lines: Float[np.ndarray, " n"],
@@ -70,7 +70,7 @@ def propagated(
     return GroundAccuracy(covariance, rms, ce90, circular_error(covariance))
 
 
-def drawn(
+def simulate_accuracy(
     image: PushbroomImage,
     surface: Surface,
     lines: Float[np.ndarray, " n"],
@@ -133,7 +133,7 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
 def _covariances(image, surface, lines, pixels, sigma):
     """`sigma` by the kinds of errors that there are."""
     no_rows = jnp.zeros((0, 3))
-    nothing = no_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
+    nothing = zero_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
     zero = jax.tree.map(jnp.zeros_like, sigma)
 
     def of_place(line, pixel):
@@ -141,7 +141,7 @@ def _covariances(image, surface, lines, pixels, sigma):
         axes = east_north(surface, X0)
         move = lambda errors: horizontal(
             axes, X0, locate_point(
-                disturbed(image, nothing._replace(**errors)), surface, line, pixel
+                add_errors(image, nothing._replace(**errors)), surface, line, pixel
             ),
         )  # fmt: skip
         J = jax.jacrev(move)(zero)
@@ -154,7 +154,7 @@ def _covariances(image, surface, lines, pixels, sigma):
 @jax.jit
 def _draws(image, surface, lines, pixels, sigma, keys):
     def one(key):
-        wrong = disturbed(image, draw(sigma, key))
+        wrong = add_errors(image, draw(sigma, key))
         return _differences(wrong, image, surface, lines, pixels)
 
     return jax.lax.map(one, keys)

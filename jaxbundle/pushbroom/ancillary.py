@@ -133,7 +133,7 @@ def extrapolation_limit(rows: Float[np.ndarray, " rows"]) -> float:
     return min(max(STEPS * step, SHORTEST), LONGEST)
 
 
-def told_extrapolation(
+def warn_of_extrapolation(
     rows: Float[np.ndarray, " rows"], times: Float[np.ndarray, " lines"], source: Source
 ) -> tuple[str, ...]:
     """A warning if the rows of a product begin after, or end before, the times of the lines.

@@ -120,16 +120,16 @@ def check_size(lines: float, pixels: float, where: str) -> None:
 
 def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose at the time t, in seconds; NaN outside the tables."""
-    return moved_pose(given_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
+    return move_pose(recorded_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
-def given_pose(image: PushbroomImage, t: Scalar) -> Pose:
+def recorded_pose(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose of the platform from its tables, without offsets and mounting."""
     of = image.trajectory
     return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
 
 
-def moved_pose(
+def move_pose(
     given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
 ) -> Pose:
     """The pose of the camera, `dt` seconds after the middle line."""

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.geometry.vectors import Triple, along, difference, length, turned
-from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refracted
+from jaxbundle.geometry.vectors import Triple, along, difference, length, rotate
+from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
 from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.scanner import Pair, slopes_of
@@ -36,7 +36,7 @@ def ground_point(
 ) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
-    o, d = P, turned(R, (*slopes, -1.0))
+    o, d = P, rotate(R, (*slopes, -1.0))
     if corrections.aberration:
         d = without_aberration(d, inertial_velocity(o, V))
     X = along(o, d, surface.distance(o, d))
@@ -47,7 +47,7 @@ def ground_point(
             o, d = earlier_earth(start, distance), earlier_earth(direction, distance)
             X = along(o, d, surface.distance(o, d))
     if corrections.refraction:
-        o, d = refracted(surface.earth, surface.height(X), o, d)
+        o, d = refract(surface.earth, surface.height(X), o, d)
         X = along(o, d, surface.distance(o, d))
     return X
 

@@ -58,7 +58,8 @@ def refine(image, pieces, earth, X, t, u):
         *place, settled, rounds = state
         chosen = first_of(open_(state), few)
         found = round_(*gather((X, *place), chosen))
-        return *replaced((*place, settled), found, chosen), rounds.at[chosen].add(1, mode="drop")
+        changed = replace_chosen((*place, settled), found, chosen)
+        return *changed, rounds.at[chosen].add(1, mode="drop")
 
     def again(state):
         if n == few:
@@ -79,7 +80,7 @@ def gather(arrays, chosen):
     return jax.tree.map(lambda a: a.at[chosen].get(mode="clip"), arrays)
 
 
-def replaced(arrays, values, chosen):
+def replace_chosen(arrays, values, chosen):
     """Arrays [..., n] with values [..., few] at indices; those of n are dropped."""
     return jax.tree.map(lambda a, v: a.at[..., chosen].set(v, mode="drop"), arrays, values)
 
@@ -89,7 +90,7 @@ def line_period(image):
     return image.times.time(1.0) - image.times.time(0.0)
 
 
-def seen_from(image, earth, motion, X):
+def seen_position(image, earth, motion, X):
     """The apparent position of X for a camera at P with the velocity V; `motion` is (P, V)."""
     P, V = motion
     return seen_point(image.corrections, earth, P, V, X) if image.corrections.any else X
@@ -115,7 +116,8 @@ def _round(image, pieces, earth, X, t, u):
     c = [[of_own(a) for a in power] for power in pieces.coefficients.transpose(1, 2, 0)]
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
-        X = seen_from(image, earth, motion(numbers, [r / half for r in rates], pieces.origin), X)
+        at = motion(numbers, [r / half for r in rates], pieces.origin)
+        X = seen_position(image, earth, at, X)
         # otherwise XLA recomputes it for each of the twelve sums below
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)

@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
-from jaxbundle.geometry.vectors import turned
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.geometry.vectors import rotate
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
 from jaxbundle.types import AnyArray
@@ -88,7 +88,7 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
             )
         middle = (left + right) / 2
         left, right = np.r_[left, middle], np.r_[middle, right]
-    more = rounded(len(found)) - len(found) if len(found) <= SHARED else 0
+    more = round_up(len(found)) - len(found) if len(found) <= SHARED else 0
     found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(
@@ -131,7 +131,7 @@ def _middle(image):
     pose = pose_at(image, image.middle_time)
     u = (image.pixels - 1) / 2
     slopes, per_pixel = jax.jvp(image.optics.slopes, (u,), (1.0,))
-    return pose, turned(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
+    return pose, rotate(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
 
 
 def _sight(image, earth):

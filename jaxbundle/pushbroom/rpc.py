@@ -28,7 +28,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpacked
+from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpack
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import require_ellipsoid
 from jaxbundle.pushbroom.surfaces import Surface
@@ -87,7 +87,7 @@ class Rpc(eqx.Module):
 
 def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, given in radians and metres; see `domain` for their status."""
-    return _image(rpc, *normalised(rpc, longitude, latitude, height))
+    return _image(rpc, *normalise(rpc, longitude, latitude, height))
 
 
 def locate(
@@ -136,7 +136,7 @@ def _twice_misclosure(place, data):
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
     """The `RpcStatus` of a point: whether it and its image are in the domain of the
     coefficients."""
-    place = normalised(rpc, longitude, latitude, height)
+    place = normalise(rpc, longitude, latitude, height)
     ratios = jnp.stack(_ratios(rpc, *place))
     inside = _inside(jnp.stack([*place, *ratios]))
     return jnp.where(jnp.isfinite(ratios).all(), inside, int(RpcStatus.NOT_CONVERGED))
@@ -184,7 +184,7 @@ def sight(
 
     ends = rpc.height_offset + jnp.abs(rpc.height_scale) * jnp.array([1.0, -1.0])
     top, bottom = jax.vmap(point)(ends)
-    return unpacked(top), unit(difference(bottom, top))
+    return unpack(top), unit(difference(bottom, top))
 
 
 @jax.jit
@@ -227,7 +227,7 @@ def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     )  # fmt: skip
 
 
-def normalised(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
+def normalise(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
     """(L, P, H); longitudes may differ by turns."""
     east = jnp.degrees(longitude) - rpc.longitude_offset
     east = east - 360 * jnp.round(east / 360)

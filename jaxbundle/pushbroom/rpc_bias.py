@@ -144,7 +144,7 @@ def fit_bias(
     )
 
 
-def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
+def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
     exact).
 

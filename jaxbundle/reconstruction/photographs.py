@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
 from jaxbundle.photographs.reading import SUFFIXES, photograph_size
@@ -60,7 +60,7 @@ def find_photographs(
         first[fingerprint] = name
         found.append(Photograph(path, name, fingerprint, read_exif(path)))
     if len(found) < 2:
-        said = some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
+        said = list_some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
         raise InputError(
             f"{len(found)} of {len(paths)} photographs can be used; two or more are needed"
             + (f": {said}" if left_out else "")
@@ -113,7 +113,7 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
 
     **Raises:** `InputError` if the given camera has another size.
     """
-    notes = _turned(photographs)
+    notes = _rotation_messages(photographs)
     if given is not None:
         return Cameras((_fits(given, photographs),), (0,) * len(photographs), (True,), True, notes)
     groups: dict[tuple, list[int]] = {}
@@ -162,11 +162,11 @@ def _fits(given: Camera, photographs) -> Camera:
     return given
 
 
-def _turned(photographs) -> tuple[str, ...]:
+def _rotation_messages(photographs) -> tuple[str, ...]:
     turned = [p.name for p in photographs if p.exif.orientation != UPRIGHT]
     if not turned:
         return ()
     return (
-        f"{len(turned)} photographs have a rotated EXIF orientation ({some(turned, 3, str)}); "
+        f"{len(turned)} photographs have a rotated EXIF orientation ({list_some(turned, 3, str)}); "
         "their pixels are used in the orientation of the sensor, columns and rows likewise",
     )

@@ -99,7 +99,7 @@ def _with_distance(camera: Camera, f: float) -> Camera:
     return dataclasses.replace(camera, parameters=parameters, sigma=sigma)
 
 
-def believable(result: Adjustment) -> bool:
+def is_plausible(result: Adjustment) -> bool:
     """Whether an adjustment converged to plausible principal distances."""
     return bool(result.converged) and all(
         SHORTEST < found["fx"] / max(camera.image_size) < LONGEST

@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
 from jaxbundle.network.declare import declare as declare_network
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 from jaxbundle.refinement import kinds
-from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_one_size, priors
+from jaxbundle.refinement.freedom import Form, Name, make_form, names, pad_forms, priors
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage
 from jaxbundle.types import Index, present
 
@@ -73,7 +73,7 @@ class Given:
 
 def gather(images, points: GroundPoints, observations, frames: Network | None) -> Given:
     """The forms of the unknowns, the sensors, the origin."""
-    forms = of_one_size([make_form(one.image, one.earth, one.freedom) for one in images])
+    forms = pad_forms([make_form(one.image, one.earth, one.freedom) for one in images])
     sensors = list(dict.fromkeys(map(sensor_of, images)))
     sensor = np.array([sensors.index(sensor_of(one)) for one in images])
     at = {id: k for k, id in enumerate(points.id)}

@@ -23,7 +23,7 @@ from jaxbundle.pushbroom.image import PushbroomImage, no_offsets
 from jaxbundle.pushbroom.interpolation import Table, span
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
-from jaxbundle.refinement.freedom import Change, Form, changed, changed_optics
+from jaxbundle.refinement.freedom import Change, Form, change_image, change_optics
 
 TOLERANCE = 1e-9
 """Radians: a millimetre from 1000 km."""
@@ -39,7 +39,7 @@ SAME = 1e-12
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
-    moved = changed(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
+    moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)), image.times,
         _optics(image, change), moved.mounting, no_offsets(), image.corrections,
@@ -138,7 +138,7 @@ def _pad(function, rows):
 
 def _optics(image, change) -> Optics:
     """Optics of the same kind if possible, else a table of angles."""
-    wanted = changed_optics(image, change)
+    wanted = change_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters

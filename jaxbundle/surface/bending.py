@@ -168,7 +168,7 @@ def response(
     return out
 
 
-def corrected(
+def correct_bending(
     pair: tuple[OrientedImage, OrientedImage], guide: Guide, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, " n"], match, half: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:

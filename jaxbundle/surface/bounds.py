@@ -37,7 +37,9 @@ class Bounds:
         return np.where((inside[:, :1] < inside[:, 1:]), inside, whole)
 
 
-def by_points(view: OrientedImage, X: Float[np.ndarray, "n 3"]) -> tuple[float, float] | None:
+def bounds_from_points(
+    view: OrientedImage, X: Float[np.ndarray, "n 3"]
+) -> tuple[float, float] | None:
     """Bounds of q of the points in an image with a margin; None if they are too few."""
     X = X[is_inside(view, view.project(X))]
     if len(X) < ENOUGH:
@@ -47,7 +49,7 @@ def by_points(view: OrientedImage, X: Float[np.ndarray, "n 3"]) -> tuple[float, 
     return max(low - room, 0.2 * low if low > 0 else -np.inf), high + room
 
 
-def by_geometry(
+def bounds_from_geometry(
     view, others: Sequence
 ) -> tuple[float, float] | None:
     """Bounds of q of photographs for usual angles of intersection, around the point where most

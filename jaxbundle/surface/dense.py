@@ -284,7 +284,7 @@ def _solve(left, warped, half) -> _Solved:
     LR = g[..., 2]
     textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
     inner = _variance(left, half // INNER)
-    Q, p = _solved(N, g, textured)
+    Q, p = _invert_normal(N, g, textured)
     rest = np.maximum(LL - np.einsum("...i,...i->...", p, g), 0)
     s2 = rest / (n - 4)
     # half of s² is the noise of the left image
@@ -305,7 +305,7 @@ def _variance(a, half):
     return mean(a * a) - mean(a) ** 2
 
 
-def _solved(N, g, textured):
+def _invert_normal(N, g, textured):
     """N⁻¹ and N⁻¹·g of symmetric 3 × 3; NaN where there is no texture or one direction has none."""
     a, b, c = N[..., 0, 0], N[..., 0, 1], N[..., 0, 2]
     d, e, f = N[..., 1, 1], N[..., 1, 2], N[..., 2, 2]

@@ -201,7 +201,7 @@ def search(base, others, pyramids, uv, q, normal, level, half):
         common = q[rows, :1] + share * (q[rows, 1:] - q[rows, :1])
         curves = []
         for k, o in enumerate(others):
-            segment, shape = _taken(parts[k], rows), _taken(shapes[k], rows)
+            segment, shape = _take(parts[k], rows), _take(shapes[k], rows)
             curves.append(_at_common(base, o, (pyramids[0], pyramids[1][k]), uv[rows], segment,
                                      shape, shape.usable, level, int(steps), common))  # fmt: skip
         peak, best, second = top(combine(curves))
@@ -210,7 +210,7 @@ def search(base, others, pyramids, uv, q, normal, level, half):
     return out
 
 
-def _taken(record, rows):
+def _take(record, rows):
     """The rows of a record of arrays."""
     fields = {f.name: getattr(record, f.name)[rows] for f in dataclasses.fields(record)}
     return type(record)(**fields)

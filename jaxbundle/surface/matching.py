@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.measure.least_squares_matching import MatchingStatus
-from jaxbundle.surface.bending import corrected, sharpen
+from jaxbundle.surface.bending import correct_bending, sharpen
 from jaxbundle.surface.correlation import Pyramid
 from jaxbundle.surface.guide import Guide, search
 from jaxbundle.surface.intersection import Intersected, intersect
@@ -64,7 +64,7 @@ class Settings:
     least_angle: float = np.radians(1.0)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Matches:
     """Points from a base image: their pixels, points, and rejected ones by reason.
@@ -118,7 +118,7 @@ def match_points(
         shape = windows(base, other, X, normal)
         start = positions(base, other, uv, q[:, None])[:, 0]
         match = refine(base, other, uv, start, shape.A, settings.fine)
-        place, uncertain = corrected((base, other), sharp, uv, q, match, settings.fine)
+        place, uncertain = correct_bending((base, other), sharp, uv, q, match, settings.fine)
         uncertain = uncertain + LEAST_SIGMA**2 * np.eye(2)
         places[:, k], covariance[:, k], rhos[:, k] = place, uncertain, match.rho
         good = shape.usable & (match.status == int(MatchingStatus.CONVERGED))

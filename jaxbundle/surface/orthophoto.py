@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surface.dsm import Dsm
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
@@ -73,7 +73,7 @@ def write_orthophoto(
     stored = np.nan_to_num(np.clip(np.rint(values), 1, np.iinfo(dtype).max)).astype(dtype)
     rows, columns = values.shape
     transform = Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y)
-    with written_raster(path, columns, rows, 1, dtype, transform=transform, nodata=0,
+    with write_raster(path, columns, rows, 1, dtype, transform=transform, nodata=0,
                         crs=dsm.system, compress="deflate") as raster:  # fmt: skip
         raster.write(stored[None])
 

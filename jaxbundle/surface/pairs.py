@@ -47,7 +47,7 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     return best
 
 
-def given_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:
+def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:
     """Pairs as texts BASE,OTHER[,OTHER…] of image names, as indices.
 
     **Raises:** `InputError`."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.surface.bounds import Bounds, by_geometry, by_points
+from jaxbundle.surface.bounds import Bounds, bounds_from_geometry, bounds_from_points
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
 from jaxbundle.surface.dense_cloud import dense_cloud
@@ -62,9 +62,9 @@ def find_bounds(
         others = [o for o in views if o is not view]
         # a view between the heights is not bounded by them
         among = heights is not None and low <= view.X0[2] <= high
-        q = by_points(view, tie) if len(tie) and (heights is None or among) else None
+        q = bounds_from_points(view, tie) if len(tie) and (heights is None or among) else None
         if q is None:
-            wide = by_geometry(view, others)
+            wide = bounds_from_geometry(view, others)
             if wide is None:
                 raise InputError(
                     f"{view.name}: all images are at one position: a surface needs a base"

@@ -99,8 +99,8 @@ def rectify(
     span = int(np.ceil(d_high + room)) - lowest
     origin = first - [span, 0]
     shape = (rows, columns + span)
-    left = _looked_up(base, R, f, origin, shape)
-    right = _looked_up(other, R, f, origin - [lowest, 0], shape)
+    left = _look_up(base, R, f, origin, shape)
+    right = _look_up(other, R, f, origin - [lowest, 0], shape)
     return Rectified(left, right, origin, lowest, base.X0, R, f, length), span
 
 
@@ -128,7 +128,7 @@ def _resolution(view: FrameView) -> float:
     return float(np.sqrt(np.sqrt(np.linalg.det(J @ J.T))))
 
 
-def _looked_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
+def _look_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
     """Grey values at the rays of a rectified camera, NaN outside the image."""
     rows, columns = shape
     coefficients = ndimage.spline_filter(np.asarray(view.grey, np.float32), 3, np.float32)

@@ -114,7 +114,7 @@ class FrameView:
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
     def points(self, uv, q):
-        return in_lanes(_points, self.frame, uv, q)
+        return run_in_lanes(_points, self.frame, uv, q)
 
     def parameter(self, X):
         return 1 / np.linalg.norm(X - self.X0, axis=1)
@@ -123,11 +123,11 @@ class FrameView:
         d = X - self.X0
         with np.errstate(invalid="ignore", divide="ignore"):
             angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
-        uv = in_lanes(_project, self.frame, X)
+        uv = run_in_lanes(_project, self.frame, X)
         return np.where((angle <= self._farthest)[:, None], uv, np.nan)
 
     def derivative(self, X):
-        return in_lanes(_derivative, self.frame, X)
+        return run_in_lanes(_derivative, self.frame, X)
 
     def bounds(self, uv, low, high):
         d = self.points(uv, np.ones(len(uv))) - self.X0
@@ -187,7 +187,7 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
         )  # fmt: skip
 
 
-def in_lanes(program: Callable, frame, *arrays):
+def run_in_lanes(program: Callable, frame, *arrays):
     """The program for arrays [n, …], in blocks of `LANES`, padded."""
     n = len(arrays[0])
     lanes = LANES if n > FEW else FEW

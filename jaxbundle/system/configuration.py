@@ -20,9 +20,9 @@ def use_cores(number: int | None = None) -> None:
     before the first JAX computation."""
     import jax
 
-    from jaxbundle.arguments import whole
+    from jaxbundle.arguments import integer
 
-    cores = available_cores() if number is None else whole("number", number)
+    cores = available_cores() if number is None else integer("number", number)
     jax.config.update("jax_num_cpu_devices", cores)
 
 
@@ -87,7 +87,7 @@ def join_processes(
     """
     import jax
 
-    from jaxbundle.arguments import whole
+    from jaxbundle.arguments import integer
 
     expected = (
         "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
@@ -95,9 +95,9 @@ def join_processes(
     )
     for name, value in (("processes", processes), ("process", process)):
         if value is not None:
-            whole(name, value, least=0)
-    whole("lost_after_seconds", lost_after_seconds)
-    whole("wait_seconds", wait_seconds)
+            integer(name, value, least=0)
+    integer("lost_after_seconds", lost_after_seconds)
+    integer("wait_seconds", wait_seconds)
     if address is not None:
         parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
         if not parts or not 0 < int(parts[2]) < 65536:

@@ -6,8 +6,8 @@ during an import it becomes another error; and while the main thread compiles or
 C++, which takes minutes for a large network, it is not raised at all.
 
 So nothing is raised. The handler removes temporary files and ends the process. Python calls it
-between two steps of the main thread. If it is not called within `GRACE`, because
-the main thread is in C++ or in an `unbroken` block, a thread woken by the signal does the same.
+between two steps of the main thread. If it is not called within `GRACE`, because the main thread is
+in C++ or in a `defer_interrupts` block, a thread woken by the signal does the same.
 
 Importing jaxbundle installs nothing: only the command line calls `handle_interrupts`.
 """
@@ -86,7 +86,7 @@ def set_status(status: int) -> None:
 def _handle(number: int, frame: object) -> None:
     if _temporaries is None:  # Then nothing is.
         _say_and_exit(number)
-    if not _temporaries.put_off(lambda: _end(number)):
+    if not _temporaries.defer(lambda: _end(number)):
         _end(number)
 
 

@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import FEATURES
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.photographs.opencv import need_opencv
 
 CELLS = 16
@@ -36,10 +36,10 @@ class Detection:
 
     def __post_init__(self):
         one_of("features", self.kind, FEATURES)
-        whole("features: number", self.number)
+        integer("features: number", self.number)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Features:
     """`xy`: pixels of the original; `size`: diameter, in them; `angle`: radians from x to y;

@@ -117,7 +117,7 @@ def _orient(cameras, xy1, xy2, limit):
     one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
     M, b, part, angle = many.orient_pairs(one, two, limit / f)
     filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
-    e = np.asarray(many.in_lanes(_sampson, many.LANES, M, b, *filled)[0])
+    e = np.asarray(many.run_in_lanes(_sampson, many.LANES, M, b, *filled)[0])
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
     costs = np.where(part > 0, np.log1p((e / limit) ** 2).mean(1), np.log1p(100.0))
     by_camera = lambda a: a.reshape(len(cameras), len(xy1), *a.shape[1:])

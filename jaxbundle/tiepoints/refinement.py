@@ -93,7 +93,7 @@ def measure_tracks(
     )
     others = np.flatnonzero(~first & inside & inside[window_of])
     start[:, :, 2] -= corner
-    found = _matched(windows[track[others]], pieces, others, start)
+    found = _match_in_portions(windows[track[others]], pieces, others, start)
     return _collect(track, image, xy, size, first, level, corner, colour, others, found)
 
 
@@ -181,7 +181,7 @@ def _match(windows: Array, pieces: Array, start: Array):
     return found.affine, found.covariance, found.correlation, found.status
 
 
-def _matched(windows, pieces, others, start):
+def _match_in_portions(windows, pieces, others, start):
     """A, covariance, correlation and status of the matches."""
     parts = []
     for begin in range(0, len(others), LANES):

@@ -128,18 +128,18 @@ def start_cameras(
         own = [c for c in range(len(cameras)) if lens[c] == number]
         found = [_once(m) for m in matches if {of[k] for k in m.images} <= set(own)]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
-        xy = _centre(cameras, of, features, _various(found))
+        xy = _centre(cameras, of, features, _choose_pairs(found))
         begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
         start = estimate_interior(begin, xy, told)
         if start.pairs:
             clear = sorted(found, key=lambda m: -len(m.rows))[:TRIED]
-            explained = lambda camera, clear=clear, own=own: _explained(
+            explained = lambda camera, clear=clear, own=own: _count_explained(
                 _with_lens(cameras, own, camera), of, features, clear
             )
             now, every = explained(start.camera), sum(len(m.rows) for m in clear)
             least = (MORE_THAN_TOLD if told else MORE) * now
             if now < PLENTY * every and least < every:
-                start = _most_explained(start, begin, xy, explained, least)
+                start = _choose_principal_distance(start, begin, xy, explained, least)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)
         if start.pairs:
@@ -170,14 +170,14 @@ def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
     return [with_it(c) if k in own else c for k, c in enumerate(cameras)]
 
 
-def _explained(cameras, of, features, matches) -> int:
+def _count_explained(cameras, of, features, matches) -> int:
     """The number of matches explained by relative orientations of pairs that close around
     three photographs, as hardly any do with a wrong principal distance."""
     pairs = verify(cameras, of, features, matches, lambda *_: None)
     return sum(map(len, without_contradicted(cameras, of, features, pairs)[0]))
 
 
-def _most_explained(start: Start, begin: Camera, xy, explained, least: float) -> Start:
+def _choose_principal_distance(start: Start, begin: Camera, xy, explained, least: float) -> Start:
     """The start, or that from another principal distance that explains clearly more matches."""
     size = max(present_size(begin))
     f = start.camera.parameters["fx"]
@@ -197,7 +197,7 @@ def _middle(camera: Camera):
     return (np.array(present_size(camera)) - 1) / 2
 
 
-def _various(own):
+def _choose_pairs(own):
     """The pairs with the most matches, and as many others with enough, by photograph in turn."""
     own = sorted(own, key=lambda found: -len(found.rows))
     if not own:

@@ -104,10 +104,10 @@ def verify_pairs(
     found: list = [None] * len(xy1)
     if not usable:
         return found
-    sure = _agreed({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
+    sure = _find_agreeing({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
     others = {k: np.arange(len(xy1[k])) for k in usable
               if k not in sure and (~single[k]).sum() >= LEAST}  # fmt: skip
-    agreed = {**_agreed(others, xy1, xy2, tolerance), **sure}
+    agreed = {**_find_agreeing(others, xy1, xy2, tolerance), **sure}
     for k in sure:
         good, M, b = agreed[k]
         if (good & single[k]).sum() >= ENOUGH:
@@ -127,7 +127,7 @@ def verify_pairs(
     return found
 
 
-def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
+def _find_agreeing(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
     """The agreeing matches of pairs with the orientation from some of them (`rows`), M and b, if
     enough of these agree. Otherwise only the most distinct ones are tried: for photographs far
     apart most matches may be wrong."""
@@ -138,7 +138,7 @@ def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
 
 
 def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
-    """As `_agreed`, from the number of matches given by `clear`."""
+    """As `_find_agreeing`, from the number of matches given by `clear`."""
     if not rows:
         return {}
     keys = np.array(list(rows))
@@ -170,8 +170,8 @@ def prepare() -> None:
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
     weights = np.ones((LANES, SLOTS))
-    many.in_lanes(_refine, LANES, M, b, xy, xy, weights)
-    many.in_lanes(_simpler, LANES, M, b, xy, xy, weights)
+    many.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
+    many.run_in_lanes(_simpler, LANES, M, b, xy, xy, weights)
 
 
 def _by_rotation(xy1, xy2, tolerance):
@@ -235,7 +235,7 @@ def _improve(poses, of, xy1, xy2, tolerance, limit):
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
     weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
     start = [np.stack([poses[k][i] for k in keys]) for i in (0, 1)]
-    M, b = many.in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
+    M, b = many.run_in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
 
 
@@ -262,7 +262,7 @@ def _kinds(found, xy1, xy2, tolerance):
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
     weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
     M, b = (np.stack([f[i] for f in found]) for i in (1, 2))
-    angle, turn, plane = many.in_lanes(
+    angle, turn, plane = many.run_in_lanes(
         _simpler, LANES, M, b, filled(xy1), filled(xy2), weights
     )  # fmt: skip
     kinds = []

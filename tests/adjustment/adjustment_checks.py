@@ -21,9 +21,9 @@ from jaxbundle.leastsquares.datum.conditions import datum_directions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
 from jaxbundle.leastsquares.indexing.rows import (
     fill_places,
-    in_given_order,
     lay_out_data,
     residuals,
+    restore_order,
 )
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.problem import pad_data, pad_values
@@ -300,7 +300,7 @@ def rows_of_change(declared, plan, values, data):
 
     def function(change):
         moved = retract(declared, plan, values, unravel(change * free))
-        return in_given_order(plan, residuals(declared, plan, moved, laid))
+        return restore_order(plan, residuals(declared, plan, moved, laid))
 
     return function, zero
 

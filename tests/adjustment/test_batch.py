@@ -12,7 +12,7 @@ from scipy import optimize
 import jaxbundle
 from jaxbundle import cameras
 from jaxbundle.batch import input as batch_input
-from jaxbundle.batch.input import bucket, once
+from jaxbundle.batch.input import bucket, single_list
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)
@@ -293,11 +293,11 @@ def test_perfect_images_give_the_camera_itself(three):
 def test_object_points_may_be_repeated_for_every_view(three):
     xy, X = three[0], np.stack([BOARD, 2 * BOARD, 3 * BOARD])
     views = xy.shape[1]
-    np.testing.assert_array_equal(once(BOARD, xy), BOARD)
-    np.testing.assert_array_equal(once(BOARD[None], xy), BOARD)
-    np.testing.assert_array_equal(once(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
-    np.testing.assert_array_equal(once(X, xy), X)
-    np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
+    np.testing.assert_array_equal(single_list(BOARD, xy), BOARD)
+    np.testing.assert_array_equal(single_list(BOARD[None], xy), BOARD)
+    np.testing.assert_array_equal(single_list(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
+    np.testing.assert_array_equal(single_list(X, xy), X)
+    np.testing.assert_array_equal(single_list(X[:, None].repeat(views, 1), xy), X)
 
 
 @pytest.mark.further

@@ -15,7 +15,7 @@ from adjustment_checks import adjusted, camera, solved, synthetic, vtpv
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.problem import given_data, pad_values, without_filling
+from jaxbundle.leastsquares.problem import complete_data, pad_values, without_filling
 from jaxbundle.leastsquares.quality.derivatives import attach_derivatives
 
 pytestmark = pytest.mark.slow
@@ -29,7 +29,7 @@ def attached(problem, values, data, sensitivity="exact"):
     """The solution `values` for `data` as a function of them."""
     system = problem.system
     tables = pad_values(system, problem.layout.tables(values))
-    given = given_data(system, problem.layout.data(data))
+    given = complete_data(system, problem.layout.data(data))
     found = attach_derivatives(system.declared, system.plan, tables, given, sensitivity)
     return problem.layout.values(without_filling(system, found))
 

@@ -16,7 +16,7 @@ from jaxbundle.io import read_network
 from jaxbundle.io.networks.bundler import write_bundler
 from jaxbundle.io.results.coordinates import write_coordinates
 from jaxbundle.io.writing import folders
-from jaxbundle.io.writing.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
+from jaxbundle.io.writing.folders import INSIDE, MARKER, check_folder, read_marker, replace_folder
 from jaxbundle.system.temporaries import remove_temporaries
 
 OLD = {"report.txt": "old", "network/points.csv": "1", "histogram.png": "h"}
@@ -24,7 +24,7 @@ NEWER = {"report.txt": "newer", "network/points.csv": "2", "network/deep/x": "3"
 
 
 def write(folder, files, by="adjust", force=False, names=tuple(NEWER)):
-    with replaced_folder(folder, by, names, force) as new:
+    with replace_folder(folder, by, names, force) as new:
         for name, text in files.items():
             (new / name).parent.mkdir(parents=True, exist_ok=True)
             (new / name).write_text(text)
@@ -174,11 +174,11 @@ def test_a_folder_that_cannot_be_moved_to_from_beside(out, monkeypatch):
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit(143), MemoryError, ValueError])
 def test_what_fails_leaves_no_trace(out, error):
     with pytest.raises(type(error) if isinstance(error, BaseException) else error):
-        with replaced_folder(out, "adjust", NEWER) as new:
+        with replace_folder(out, "adjust", NEWER) as new:
             (new / "report.txt").write_text("half")
             raise error
     with pytest.raises(InputError, match=f"^{out}/a/report.txt: odd$"):
-        with replaced_folder(out / "a" / "b", "adjust", NEWER, force=True) as new:
+        with replace_folder(out / "a" / "b", "adjust", NEWER, force=True) as new:
             raise InputError(f"{new.parent.parent / 'report.txt'}: odd")
     assert content(out) == OLD and {*os.listdir(out.parent)} == {"out"}
 
@@ -246,7 +246,7 @@ def test_an_interrupt_of_the_command_line_leaves_no_trace(out, place):
     """It ends the process without an exception, and removes what is temporary."""
 
     def action():
-        with replaced_folder(out.parent / place, "adjust", NEWER) as new:
+        with replace_folder(out.parent / place, "adjust", NEWER) as new:
             (new / "report.txt").write_text("half")
             remove_temporaries(1)
             os._exit(7)
@@ -256,7 +256,7 @@ def test_an_interrupt_of_the_command_line_leaves_no_trace(out, place):
 
 
 def test_two_runs_do_not_write_one_folder(out):
-    with replaced_folder(out, "adjust", NEWER):
+    with replace_folder(out, "adjust", NEWER):
         with pytest.raises(InputError, match=f"^{out}: another run is writing it"):
             write(out, NEWER)
     assert content(out) == {}

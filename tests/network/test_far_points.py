@@ -11,7 +11,7 @@ from network.further_checks import sample
 
 import jaxbundle
 from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
-from jaxbundle.bundle.minimum import solved
+from jaxbundle.bundle.minimum import inspect_solution
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
@@ -61,7 +61,7 @@ def moderate():
     for lengths in (None, LENGTHS):
         problem = prepared(network, lengths)
         problem, minimum = minimise_with_infinity(problem, problem.data.start, max_steps=50)
-        found.append(solved(problem, minimum))
+        found.append(inspect_solution(problem, minimum))
     return found
 
 
@@ -87,7 +87,7 @@ def _of_a_place(value, change):
     there = retracted(change)
     return (
         derivative(value), jax.jacfwd(retracted)(jnp.zeros(3))[:3],
-        jnp.stack(space.moved(space.prepare(value), tuple(change))), there,
+        jnp.stack(space.move(space.prepare(value), tuple(change))), there,
         space.difference(there, value),
     )  # fmt: skip
 
@@ -212,7 +212,7 @@ def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
         np.testing.assert_array_equal(
             at_infinity(again, minimum.values), at_infinity(problem, values)
         )
-        found = solved(again, minimum)
+        found = inspect_solution(again, minimum)
         np.testing.assert_allclose(found.vtpv, result.vtpv, rtol=1e-9)
 
 
@@ -227,7 +227,7 @@ def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
     rows = tables["point"][NEAR:]
 
     def vtpv(along):
-        X = jnp.stack([jnp.stack(space.moved(space.prepare(row), (0.0, 0.0, d)))
+        X = jnp.stack([jnp.stack(space.move(space.prepare(row), (0.0, 0.0, d)))
                        for row, d in zip(rows, along)])  # fmt: skip
         point = values.point.at[NEAR:].set(X)
         return _vtpv_of_images(problem, dataclasses.replace(values, point=point))

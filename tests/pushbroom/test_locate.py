@@ -31,7 +31,7 @@ from jaxbundle.pushbroom.corrections import (
     INDICES,
     Corrections,
     earlier_earth,
-    refracted,
+    refract,
     seen_direction,
     seen_point,
     true_direction,
@@ -163,7 +163,7 @@ def test_light_time_turns_the_earth():
     np.testing.assert_allclose(earlier_earth(tuple(v), 5e5), turn.apply(v), atol=1e-9)
 
 
-through_air = jax.jit(refracted)
+through_air = jax.jit(refract)
 
 
 def test_refraction_keeps_the_invariant_of_bouguer():

@@ -13,7 +13,7 @@ from jaxbundle.io.rasters import writing as raster_writing
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
-from jaxbundle.system.temporaries import put_off
+from jaxbundle.system.temporaries import defer
 
 
 def write(target):
@@ -57,7 +57,7 @@ def test_no_interrupt_waits_while_a_raster_is_written_or_verified(tmp_path, monk
 
         def noted(*arguments, **options):
             os.write(2, name.encode())
-            moments.append((name, put_off(lambda: None)))
+            moments.append((name, defer(lambda: None)))
             return work(*arguments, **options)
 
         monkeypatch.setattr(package, name, noted)

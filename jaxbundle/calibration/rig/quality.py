@@ -41,7 +41,7 @@ def _slopes(model, p, mounting: PoseValue, xy, nearness):
         ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
 
         def image(change, p):
-            moved = space.moved(block, (*(nearness * change[:3]), *change[3:]))
+            moved = space.move(block, (*(nearness * change[:3]), *change[3:]))
             return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
 
         return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)

@@ -150,7 +150,7 @@ def compensate(
     from jaxbundle.cli.pushbroom.rpc_tables import figures_of, table_of
     from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
-    from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
+    from jaxbundle.pushbroom.rpc_bias import apply_bias, fit_bias
 
     # the tags of a raster may be replaced in place
     keep_inputs([control], out=out, csv=csv, json=json)
@@ -163,7 +163,7 @@ def compensate(
     found = fit_bias(
         given, table, model=model, sigma=sigma, ground_sigma=ground, source=columns.source
     )
-    changed, left = compensated(given, found.bias)
+    changed, left = apply_bias(given, found.bias)
     write_rpc(out, changed)
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]

@@ -20,7 +20,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import MEASURABLE
 from jaxbundle.cameras.convert_fit import (
     fit_parameters,
-    fitted,
+    fitted_parameters,
     image_grid,
     images_of,
     start_values,
@@ -41,13 +41,13 @@ ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
 ROUNDS, LONGEST = 60, 0.2
 """Newton's method for rays: rounds, and radians of its steps."""
-OPENCV = fitted(get_model("opencv"))
+OPENCV = fitted_parameters(get_model("opencv"))
 RATIONAL = (*OPENCV, "k4", "k5", "k6")
 PRISM = (*OPENCV, "s1", "s2", "s3", "s4")
 PERSPECTIVE = (("opencv", OPENCV), ("opencv", RATIONAL), ("opencv", PRISM),
                ("opencv", (*RATIONAL, *PRISM[-4:])),
-               ("brown-projected", fitted(get_model("brown-projected"))))  # fmt: skip
-FISHEYE = (("kannala-brandt", fitted(get_model("kannala-brandt"))),)
+               ("brown-projected", fitted_parameters(get_model("brown-projected"))))  # fmt: skip
+FISHEYE = (("kannala-brandt", fitted_parameters(get_model("kannala-brandt"))),)
 NARROW = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
 
@@ -127,7 +127,7 @@ class FittedCamera(Camera):
     told: str = ""
 
 
-def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
+def fit_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
     """The nearest of our cameras; `why` the original model has no equal here.
 
     **Raises:** `NoPlaceError`.
@@ -141,7 +141,7 @@ def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamer
     )  # fmt: skip
 
 
-def fits_told(cameras: Iterable[Camera]) -> tuple[str, ...]:
+def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:
     """Messages about the fitted cameras."""
     return tuple(camera.told for camera in cameras if isinstance(camera, FittedCamera))
 

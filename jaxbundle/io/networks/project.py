@@ -51,7 +51,7 @@ from jaxbundle.io.networks.settings import (
 )
 from jaxbundle.io.text.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
     IMAGE_COLUMNS,
@@ -184,7 +184,7 @@ def write_project(
     (`jaxbundle.io.writing.folders`).
     """
     network, folder = require_network(network), Path(given_path("folder", folder))
-    with replaced_folder(folder, by, FILES, force) as new:
+    with replace_folder(folder, by, FILES, force) as new:
         fill_project(network, new)
     return folder / FILE_NAME
 

@@ -49,7 +49,7 @@ from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.sections import Section, read_sections
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement.freedom import Freedom
@@ -162,7 +162,7 @@ def _freedom(section: Section, radians: float) -> Freedom:
         else:
             values = value if isinstance(value, list) else [value] * 3
             if len(values) != 3:
-                raise InputError(f"{section.where}{key} is {shown(value)}; one value or three")
+                raise InputError(f"{section.where}{key} is {show(value)}; one value or three")
             found[key] = tuple(factor * _sigma(section, key, v) for v in values)
     return Freedom(**found)
 
@@ -173,7 +173,7 @@ def _sigma(section: Section, key: str, value: Any) -> float:
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
         return float(value)
     raise InputError(
-        f'{section.where}{key} is {shown(value)}; "free", "held" or a prior σ is expected'
+        f'{section.where}{key} is {show(value)}; "free", "held" or a prior σ is expected'
     )
 
 

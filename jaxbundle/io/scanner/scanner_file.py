@@ -64,7 +64,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.text.sections import Section, TomlFile
-from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
 from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
@@ -102,7 +102,7 @@ def scanner_of(file: TomlFile) -> Scanner:
     """
     file.require(NEEDED)
     scanner = file.section("scanner")
-    lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
+    lines, pixels = (scanner.integer(key) for key in ("lines", "pixels"))
     check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
     position, positions = _position(file, earth)
@@ -169,7 +169,7 @@ def earth_of(scanner: Section) -> Ellipsoid | None:
         return Ellipsoid(*axes.tolist())
     if value not in ("WGS84", "local"):
         raise InputError(
-            f'{scanner.where}earth is {shown(value)}; "WGS84", "local" or [a, b, c] is expected'
+            f'{scanner.where}earth is {show(value)}; "WGS84", "local" or [a, b, c] is expected'
         )
     return WGS84 if value == "WGS84" else None
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv, read_toml
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -77,7 +77,7 @@ class Section:
         if value is None:
             raise InputError(f"{self.where}{key} is missing; {expected} is expected")
         if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
-            raise InputError(f"{self.where}{key} is {shown(value)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(value)}; {expected} is expected")
         return value
 
     def check_keys(self, known: Sequence[str]) -> None:
@@ -93,7 +93,7 @@ class Section:
             raise InputError(f"{self.where}{key} is {value}; a finite number is expected")
         return value
 
-    def whole(self, key: str) -> int:
+    def integer(self, key: str) -> int:
         """A whole number, 2 or more."""
         value = self._given(key, None, "a whole number, 2 or more,", (int,))
         if value < 2:
@@ -114,7 +114,7 @@ class Section:
         values = self._given(key, None, expected, (list,))
         good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not good or not values or count not in (None, len(values)):
-            raise InputError(f"{self.where}{key} is {shown(values)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(values)}; {expected} is expected")
         return np.array(values, float)
 
     def table(self) -> Columns:

@@ -59,8 +59,8 @@ def move_into_datum(
         away = {name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
                 for name, value in tables.items()}  # fmt: skip
         missing, slope = datum.equations(pinned, moves, away)
-        step = datum.limited(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
-        moved = _moved(declared, free, step, values)
+        step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
+        moved = _move_tables(declared, free, step, values)
         change = {
             name: jax.tree.map(np.subtract, moved[name], values[name]) for name in pinned.weight
         }
@@ -77,7 +77,7 @@ def move_into_datum(
     return values, distance <= datum.THERE * size
 
 
-def _moved(declared, free, motion, values):
+def _move_tables(declared, free, motion, values):
     """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:

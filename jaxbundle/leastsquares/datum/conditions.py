@@ -163,7 +163,7 @@ def move_to_datum(
         missing, slope = _datum_equations(declared, plan, values, start)
         near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
         slope = jnp.where(before > NEAR * size, slope, near)
-        step = limited(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
+        step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
         moved = _move(declared, plan, step, values)
         differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
                        for name in datum.weight}  # fmt: skip
@@ -181,7 +181,7 @@ def moves_on(size, distance, before, count):
     return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
 
 
-def limited(step, curved: tuple[int, ...]):
+def limit_step(step, curved: tuple[int, ...]):
     """A step of the motions, limited to `LONGEST` in the curved ones."""
     longest = abs(step[np.array(curved, int)]).max(initial=0.0)
     return step / (longest / LONGEST).clip(1.0)

@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     Residual,
     Values,
     fill_places,
-    over,
+    map_observations,
     prepare,
     residual_of,
 )
@@ -36,7 +36,7 @@ def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
         cost, gradient, hessian = _derivatives(declared, plan, number, prepared, laid)
         more = _blocks(declared, plan, part, gradient, hessian)
         sums.add_part(part, cost.sum(), *more)
-    return sums.finished(declared, values)
+    return sums.total(declared, values)
 
 
 def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
@@ -45,7 +45,7 @@ def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: La
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     one = _HalfSquare(residual_of(declared, part), widths)
-    return over(part, kind, prepared, laid, number, one)
+    return map_observations(part, kind, prepared, laid, number, one)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
     Tangent,
-    agreed,
+    average_over_devices,
     gather,
     scatter,
     times_kept,
@@ -94,7 +94,7 @@ class ConjugateGradients(eqx.Module):
         product = times_kept(plan, self.normal.blocks, x)
         for g, less in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
             product[g] = product[g] - less
-        return agreed(plan, {g: rows * self.scale[g] for g, rows in product.items()})
+        return average_over_devices(plan, {g: rows * self.scale[g] for g, rows in product.items()})
 
 
 def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxbundle.arguments import one_of, positive, whole
+from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.implicit import derivative_along, differentiable_once, implicit_root
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.equations import elimination
@@ -45,7 +45,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import find, half_square
 from jaxbundle.leastsquares.iterations.stopping import converged
-from jaxbundle.leastsquares.problem import Problem, given_data, make_solver, without_filling
+from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
@@ -81,8 +81,8 @@ def solve(
     form.
     """
     one_of("sensitivity", sensitivity, get_args(Sensitivity))
-    steps, atol = whole("max_iterations", max_iterations), positive("atol", atol)
-    data = given_data(problem, data)
+    steps, atol = integer("max_iterations", max_iterations), positive("atol", atol)
+    data = complete_data(problem, data)
     solver = make_solver(problem, atol=atol, max_steps=steps, **options)
     fixed = jax.lax.stop_gradient(data)
     minimum = find(solver, fixed, fixed.start)
@@ -116,9 +116,9 @@ class Linearised(eqx.Module):
         """v/σ after a change of the unknowns."""
         plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
         change = {name: x * plan.groups[name].free for name, x in change.items()}
-        return residuals(self.declared, plan, self.moved(change, data), laid)
+        return residuals(self.declared, plan, self.move(change, data), laid)
 
-    def moved(self, change: Tangent, data: Data) -> Values:
+    def move(self, change: Tangent, data: Data) -> Values:
         return retract(self.declared, self.plan, self.given(data), change)
 
 
@@ -140,9 +140,9 @@ def attach_derivatives(
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
-        return at.moved(_propagate(change, at, data), data)
+        return at.move(_propagate(change, at, data), data)
     change = implicit_root(gradient_after, _solve_structured, step, at, data)
-    return datum.attach_motion(declared, plan, at.moved(change, data), data.start)
+    return datum.attach_motion(declared, plan, at.move(change, data), data.start)
 
 
 def linearise(

@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.datum.conditions import attach_motion
 from jaxbundle.leastsquares.equations.elimination import Factor, solve
 from jaxbundle.leastsquares.equations.normal import Tangent, dot, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
-from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, in_given_order
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
 from jaxbundle.leastsquares.iterations.solver import half_square
 from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_after
 from jaxbundle.leastsquares.solution import Solution
@@ -150,14 +150,14 @@ def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, facto
         slopes = jax.tree.map(jnp.negative, jax.grad(along)(data.measured))
         residuals = lambda change: at.residuals(change, data)
         of_parts = jax.jvp(residuals, (still,), (adjoint,))[1]
-        return slopes, in_given_order(plan, of_parts), left
+        return slopes, restore_order(plan, of_parts), left
 
     return jax.lax.map(one, rows)
 
 
 def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
     """The tables after a change, in the datum defined by `start`."""
-    moved = at.moved(change, dataclasses.replace(at.data, start=start))
+    moved = at.move(change, dataclasses.replace(at.data, start=start))
     return attach_motion(at.declared, at.plan, moved, start)
 
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
@@ -109,7 +109,7 @@ class Figures(Further):
         )  # fmt: skip
         for row, word in enumerate(made.type):
             if word not in TYPES:
-                raise InputError(f"{table.source(row)}: type is {shown(word)}"
+                raise InputError(f"{table.source(row)}: type is {show(word)}"
                                  f"{did_you_mean(word, TYPES)}")  # fmt: skip
         first: dict[str, int] = {}
         for row, name in enumerate(made.figure):

@@ -35,7 +35,7 @@ SECTION, MOUNTING = "rig", "mounting"
 AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
 
 
-def mounted(one, other, mounting_of_one, mounting_of_other, given):
+def mounting_misclosure(one, other, mounting_of_one, mounting_of_other, given):
     """Difference of position and rotation of the reference camera derived from two cameras, in the
     frame of the first; the rotation as a vector. The reference has no mounting.
     """
@@ -52,7 +52,7 @@ def mounted(one, other, mounting_of_one, mounting_of_other, given):
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
 MOUNTED = Kind(
-    "mountings", mounted, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
+    "mountings", mounting_misclosure, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
 )  # fmt: skip
 
 
