@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from jaxbundle.errors import InputError
 
-MOST = 10**9
+LARGEST_INTEGER = 10**9
 """Largest integer."""
 
 
@@ -27,7 +27,7 @@ def show(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:58]}…"
 
 
-def integer(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
+def integer(name: str, value: Any, least: int = 1, most: int = LARGEST_INTEGER) -> int:
     """A whole number from `least` to `most`.
 
     **Raises:** `InputError`."""
@@ -37,7 +37,7 @@ def integer(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
     except TypeError:
         number = least - 1
     if not least <= number <= most:
-        last = "10⁹" if most == MOST else most
+        last = "10⁹" if most == LARGEST_INTEGER else most
         raise InputError(f"{name} must be a whole number from {least} to {last}, but is "
                          f"{show(value)}")  # fmt: skip
     return number

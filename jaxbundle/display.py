@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 LINES, WIDTH = 24, 100
-FEW = 4
+SHOWN_ENTRIES = 4
 """Numbers of an array, or entries of a list, that are shown."""
 T = TypeVar("T", bound=type)
 
@@ -36,13 +36,13 @@ def describe(value: Any) -> str:
 def abbreviate(value: Any, depth: int = 0) -> str:
     """A value in less than a line."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        few = value.size <= FEW and isinstance(value, np.ndarray | np.generic)
+        few = value.size <= SHOWN_ENTRIES and isinstance(value, np.ndarray | np.generic)
         text = " ".join(str(value).split()) if few else f"{value.dtype}{[*value.shape]}"
     elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
-        parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:FEW]]
+        parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:SHOWN_ENTRIES]]
         text = f"{{{', '.join(_more(parts, len(value), depth))}}}"
     elif isinstance(value, tuple | list):
-        parts = [abbreviate(one, depth + 1) for one in value[:FEW]]
+        parts = [abbreviate(one, depth + 1) for one in value[:SHOWN_ENTRIES]]
         text = "({})" if isinstance(value, tuple) else "[{}]"
         text = text.format(", ".join(_more(parts, len(value), depth)))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -58,7 +58,7 @@ def _more(parts: list[str], number: int, depth: int) -> list[str]:
     """With how many there are, if they are not all; deep inside only that."""
     if depth > 1 and number:
         return [f"{number} entries"]
-    return parts if number <= FEW else [*parts, f"… {number} in all"]
+    return parts if number <= SHOWN_ENTRIES else [*parts, f"… {number} in all"]
 
 
 def data_set(

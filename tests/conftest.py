@@ -35,12 +35,12 @@ install_import_hook(modules_with_shapes(ROOT / "jaxbundle"), "type_checker.check
 
 import jaxbundle  # noqa: E402
 from jaxbundle import cli  # noqa: E402
-from jaxbundle.__main__ import SELDOM  # noqa: E402
+from jaxbundle.__main__ import GC_THRESHOLDS  # noqa: E402
 
 jaxbundle.enable_x64()
 
 gc.freeze()
-gc.set_threshold(*SELDOM)
+gc.set_threshold(*GC_THRESHOLDS)
 
 
 # Where signals are ignored (in the background, under nohup), the programs that tests start would

@@ -16,7 +16,7 @@ from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
 from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.weakness import VAGUE, Weakness, weakness, weakness_of_unsolved
+from jaxbundle.statistics.weakness import VAGUE_RATIO, Weakness, weakness, weakness_of_unsolved
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -211,10 +211,10 @@ def test_vertical_images_name_the_principal_distance(monkeypatch):
     assert "c needs depth or convergent images" in said(result)
     assert result.converged
     c = result.cameras["cam"]["parameters"]["c"]
-    assert VAGUE * c["sigma"] > c["value"]
+    assert VAGUE_RATIO * c["sigma"] > c["value"]
     # The directions of a factor give what the cofactors give.
     given = result.weakness
-    monkeypatch.setattr("jaxbundle.leastsquares.quality.weakness.SMALL", 0)
+    monkeypatch.setattr("jaxbundle.leastsquares.quality.weakness.SMALL_SYSTEM", 0)
     found = weakness(Inspection(result.problem, result.values), result.sigma0)
     assert found.unknowns == given.unknowns
     assert found.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-3)

@@ -18,7 +18,7 @@ FEWEST = 3
 CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
 """An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
 pixels."""
-WORST = 0.5
+WORST_SHARE = 0.5
 """One round excludes epochs with an RMS above this fraction of the largest: the worst affect
 others."""
 
@@ -34,7 +34,7 @@ def contradicting(
         return np.zeros(0, int)
     limit = max(CONTRADICTS * float(np.median(rms[seen])), LEAST_CONTRADICTION)
     rms = np.where(shared, rms, 0.0)
-    return np.flatnonzero(rms > max(limit, WORST * rms.max()))
+    return np.flatnonzero(rms > max(limit, WORST_SHARE * rms.max()))
 
 
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:

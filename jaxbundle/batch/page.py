@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from jaxbundle.batch.population import APART, FEWEST, LEVEL, Population
+from jaxbundle.batch.population import FEWEST, LEVEL, OUTLIER_LIMIT, Population
 from jaxbundle.network.columns import count
 from jaxbundle.report.layout import fixed, significant
 from jaxbundle.report.page import (
@@ -55,10 +55,10 @@ def _judge(found: Population) -> list[Finding]:
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
     words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
-    far = int((np.nan_to_num(found.farthest) > APART).sum())
+    far = int((np.nan_to_num(found.farthest) > OUTLIER_LIMIT).sum())
     if np.isfinite(found.farthest).any():
-        words = (f"{far} with a parameter more than {APART:g} robust standard deviations from the "
-                 "median")  # fmt: skip
+        words = (f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
+                 "deviations from the median")  # fmt: skip
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
 from jaxbundle.batch.epochs import contradicting
 from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
-from jaxbundle.batch.input import LARGEST
+from jaxbundle.batch.input import LARGEST_NUMBER
 from jaxbundle.batch.misfit import misfits
 from jaxbundle.batch.weakness import is_vague
 from jaxbundle.bundle.adjust import adjust
@@ -97,7 +97,7 @@ def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[Firs
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
         for c, size in enumerate(rig.sizes):
-            if not (np.abs(rig.xy[c]) > LARGEST).any() and np.isfinite(rig.xy[c]).any():
+            if not (np.abs(rig.xy[c]) > LARGEST_NUMBER).any() and np.isfinite(rig.xy[c]).any():
                 places.setdefault((size, len(rig.points)), []).append((i, c))
     for (size, points), of in places.items():
         xy = np.full((len(of), max(len(rigs[i].epochs) for i, _ in of), points, 2), np.nan)

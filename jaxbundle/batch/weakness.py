@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.batch.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
-from jaxbundle.leastsquares.quality.weakness import VAGUE
+from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
-PART = 0.05
+SMALLEST_PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""
 
 
@@ -31,7 +31,7 @@ def is_vague(
     columns = [model.parameters.index(name) for name in model.principal_distance]
     shortest = np.abs(interior[:, columns]).min(1)
     of_these = {model.parameters.index(name) for name in model.core}
-    return ~(VAGUE * sigma <= shortest[:, None]) & [column in of_these for column in free]
+    return ~(VAGUE_RATIO * sigma <= shortest[:, None]) & [column in of_these for column in free]
 
 
 def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "cameras k"]:
@@ -40,4 +40,4 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
-    return finite[:, None] & (share > PART)
+    return finite[:, None] & (share > SMALLEST_PART)

@@ -50,7 +50,7 @@ NULL = 1e-9
 """Eigenvalues of a correlation matrix below this part of the largest are 0."""
 SCALE = SEVEN.index("scale")
 ROUNDS = 10
-SHOWN = 12
+SHOWN_ROWS = 12
 """Rows of a comparison on the screen."""
 
 
@@ -135,7 +135,7 @@ class AdjustmentComparison:
                          f"({self.significance:g} for all together)")  # fmt: skip
         sigma = np.where(self.sigma > 0, self.sigma, np.nan)
         ratio = np.nan_to_num(np.abs(self.difference / sigma))
-        rows = np.argsort(-ratio, kind="stable")[:SHOWN]
+        rows = np.argsort(-ratio, kind="stable")[:SHOWN_ROWS]
         lines.append(f"{'':24}{'a':>16}{'b':>16}{'b − a':>12}{'σ':>11}{'b − a in σ':>11}")
         for k in rows:
             name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"

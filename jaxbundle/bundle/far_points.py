@@ -29,13 +29,13 @@ NARROW, PARALLEL = 0.03, 1e-3
 """Largest angle between the rays, in radians, of a point that may be at any distance; and of one
 that is so from the start, unless half of the tie points are: then all images have nearly the same
 projection centre."""
-PATIENCE = 30
+EVALUATIONS_BEFORE_RELEASE = 30
 """Evaluations before narrow points are put at any distance; twice as many if half of the tie points
 are narrow."""
-ROUND = 4
+EVALUATIONS_BETWEEN_CHECKS = 4
 """Evaluations between checks of points pulled beyond infinity, or back; doubled whenever no point
 changed."""
-RELEASES = 10
+MOST_RELEASES = 10
 """A point released this often stays at infinity."""
 
 
@@ -52,7 +52,7 @@ def minimise_at_any_distance(
     legs, parallel = [], angle < PARALLEL
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
-            patience = PATIENCE * (2 if mostly(angle < NARROW) else 1)
+            patience = EVALUATIONS_BEFORE_RELEASE * (2 if mostly(angle < NARROW) else 1)
             plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
             if inspect_solution(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
@@ -77,7 +77,7 @@ def minimise_with_infinity(
     if problem.layout.lengths is None:
         return problem, minimise(problem, start, max_steps=max_steps, **options)
     held = _held(problem)
-    legs, released, steps = [], np.zeros(len(held), int), ROUND
+    legs, released, steps = [], np.zeros(len(held), int), EVALUATIONS_BETWEEN_CHECKS
     problem = _hold_at_infinity(problem, held, start)  # One program for all rounds.
     while True:
         left = max_steps - sum(int(leg.iterations) for leg in legs)
@@ -86,12 +86,12 @@ def minimise_with_infinity(
         there = at_infinity(problem, start)
         if there.any():
             outward = _pulled_outward(problem, start)
-            there &= np.where(held, outward | (released >= RELEASES), outward)
+            there &= np.where(held, outward | (released >= MOST_RELEASES), outward)
         released += held & ~there
         changed = (there != held).any()
         if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
             return problem, _join(legs)
-        steps = ROUND if changed else 2 * steps
+        steps = EVALUATIONS_BETWEEN_CHECKS if changed else 2 * steps
         if changed:
             held = there
             problem = _hold_at_infinity(problem, held, start)

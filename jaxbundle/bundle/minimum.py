@@ -29,7 +29,7 @@ changes an observation, and iterations go on for long."""
 EIGENVECTORS = 3000
 """Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
 
-RUNAWAY = 20.0
+LARGEST_FACTOR = 20.0
 """A principal distance that changed by more than this factor is implausible."""
 
 
@@ -110,21 +110,21 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
 
 
 def _collapsed(problem: Problem, values: Values) -> list[str]:
-    """Principal distances that diverged from their start values by a factor of `RUNAWAY`.
+    """Principal distances that diverged from their start values by a factor of `LARGEST_FACTOR`.
 
     If c and an image scale are both free, c = 0 makes all corrected residuals zero.
     """
     return [
         f"{parameter} of camera {camera.id} (it diverged from its start value)"
         for camera, parameter, ratio in _principal_distances(problem, values)
-        if not 1 / RUNAWAY < ratio < RUNAWAY
+        if not 1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR
     ]
 
 
 def misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
     """Whether an adjusted principal distance differs from the given one, but plausibly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
-    sane = all(1 / RUNAWAY < ratio < RUNAWAY for ratio in ratios)
+    sane = all(1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR for ratio in ratios)
     return sane and any(not 1 / MISJUDGED < ratio < MISJUDGED for ratio in ratios)
 
 

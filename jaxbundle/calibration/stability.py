@@ -44,7 +44,7 @@ from jaxbundle.statistics.difference import Covariance
 
 ROTATION = 0.1
 """μ below this: nearly a rotation."""
-SEEN = 1e-12
+SMALLEST_EFFECT = 1e-12
 """Relative limit below which parameter changes that move no image are dropped."""
 
 
@@ -197,7 +197,7 @@ def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
     """Functions F·p of the parameters that are invariant to rotation-like changes."""
     unit = np.outer(scale, scale)
     size, U = np.linalg.eigh(G * unit)
-    seen = size > SEEN * size[-1]
+    seen = size > SMALLEST_EFFECT * size[-1]
     root = U[:, seen] / np.sqrt(size[seen])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
     vectors = (root @ V)[:, mu > ROTATION]

@@ -41,7 +41,7 @@ from jaxbundle.leastsquares.quality.snooping import Removed, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 
 DATUMS = ("given", "inner", "minimal")
-FEW = 60
+FEWEST_ELIMINATED = 60
 """Problems with fewer unknowns are solved without elimination."""
 
 
@@ -281,7 +281,7 @@ def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observatio
     size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
     total = sum(int(t.free.sum()) for t in tables)
     largest = max(size, key=size.__getitem__, default=None)
-    worth = largest is not None and total >= FEW and size[largest] > total / 4
+    worth = largest is not None and total >= FEWEST_ELIMINATED and size[largest] > total / 4
     return largest if worth else None
 
 

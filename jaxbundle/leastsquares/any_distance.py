@@ -12,7 +12,7 @@ from jaxbundle.leastsquares.spaces import tangent_basis
 
 FARTHEST = 1e8
 """Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
-THERE = 0.99
+INFINITY_FROM = 0.99
 """The fraction of it from which a point counts as at infinity."""
 
 
@@ -73,7 +73,7 @@ def derivative(value):
 
 def is_at_infinity(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
     """Which points at any distance are at infinity."""
-    return (np.linalg.norm(X, axis=1) > THERE * FARTHEST * s) & (s > 0)
+    return (np.linalg.norm(X, axis=1) > INFINITY_FROM * FARTHEST * s) & (s > 0)
 
 
 def shares(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
@@ -104,7 +104,7 @@ def _transform(motion, value):
     moved = transform_point(motion, value[:3])
     turned = moved - transform_point(motion, jnp.zeros(3))
     turned = turned * length(value[:3]) / length(turned)
-    far = jnp.sqrt(value[:3] @ value[:3]) > THERE * FARTHEST * value[3]
+    far = jnp.sqrt(value[:3] @ value[:3]) > INFINITY_FROM * FARTHEST * value[3]
     return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
 
 

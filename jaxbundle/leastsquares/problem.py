@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
-LARGE = 200_000
+LARGE_PROBLEM = 200_000
 """Problems with more observations are compiled for their exact sizes."""
 
 
@@ -131,7 +131,7 @@ def _make_plan(tables, observations, eliminate, ways):
 
 def choose_rounding(observations) -> Callable:
     """The rounding of plan sizes for this number of observations."""
-    large = sum(o.number for o in observations) > LARGE
+    large = sum(o.number for o in observations) > LARGE_PROBLEM
     return lambda key, n: n if large else round_up(n)
 
 

@@ -54,7 +54,7 @@ TO_SHARE = 10_000
 """Problems with at least this many observations are distributed over several devices; for smaller
 ones waiting exceeds computing."""
 
-RETURNS, SAME = 10, 1e-12
+RETURNS, COST_TOLERANCE = 10, 1e-12
 """Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
@@ -79,7 +79,7 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
         before, after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
-        if after <= before * (1 + SAME) + SAME:
+        if after <= before * (1 + COST_TOLERANCE) + COST_TOLERANCE:
             break
         minimum = minimise_from(values)
     values = without_filling(problem, values)

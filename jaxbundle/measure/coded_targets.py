@@ -38,7 +38,7 @@ GAP, RING, BEYOND = 1.5, 2.5, 3.4
 """Radii in the middle of the dark gap, of the ring, and beyond it, in radii of the disc."""
 FEWEST_PIXELS, ROUND = 20, 0.12
 """Minimum pixels of a disc, and the relative tolerance of its area to that of its ellipse."""
-CLEAR = 0.3
+SECTOR_TOLERANCE = 0.3
 """Tolerance of sectors and the gap relative to the contrast."""
 
 
@@ -183,7 +183,7 @@ def _code(grey, target, bits):
     gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
     dark = np.median(gap)
     gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond))
-    if np.abs(gap).max() > CLEAR or beyond.mean() > 0.5:
+    if np.abs(gap).max() > SECTOR_TOLERANCE or beyond.mean() > 0.5:
         return None
     # the sectors begin at the changes
     by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
@@ -191,7 +191,7 @@ def _code(grey, target, bits):
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
     off = np.minimum(np.abs(means), np.abs(means - 1))
-    if np.any(off > CLEAR):
+    if np.any(off > SECTOR_TOLERANCE):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():

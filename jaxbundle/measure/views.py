@@ -28,7 +28,7 @@ SAME, ALIKE = 0.05, 0.8
 """Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
 the board. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, with no larger
 noise, does not determine the camera better either."""
-SEARCHED = 3
+MOST_SEARCHED = 3
 """Number of photographs searched for boards of other sizes: those without a board, if few
 have it, and the others, whether their board is a part of a larger one."""
 
@@ -243,7 +243,7 @@ def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
 def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
     """Reasons of some photographs without the board, with the size of another board in them."""
     sizes = {}
-    for name in list(failed)[:SEARCHED]:
+    for name in list(failed)[:MOST_SEARCHED]:
         try:
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
@@ -265,7 +265,7 @@ def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[st
     """A warning if most of some photographs show the same larger board; one may be wrong."""
     if board.kind != "chessboard":
         return ()
-    few = used[:SEARCHED]
+    few = used[:MOST_SEARCHED]
     sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in few)
     (other, times), *_ = sizes.most_common(1) or [(None, 0)]
     if other is None or times <= len(few) / 2:

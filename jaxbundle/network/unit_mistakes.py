@@ -14,7 +14,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 
-WIDEST = 10.0
+LARGEST_RADIUS = 10.0
 """Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
 FIELDS = (0.02, 5.0)
 """Common range of r/c, used only to check a remedy."""
@@ -55,7 +55,7 @@ def _check_field(camera: Camera, xy) -> str:
     point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
     usual = float(np.median(np.hypot(*(xy - point).T)))
     size = camera.pixel_size
-    if usual > WIDEST * c:
+    if usual > LARGEST_RADIUS * c:
         raise InputError(
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
             f"more than {usual:.4g} {model.unit} from the principal point, "

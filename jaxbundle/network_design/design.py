@@ -43,7 +43,7 @@ ROLLED = 0.1
 """Random initial roll, radians, since zero roll is often a saddle point."""
 CANDIDATES, REFINED = 48, 2
 """Number of positions tried for a further photograph, and of the best ones refined."""
-ROUGH = 0.1
+ROUGH_SOFTNESS = 0.1
 """Softness of the conditions in this comparison."""
 
 
@@ -203,7 +203,7 @@ def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
     program = make_program(pairs, configuration(pairs, variables))
     position, rotation, target = try_stations(pairs, CANDIDATES, seed)
     begins = [_place(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
-    aims = np.array([program(variables.vector(s), s, ROUGH)[0] for s in begins])
+    aims = np.array([program(variables.vector(s), s, ROUGH_SOFTNESS)[0] for s in begins])
     boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
     best = None

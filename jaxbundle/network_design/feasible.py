@@ -16,9 +16,9 @@ from jaxbundle.network_design.pairs import FEWEST_RAYS, Pairs
 from jaxbundle.network_design.variables import Start, points_on_axes, turn_axis
 from jaxbundle.network_design.visibility import margins, visible
 
-TRIED = 1024
+TRIAL_POSITIONS = 1024
 """Trial positions in the room."""
-REACH = 3.0
+LARGEST_DISTANCE = 3.0
 """Without a room, the limit of the distance of stations, relative to the largest at the start."""
 
 
@@ -29,7 +29,7 @@ def room_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
     start = pairs.problem.data.start
     middle = np.asarray(start.point).mean(0)
     reach = np.linalg.norm(np.asarray(start.position) - middle, axis=1).max()
-    return middle + REACH * reach * np.array([[-1.0] * 3, [1.0] * 3])
+    return middle + LARGEST_DISTANCE * reach * np.array([[-1.0] * 3, [1.0] * 3])
 
 
 def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
@@ -63,7 +63,7 @@ def try_stations(
     return position, np.asarray(_turned(upright, away)), targets
 
 
-def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
+def check_feasible(pairs: Pairs, tried: int = TRIAL_POSITIONS) -> None:
     """Refuse conditions that no station satisfies, and targets visible from none.
 
     **Raises:** `InputError` naming the condition, or the targets."""

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network_design.pairs import IDLE, Pairs
-from jaxbundle.network_design.search import WORST, make_program
+from jaxbundle.network_design.search import UNDETERMINED_AIM, make_program
 
 NOTHING = IDLE**2
 """The weight of an unselected photograph, so that its orientation stays determined."""
@@ -56,7 +56,7 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
         aims.append(float(np.exp(min(program(w)[0] / 2, 700.0))))
 
     keep(start)
-    if program(start)[0] >= 2 * WORST:
+    if program(start)[0] >= 2 * UNDETERMINED_AIM:
         raise NotSolvedError("design: all candidates together do not determine the network")
     found = minimize(
         program, start, jac=True, method="SLSQP", bounds=[(NOTHING, 1.0)] * images, callback=keep,

@@ -8,11 +8,11 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, controlled
 from jaxbundle.orientation.sights import Sights
 
-APART = 3.0
+OUTLIER_LIMIT = 3.0
 """Points with residuals above this multiple of the median are excluded from the similarity."""
 LEAST_RAYS = 5
 """Minimum rays to control points: four give seven unknowns and one redundancy."""
-FEW = 6
+FEWEST_WITH_OUTLIERS = 6
 """With at most this many points all are used, since outliers cannot be identified."""
 ROUNDS = 3
 LEAST_TO_TELL = 4
@@ -148,9 +148,9 @@ def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
     good = np.ones(len(source), bool)
     for _ in range(ROUNDS):
         found = many.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
-        if found is None or len(source) < FEW:
+        if found is None or len(source) < FEWEST_WITH_OUTLIERS:
             return found
         A, t = found
         off = np.linalg.norm(source @ A.T + t - target, axis=1)
-        good = off <= APART * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
+        good = off <= OUTLIER_LIMIT * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
     return found

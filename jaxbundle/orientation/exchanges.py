@@ -22,9 +22,9 @@ from jaxbundle.orientation.sights import Sights, sights
 CONTRADICTION = "control points contradict each other"
 TRIPLES = 120
 """Largest number of tested similarities of three points."""
-FEW = 12
+ALL_PAIRS_UP_TO = 12
 """With at most this many points every swap of two is tried."""
-AGREED = 4
+FEWEST_AGREEING = 4
 """Minimum number of consistent points before the others are suspected; three always agree."""
 AS_GOOD = 3.0
 """Explanations with a fit worse than the best by at most this factor are also reported."""
@@ -93,7 +93,7 @@ def contradiction(
     if off is None or off.max() < tolerance:
         return None
     good = _agreeing(source, target, tolerance)
-    if good.sum() >= max(AGREED, n / 2):
+    if good.sum() >= max(FEWEST_AGREEING, n / 2):
         return _by_majority(source, target, good, tolerance, off.max())
     return _by_trial(source, target, tolerance, off.max())
 
@@ -117,10 +117,10 @@ def _by_majority(source, target, good, tolerance, before):
 
 def _by_trial(source, target, tolerance, before):
     n = len(source)
-    if n > FEW:
+    if n > ALL_PAIRS_UP_TO:
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
-    trials += [((), (k,)) for k in range(n) if n >= AGREED]
+    trials += [((), (k,)) for k in range(n) if n >= FEWEST_AGREEING]
     found = []
     for pair, left_out in trials:
         order = np.arange(n)
@@ -141,7 +141,7 @@ def _by_trial(source, target, tolerance, before):
 def _agreeing(source, target, tolerance) -> Bool[np.ndarray, " n"]:
     """The most points that fit one similarity from three of them, seen once more."""
     triples = list(itertools.islice(itertools.combinations(range(len(source)), 3), 2 * TRIPLES))
-    if len(source) > FEW:
+    if len(source) > ALL_PAIRS_UP_TO:
         rng = np.random.default_rng(0)
         triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIPLES)]
     best = np.zeros(len(source), bool)

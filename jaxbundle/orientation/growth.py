@@ -2,10 +2,10 @@
 
     known points ──resection──▶ images ──intersection──▶ more points ──▶ …
 
-An image is resected from at least `LEAST` known points, most of which must agree; images with the
-most known points come first. A point is intersected from at least two consistent rays with an angle
-above `NARROW`. All tests use the tolerance of start values; the subsequent adjustment refines the
-result.
+An image is resected from at least `FEWEST_POINTS` known points, most of which must agree; images
+with the most known points come first. A point is intersected from at least two consistent rays with
+an angle above `NARROW`. All tests use the tolerance of start values; the subsequent adjustment
+refines the result.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.sights import Sights
 from jaxbundle.orientation.status import Status
 
-LEAST = 4
+FEWEST_POINTS = 4
 """Minimum known points of an image: three, and one to choose among their solutions."""
 ENOUGH, WAITING = 12, 0.4
 """An image waits while it has fewer known points, or less than this fraction of the maximum of all
@@ -29,7 +29,7 @@ DRIFTS, LARGER = 30, 2.5
 PARALLEL, FAR_AWAY = 2e-3, 2e3
 """Radians between the rays of a point that is far away and their middle; and how far, in radii of
 the places of the images."""
-AGREE = 0.4
+AGREEING_SHARE = 0.4
 """Minimum fraction of consistent points of an image or a pair."""
 
 
@@ -105,7 +105,7 @@ def grow(
     intersect(sights, model, FOR_OTHERS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
-        waiting = among & ~model.placed & (known >= LEAST) & (known > tried)
+        waiting = among & ~model.placed & (known >= FEWEST_POINTS) & (known > tried)
         if not waiting.any():
             break
         most = known[waiting].max()
@@ -161,7 +161,7 @@ def place_images(sights: Sights, model: Model, images) -> int:
         sights.tolerance[images],
     )  # fmt: skip
     number = np.minimum([len(r) for r in rows], many.SLOTS)
-    good = (part >= AGREE) & (part * number >= LEAST)
+    good = (part >= AGREEING_SHARE) & (part * number >= FEWEST_POINTS)
     for i, image in enumerate(images):
         if good[i]:
             model.place(image, X0[i], M[i])
@@ -179,7 +179,7 @@ def _refine(sights: Sights, model: Model) -> None:
     error = misclosures(sights, model)
     rows = [_known_rows(sights, model, image) for image in images]
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
-    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= LEAST]
+    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= FEWEST_POINTS]
     if not use:
         return
     images, rows = images[use], [rows[k] for k in use]

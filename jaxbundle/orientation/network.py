@@ -31,9 +31,9 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
-    AGREE,
+    AGREEING_SHARE,
+    FEWEST_POINTS,
     FOR_OTHERS,
-    LEAST,
     Model,
     controlled,
     finish,
@@ -57,9 +57,9 @@ CONTRADICTED = 0.1
 which a mirror image is tested."""
 LEAST_CONTROL = 3
 """Minimum remaining control points for the datum."""
-MOST = 0.8
+SUFFICIENT_SHARE = 0.8
 """A model that uses at least this fraction of the image points is accepted without alternatives."""
-WIDE = 0.5
+WIDE_ANGLE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
 
@@ -236,7 +236,7 @@ def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
         if good > most and not (linked and join(seen, model, part) is None):
             best, most = part, good
-        if most >= MOST * rows.sum():
+        if most >= SUFFICIENT_SHARE * rows.sum():
             break
     return best
 
@@ -257,8 +257,8 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
     xy = [_common_points(seen, *pair) for pair in pairs]
     tolerance = seen.tolerance[pairs].mean(1)
     M, b, part, angle = many.orient_pairs([a for a, _ in xy], [b for _, b in xy], tolerance)
-    worth = np.sqrt(common) * part * np.minimum(angle, WIDE)
-    usable = (part >= AGREE) & (angle > FOR_OTHERS.angle)
+    worth = np.sqrt(common) * part * np.minimum(angle, WIDE_ANGLE)
+    usable = (part >= AGREEING_SHARE) & (angle > FOR_OTHERS.angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
         yield *pairs[k], M[k], b[k]
 
@@ -345,7 +345,7 @@ def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
     """The images with too few consistent known points."""
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     known = of_image(model.known[seen.point])
-    return of_image(_out_of_the_question(seen, model)) > (1 - AGREE) * known
+    return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
 
 
 def _reasons(network: Network, seen: Sights, model: Model, known):
@@ -353,12 +353,15 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
     of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
     images = {}
     for image in np.flatnonzero(~model.placed):
-        if of_known[image] < LEAST:
-            why = f"it sees {of_known[image]} known points of {rays[image]}; {LEAST} are needed"
+        if of_known[image] < FEWEST_POINTS:
+            why = (
+                f"it sees {of_known[image]} known points of {rays[image]}; "
+                f"{FEWEST_POINTS} are needed"
+            )
         else:
             why = (
-                f"fewer than {AGREE:.0%} of the {of_known[image]} known points it sees agree on a "
-                "pose: look for wrong point numbers, or a wrong principal distance"
+                f"fewer than {AGREEING_SHARE:.0%} of the {of_known[image]} known points it "
+                "sees agree on a pose: look for wrong point numbers, or a wrong principal distance"
             )
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]
@@ -377,7 +380,7 @@ def _why_nothing(network: Network, seen: Sights) -> str:
     control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
     best = int(control.argmax())
     begin = (
-        f"no image sees {LEAST} control points that agree ({int(control[best])} in "
+        f"no image sees {FEWEST_POINTS} control points that agree ({int(control[best])} in "
         f"{network.images.id[best]!r} at most), and "
     )
     one, other, most = _most_in_common(seen)

@@ -18,7 +18,7 @@ from jaxbundle.orientation.sights import sights
 
 IN_COMMON = 5
 """Minimum common points: a rotation has 3 parameters, the points 10 coordinates."""
-MOST = 200
+MOST_COMPARED = 200
 """Number of images compared with the one that has the most image points."""
 NOISE = 3.0
 """Misclosures up to this number of σ are explained by the measurements."""
@@ -30,7 +30,7 @@ def name_one_place(network: Network) -> str:
     seen = sights(network)
     number = np.bincount(seen.image, minlength=seen.images)
     base = int(number.argmax())
-    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST]
+    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST_COMPARED]
     c = np.array([camera.parameters[get_model(camera.model).principal_distance[0]]
                   for camera in network.cameras])  # fmt: skip
     of_camera = network.images.camera[seen.image]

@@ -34,7 +34,7 @@ from jaxbundle.types import AnyArray
 
 SIMPLER = 6.0
 """Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""
-EXACT = 1e-20
+ROUNDING_VARIANCE = 1e-20
 """Variance of image coordinates (c = 1) that is rounding."""
 REFINED = 4
 """Candidates that are refined."""
@@ -144,7 +144,7 @@ def _refine_best(M, b, data, p):
 
     def score(pair, square):
         behind = 1 - _in_front(pair, xy1, xy2, p)
-        value = (square / jnp.sum(p) + EXACT) * (1 + 100 * behind)
+        value = (square / jnp.sum(p) + ROUNDING_VARIANCE) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
     first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
@@ -210,5 +210,5 @@ def _simpler(points, vtpv):
         return jnp.where(spare > 0, square, jnp.inf)
 
     rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)
-    limit = lambda other: SIMPLER * other + EXACT * average
+    limit = lambda other: SIMPLER * other + ROUNDING_VARIANCE * average
     return rotation < limit(jnp.minimum(variance, plane)), plane < limit(variance)

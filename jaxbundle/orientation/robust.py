@@ -39,7 +39,7 @@ from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray, Scalar
 
-FAR = 1e6
+IMPOSSIBLE_ERROR = 1e6
 """Error of an observation that is impossible in a model (a point behind the camera)."""
 CUT = 2.5
 """Observations beyond this number of robust standard deviations are gross errors (LMedS)."""
@@ -124,7 +124,7 @@ def robust_resection(
     def errors(pose, xy, X):
         e = jnp.linalg.norm(jax.vmap(image_of, (None, 0))(pose, X) - xy, axis=1)
         q = jax.vmap(to_camera, (None, 0))(pose, X)[:, 2]
-        return jnp.where(q < 0, e, FAR)
+        return jnp.where(q < 0, e, IMPOSSIBLE_ERROR)
 
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
@@ -156,7 +156,7 @@ def robust_relative_orientation(
         M, b = pair
         e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2))
         s = jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
-        return jnp.where(jnp.all(s > 0, 1), e, FAR)
+        return jnp.where(jnp.all(s > 0, 1), e, IMPOSSIBLE_ERROR)
 
     def solve(xy1, xy2):
         """Of the four orientations of an E that with most of the five points in front."""
@@ -237,7 +237,7 @@ def robust_direct_linear_transformation(
 
     def errors(found, xy, X):
         x, y, w = found[0] @ jnp.pad(X, ((0, 0), (0, 1)), constant_values=1).T
-        return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), FAR)
+        return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), IMPOSSIBLE_ERROR)
 
     solve = direct_linear_transformation
     return _robust_linear(key, solve, errors, (xy, X), weights, 6, samples, threshold)
@@ -260,7 +260,7 @@ def robust_intersection(
         d = found.X - X0
         along = jnp.sum(d * rays, 1)
         angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), jnp.abs(along))
-        return jnp.where(along > 0, angle, FAR)
+        return jnp.where(along > 0, angle, IMPOSSIBLE_ERROR)
 
     return _robust_linear(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
 
@@ -309,7 +309,7 @@ def _good(e, present, size, threshold):
 
 
 def _finite(e):
-    return jnp.where(jnp.isfinite(e), e, FAR)
+    return jnp.where(jnp.isfinite(e), e, IMPOSSIBLE_ERROR)
 
 
 def _median(e, present):

@@ -59,7 +59,7 @@ RATIOS = INDICES[:-1] / INDICES[1:]
 ZETAS = np.diff(INDICES) * -(INDICES[:-1] + INDICES[1:]) / INDICES[1:] ** 2
 """(n₁/n₂)² − 1, without cancellation."""
 
-NEAR = 1e-3
+SMALLEST_HEIGHT = 1e-3
 """A layer boundary this close above the ground, in metres, is ignored."""
 
 
@@ -119,7 +119,7 @@ def refract(
         n = normal(surface, X)
         k = ratio * dot(d, n)
         bent = along(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
-        passed = (border > height + NEAR) & (residual(surface, o) > 0)
+        passed = (border > height + SMALLEST_HEIGHT) & (residual(surface, o) > 0)
         choose = lambda new, old: tuple(jnp.where(passed, a, b) for a, b in zip(new, old))
         return (choose(X, o), choose(bent, d)), None
 

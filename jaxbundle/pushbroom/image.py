@@ -30,7 +30,7 @@ from jaxbundle.pushbroom.trajectory import (
 )
 from jaxbundle.types import AnyArray, Numbers, Scalar
 
-LONGEST = 10_000_000
+LONGEST_IMAGE = 10_000_000
 """Upper bound for lines or pixels."""
 
 
@@ -112,9 +112,10 @@ def check_size(lines: float, pixels: float, where: str) -> None:
     """Refuse an image size that is not integer, without lines, with fewer than 2 pixels, or
     impossibly large."""
     for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
-        if not least <= size <= LONGEST or size != int(size):
+        if not least <= size <= LONGEST_IMAGE or size != int(size):
             raise InputError(
-                f"{where}: {size:.15g} {name}; a whole number from {least} to {LONGEST} is expected"
+                f"{where}: {size:.15g} {name}; a whole number from {least} to "
+                f"{LONGEST_IMAGE} is expected"
             )
 
 

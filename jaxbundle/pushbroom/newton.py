@@ -22,26 +22,26 @@ STEPS = 2
 """Steps of a round."""
 LEFT = 1e-7
 """Position tolerance of settled steps, in lines and pixels."""
-STILL = 1e-3
+LAST_CHANGE = 1e-3
 """Largest change of a corrected sight in its last round, in lines."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
-FEW = 64
+GATHERED_AT_ONCE = 64
 """Batch size of points gathered for another round."""
-MANY = 8
+LARGEST_GATHERED = 8
 """If a larger fraction of points needs another round, all points take it."""
 EDGE = 1e-5
 """A root at most this many lines beyond the end of its piece stays with it."""
-STRAY = 1000
+FARTHEST_OUTSIDE = 1000
 """A point this many lines outside the image is given up."""
 
 
 def refine(image, pieces, earth, X, t, u):
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     round_ = partial(_round, image, pieces, earth)
-    far = STRAY * line_period(image)
+    far = FARTHEST_OUTSIDE * line_period(image)
     n = t.size
-    few = min(n, FEW)
+    few = min(n, GATHERED_AT_ONCE)
 
     def open_(state):
         t, _, settled, rounds = state
@@ -64,7 +64,8 @@ def refine(image, pieces, earth, X, t, u):
     def again(state):
         if n == few:
             return all_again(state)
-        return jax.lax.cond(jnp.sum(open_(state)) > n // MANY, all_again, few_again, state)
+        many = jnp.sum(open_(state)) > n // LARGEST_GATHERED
+        return jax.lax.cond(many, all_again, few_again, state)
 
     state = t, u, jnp.zeros(n, bool), jnp.zeros(n, int)
     return jax.lax.while_loop(lambda s: jnp.any(open_(s)), again, state)[:3]
@@ -140,7 +141,7 @@ def _round(image, pieces, earth, X, t, u):
     settled = (step * step <= LEFT * (before + LEFT)) & (q < 0)
     if image.corrections.any:
         # the sight refers to the time at the start of the round
-        settled &= jnp.abs(tau - first) < STILL * line
+        settled &= jnp.abs(tau - first) < LAST_CHANGE * line
     # a root exactly at the end of a piece would alternate
     reach = 1 + EDGE * line
     settled &= ((tau >= -reach) | (own == 0)) & ((tau <= reach) | (own == last))

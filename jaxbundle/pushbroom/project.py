@@ -44,7 +44,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 CHUNK = 2048
 """Batch size of points, which stay in the cache."""
-SEARCHED = 256
+SEARCHED_AT_ONCE = 256
 """Batch size of searched points outside the footprint."""
 NEAR_STEPS = 6
 
@@ -248,7 +248,7 @@ def _found(image, search, X, most, margin):
 
     def search_on(state):
         found, known = state
-        chosen = first_of(~known, min(SEARCHED, known.size))
+        chosen = first_of(~known, min(SEARCHED_AT_ONCE, known.size))
         few = _search(image, search, gather(X, chosen), most, margin)
         return replace_chosen(found, few, chosen), known.at[chosen].set(True, mode="drop")
 

@@ -37,7 +37,7 @@ from jaxbundle.types import AnyArray, Scalar
 TERMS = 20
 STEPS = 6
 """Newton steps of the inverse; the number of digits doubles with each."""
-SETTLED = 1e-9
+LAST_STEP = 1e-9
 """A last step below this, in units of the scales, ends Newton's method."""
 MARGIN = 0.1
 """Tolerance beyond the scales (of 1) that counts as inside."""
@@ -113,7 +113,7 @@ def locate(
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
     place, last = jax.lax.fori_loop(0, STEPS + 1, newton, start)
     L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
-    settled = last < SETTLED
+    settled = last < LAST_STEP
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
     found = lambda a: jnp.where(settled, a, jnp.nan)

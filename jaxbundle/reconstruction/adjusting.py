@@ -24,7 +24,7 @@ from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
 
 GROSS, DOUBTFUL = 4.0, 5.0
-SETTLED = 0.004
+LAST_CHANGE = 0.004
 """Change of a factor that ends the rounds."""
 ROUNDS = 4
 FEWEST = 60
@@ -111,7 +111,7 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
             break
         rows = _rows(result, network)
         factor = _factors(*_of_reliability(result), kinds[rows], np.inf)
-        if np.all(np.abs(factor - 1) < SETTLED):
+        if np.all(np.abs(factor - 1) < LAST_CHANGE):
             break
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from jaxbundle.tiepoints.verification import Pair
 
-SMALLEST = 3
+SMALLEST_PART = 3
 """Minimum photographs of a part; two if there are only two in all."""
 
 

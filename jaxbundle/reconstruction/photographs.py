@@ -14,7 +14,7 @@ from jaxbundle.system.file_content import check_plain, read_content
 
 GUESSED = 1.2
 """Default principal distance relative to the longer side."""
-SMALLEST = 64
+SHORTEST_SIDE = 64
 """Minimum pixels of the shorter side."""
 
 
@@ -47,7 +47,7 @@ def find_photographs(
         try:
             check_plain(path)
             columns, rows = photograph_size(path)
-            if min(columns, rows) < SMALLEST:
+            if min(columns, rows) < SHORTEST_SIDE:
                 raise InputError(f"{path}: {columns} × {rows} pixels are too few")
             content = read_content(path, text=False)
         except InputError as error:

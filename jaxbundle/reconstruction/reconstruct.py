@@ -26,7 +26,7 @@ from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
-from jaxbundle.reconstruction.parts import SMALLEST, connected, why_alone
+from jaxbundle.reconstruction.parts import SMALLEST_PART, connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
     Photograph,
@@ -238,7 +238,7 @@ class _Making:
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
-        least = min(SMALLEST, len(self.photographs))
+        least = min(SMALLEST_PART, len(self.photographs))
         waiting = connected(len(self.photographs), pairs)
         parts: list[Part] = []
         failed: list[str] = []
@@ -265,7 +265,7 @@ class _Making:
                                                            rest.index(p.images[1])))
                             for p in among])]  # fmt: skip
             for g in again:
-                if len(g) >= SMALLEST and len(g) < len(group):
+                if len(g) >= SMALLEST_PART and len(g) < len(group):
                     waiting.append(g)
                 else:
                     self.left_out |= {self.names[k]: reasons[self.names[k]] for k in g}

@@ -25,7 +25,7 @@ from jaxbundle.types import Index, present
 
 ARCSEC = math.degrees(1) * 3600
 IMAGE, SENSOR = "scanner image", "sensor"
-FAR = 2.0
+FARTHEST_POINT = 2.0
 """A point farther from its measurement than this many images is an error."""
 
 
@@ -315,7 +315,7 @@ def _check_near(given: Given, rows, v) -> None:
     """Refuse points far from their measurement: swapped or wrong."""
     points, observations = given.points, given.observations
     size = np.array([(one.image.lines, one.image.pixels) for one in given.images])
-    far = (~(np.abs(v) <= FAR * size[observations.image[rows]])).any(1)
+    far = (~(np.abs(v) <= FARTHEST_POINT * size[observations.image[rows]])).any(1)
     if not far.any():
         return
     row, away = int(rows[far.argmax()]), v[far.argmax()]

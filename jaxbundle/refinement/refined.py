@@ -31,9 +31,9 @@ MARGIN = 2
 """Rows of the old table kept before the first line and after the last."""
 FEWEST = 2048
 """Rows that are computed at a time, at least."""
-LONGEST = 200_000
+LONGEST_TABLE = 200_000
 """Largest length of a table."""
-SAME = 1e-12
+SLOPE_TOLERANCE = 1e-12
 """Tolerance of slopes for equal optics."""
 
 
@@ -97,10 +97,10 @@ def _attitude(image, form, change) -> Attitude:
         pending = np.repeat(split, 1 + split)
         times = np.r_[times, middle[wrong]][order]
         rotations = np.concatenate([rotations, there[wrong]])[order]
-        if len(times) > LONGEST:
+        if len(times) > LONGEST_TABLE:
             raise InputError(
-                f"attitude: more than {LONGEST} rows would be needed to write it; the table is too "
-                "rough between its rows"
+                f"attitude: more than {LONGEST_TABLE} rows would be needed to write it; the "
+                "table is too rough between its rows"
             )
     quaternions = _pad(_quaternions, rotations)
     longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
@@ -149,7 +149,7 @@ def _optics(image, change) -> Optics:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
     target = _slopes(wanted, u)
-    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SAME:
+    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SLOPE_TOLERANCE:
         return candidate
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
 

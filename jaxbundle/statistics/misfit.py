@@ -11,7 +11,7 @@ from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 CONTRADICTED = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is also significant."""
 BEYOND_CHANCE = 0.001
-MANY = 0.05
+LARGEST_REMOVED = 0.05
 """A larger fraction of removed image points, beyond chance, is reported."""
 UNRECOGNISABLE = 20.0
 """Residuals this many times their σ are most likely due to wrong axes or units."""
@@ -48,7 +48,7 @@ def doubt_of_baarda(
             f"large as they say: it has {done} ({took}). {_remedy(scale)}, or {pope}"
         )
     chance = 3 * math.sqrt(rays * by_chance)
-    if removed - by_chance * rays > max(MANY * rays, chance):
+    if removed - by_chance * rays > max(LARGEST_REMOVED * rays, chance):
         return (
             f"Baarda's test has removed many observations ({took}): there are as many blunders, or "
             f"the a priori σ are a little too small. Look at what was removed, or {pope}"

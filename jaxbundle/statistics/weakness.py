@@ -13,8 +13,8 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.weakness import (
-    FAR,
-    VAGUE,
+    NONLINEAR_RATIO,
+    VAGUE_RATIO,
     Extents,
     find_weak,
     find_weak_unsolved,
@@ -39,9 +39,9 @@ FURTHER = (
 
 @dataclasses.dataclass(frozen=True)
 class Weakness:
-    """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE` of their reference,
-    the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above 1/`FAR` of
-    their distance; `of`: the number of points."""
+    """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE_RATIO` of their
+    reference, the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above
+    1/`NONLINEAR_RATIO` of their distance; `of`: the number of points."""
 
     unknowns: tuple[str, ...] = ()
     worst: float = 0.0
@@ -58,7 +58,7 @@ class Weakness:
             found.append(
                 f"poorly determined: {list_some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
-                f"{1 / VAGUE:g} of it the unknown is practically undetermined. "
+                f"{1 / VAGUE_RATIO:g} of it the unknown is practically undetermined. "
                 f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}"
             )
         if self.points:
@@ -66,8 +66,8 @@ class Weakness:
             where = "the images stand at one place, or nearly" if most else "rays almost parallel"
             found.append(
                 f"poorly determined: X, Y, Z of {len(self.points)} of {count(self.of, 'point')} "
-                f"({list_some(self.points)}), with a σ above {1 / FAR:g} of their distance: "
-                f"{where}. Depth needs images from places farther apart."
+                f"({list_some(self.points)}), with a σ above {1 / NONLINEAR_RATIO:g} of their "
+                f"distance: {where}. Depth needs images from places farther apart."
             )
         return tuple(found)
 

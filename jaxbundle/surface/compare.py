@@ -15,7 +15,7 @@ from jaxbundle.surface.cloud import Cloud
 NEIGHBOURS = 8
 FARTHEST = 3.0
 """Maximum distance of neighbours, in median spacings of the second cloud."""
-TOGETHER = 1 << 16
+POINTS_AT_ONCE = 1 << 16
 
 
 def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
@@ -29,8 +29,8 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
     k = min(NEIGHBOURS, len(other))
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
-    for first in range(0, len(cloud), TOGETHER):
-        part = slice(first, min(first + TOGETHER, len(cloud)))
+    for first in range(0, len(cloud), POINTS_AT_ONCE):
+        part = slice(first, min(first + POINTS_AT_ONCE, len(cloud)))
         distance[part], sigma[part] = _to_planes(cloud, other, tree, k, part, FARTHEST * spacing)
     v = distance[np.isfinite(distance)]
     if not len(v):

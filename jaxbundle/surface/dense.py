@@ -30,16 +30,16 @@ from jaxbundle.system.configuration import available_cores
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
-EVEN = 40
+MEAN_WINDOW = 40
 """Half the side of the windows whose means are subtracted from the grey values."""
 LEAST_SPREAD = 25.0
 """Minimum standard deviation of compared grey values, of 256."""
 MOST_COSTS = 4e8
 """Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory, and
 paths from below are also followed."""
-UNIQUE = 5
+UNIQUENESS = 5
 """Percent by which the best cost must be below the second."""
-SPECKLE = 80
+SMALLEST_REGION = 80
 """Pixels of the smallest region of similar disparities that is kept."""
 HALF, WIDE = 4, 7
 """Half the side of the windows of least squares; of those where the texture is weak."""
@@ -60,7 +60,7 @@ COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
 """At a resolution so much coarser, windows of half this side are compared with others of the image
 itself; their correlation from which a texture repeats itself; the part of the image which a surface
 of such a texture must have."""
-NEAR = 0.7
+SURFACE_TOLERANCE = 0.7
 """Pixels: by so much disparities of one surface differ within a window, about."""
 MOST_CHANGE = 1.0
 """Maximum change of a disparity by least squares, pixels."""
@@ -110,7 +110,7 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
 def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows columns"]]:
     """Grey values around 128 without differences of exposure and light."""
     cv2 = need_opencv()
-    mean = lambda a: cv2.blur(a.astype(np.float32), (2 * EVEN + 1,) * 2)
+    mean = lambda a: cv2.blur(a.astype(np.float32), (2 * MEAN_WINDOW + 1,) * 2)
     found, spread = [], 0.0
     for a, there in ((left, inside), (right, right_inside)):
         away = np.where(there, a - mean(a * there) / np.maximum(mean(there), 1e-6), 0)
@@ -127,8 +127,8 @@ def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     number = max(16, -(-(span + 1) // 16) * 16)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
-        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
-        speckleWindowSize=SPECKLE, speckleRange=2,
+        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUENESS,
+        speckleWindowSize=SMALLEST_REGION, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
         else cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip
@@ -348,7 +348,7 @@ def _smooth(disparity, known, half):
     """Means of the similar disparities in a window."""
     cv2 = need_opencv()
     far = np.where(known, disparity, -1e3).astype(np.float32)
-    smooth = cv2.bilateralFilter(far, 2 * half + 1, NEAR, float(half))
+    smooth = cv2.bilateralFilter(far, 2 * half + 1, SURFACE_TOLERANCE, float(half))
     return np.where(known, smooth, np.nan).astype(np.float32)
 
 

@@ -17,14 +17,14 @@ from jaxbundle.surface.reconstruct import Surface
 
 COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
 NEEDED = COLUMNS[:3]
-TOGETHER = 1 << 16
+POINTS_AT_ONCE = 1 << 16
 
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
     """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
     names = np.array([*map(_quote, cloud.images), ""], dtype=object)
-    starts = range(0, len(cloud), TOGETHER)
-    lines = (_lines(cloud, names, slice(k, k + TOGETHER)) for k in starts)
+    starts = range(0, len(cloud), POINTS_AT_ONCE)
+    lines = (_lines(cloud, names, slice(k, k + POINTS_AT_ONCE)) for k in starts)
     write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
 
 

@@ -27,15 +27,15 @@ COARSE_STEPS = 128
 """Maximum positions at the coarsest level, if the image is large enough for a coarser one."""
 MOST_STEPS = 512
 """Maximum positions compared for a node."""
-HALF = 4
+HALF_WINDOW = 4
 """Half the side of the windows, pixels of the level."""
-REACH = 2.0
+SEARCH_MARGIN = 2.0
 """Pixels of the coarser level searched beyond the neighbours' range."""
 WEAKEST = 0.35
 """Minimum correlation of a node."""
-APART = 2.0
+LARGEST_DEVIATION = 2.0
 """Maximum distance of a node from the median of its neighbours, pixels of the level."""
-SMOOTH = 0.7
+LARGEST_SLOPE = 0.7
 """Change of position from node to node on one plane, relative to their distance."""
 MOST_NODES = 60_000
 """Maximum nodes of a guide; then the finest levels are left to the points."""
@@ -158,7 +158,7 @@ def _search_all(base, others, pyramids, uv, q, level, shape):
 
 def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, common):
     """ρ at common parameters, interpolated along each segment."""
-    rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF,
+    rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF_WINDOW,
                        steps=steps)  # fmt: skip
     spacing = 2.0**level * np.linalg.norm(shape.other_along, axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -173,10 +173,10 @@ def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, co
 
 def _search_near(base, others, pyramids, uv, bounds, level, shape, guide):
     """Positions around the coarser guide at the nodes."""
-    reach = REACH * 2.0 ** (level + 1)
+    reach = SEARCH_MARGIN * 2.0 ** (level + 1)
     q0, q, normal, rate = guide.around(uv, reach)
     q = np.clip(q, bounds[:, :1], bounds[:, 1:])
-    found, rho, _ = search(base, others, pyramids, uv, q, normal, level, HALF)
+    found, rho, _ = search(base, others, pyramids, uv, q, normal, level, HALF_WINDOW)
     lost = ~np.isfinite(found)
     return uv, shape, np.where(lost, q0, found), rate, np.where(lost, np.nan, rho), normal
 
@@ -225,7 +225,7 @@ def _smooth(base, level, uv, shape, q, rate, rho, _):
     rate = np.where(np.isfinite(rate), rate, np.nanmedian(rate))
     middle = _median(np.where(known, q, np.nan))
     with np.errstate(invalid="ignore"):
-        known &= np.abs(q - middle) * rate <= APART * 2.0**level
+        known &= np.abs(q - middle) * rate <= LARGEST_DEVIATION * 2.0**level
     filled = np.where(known, q, middle)
     filled = _nearest_filled(np.where(np.isfinite(filled), filled, np.nan), q)
     X = base.points(uv, filled.ravel()).reshape(*shape, 3)
@@ -261,7 +261,7 @@ def _normals(base, uv, X, q, rate, step):
     bent = np.zeros(q.shape, bool)
     for axis in (0, 1):
         change = np.abs(np.diff(q, axis=axis)) * (rate[1:] if axis == 0 else rate[:, 1:])
-        off = change > SMOOTH * step
+        off = change > LARGEST_SLOPE * step
         width = [(0, 0), (0, 0)]
         width[axis] = (1, 0)
         bent |= np.pad(off, width)

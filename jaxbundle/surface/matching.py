@@ -37,11 +37,11 @@ LEAST_CORRELATION = 0.6
 LEAST_SIGMA, MOST_SIGMA = 0.012, 0.5
 """Pixels: σ added to a match by interpolation and sampling, and the limit above which the texture
 does not determine it."""
-UNIQUE = 0.95
+LARGEST_SECOND = 0.95
 """Maximum ratio of ρ of the second best separate position to that of the best."""
 CONSISTENT = 1.5
 """Maximum distance of a point from the guide of the other image, pixels."""
-STRAYED = 2.5
+LARGEST_SHIFT = 2.5
 """Maximum distance of least squares matching from the position of the correlation, pixels."""
 BLOCK_SIDE, SMOOTH = 16, 0.45
 """Points per side of a block for the scatter; the quantile of the blocks used, in
@@ -103,7 +103,7 @@ def match_points(
     q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, half)
     with np.errstate(invalid="ignore"):
         found = np.isfinite(q) & (rho >= settings.least_correlation)
-        double = found & (second > UNIQUE * rho)
+        double = found & (second > LARGEST_SECOND * rho)
     lost["low correlation"] += int((~found).sum())
     lost["not unique"] += int(double.sum())
     rows = np.flatnonzero(found & ~double)
@@ -123,7 +123,7 @@ def match_points(
         places[:, k], covariance[:, k], rhos[:, k] = place, uncertain, match.rho
         good = shape.usable & (match.status == int(MatchingStatus.CONVERGED))
         good &= match.rho >= settings.least_correlation
-        good &= np.linalg.norm(match.uv - start, axis=1) <= STRAYED
+        good &= np.linalg.norm(match.uv - start, axis=1) <= LARGEST_SHIFT
         with np.errstate(invalid="ignore"):
             good &= np.sqrt(np.trace(match.covariance, axis1=1, axis2=2)) < MOST_SIGMA
         good &= _agrees(base, other, guides[k], X)

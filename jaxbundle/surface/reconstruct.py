@@ -23,7 +23,7 @@ from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
 from jaxbundle.surface.views import FrameView, OrientedImage
 
-KEPT = 6
+MOST_PYRAMIDS = 6
 """Maximum pyramids in memory."""
 POINTS = 40_000
 """Points of a base image by default."""
@@ -31,7 +31,7 @@ DENSE_NODES = 25_000
 """Maximum nodes of the guides of dense matching, which only give the range of depths."""
 MOST_POINTS = 16_000_000
 """Maximum points of a dense cloud by default; they take 2.5 GB."""
-SAMPLE = 1 << 20
+SAMPLED_PIXELS = 1 << 20
 """Number of pixels sampled for the darkest and the brightest."""
 
 Tell = Callable[[str, int, int], None]
@@ -113,7 +113,7 @@ class _Pyramids:
         if k in self.kept:
             self.kept[k] = self.kept.pop(k)
         else:
-            while len(self.kept) >= KEPT:
+            while len(self.kept) >= MOST_PYRAMIDS:
                 self.kept.pop(next(iter(self.kept)))
             self.kept[k] = make_pyramid(self.views[k].grey, self.levels)
         return self.kept[k]
@@ -263,7 +263,7 @@ def _colour(view, uv):
         return view.colours()[place[:, 1], place[:, 0]]
     grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
     if grey.dtype != np.uint8:
-        every = max(1, view.grey.size // SAMPLE)
+        every = max(1, view.grey.size // SAMPLED_PIXELS)
         low, high = np.percentile(view.grey.ravel()[::every], [0.5, 99.5])
         grey = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
     return np.repeat(grey[:, None], 3, axis=1)

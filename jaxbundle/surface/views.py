@@ -35,9 +35,9 @@ from jaxbundle.io.networks.orientation_covariance import OrientationCovariance
 from jaxbundle.network.tables import Camera
 
 LANES = 1 << 13
-FEW = 1 << 9
+FEWEST_POINTS = 1 << 9
 """Points of one call; fewer are padded to one of these sizes: two programs suffice."""
-BEYOND = 1.02
+RAY_MARGIN = 1.02
 """A ray farther from the axis than the farthest of the image, times this, is outside."""
 
 Points = Float[np.ndarray, "n 3"]
@@ -106,7 +106,7 @@ class FrameView:
         self.frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
         edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
-        self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
+        self._farthest = RAY_MARGIN * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
 
     def edge(self) -> Places:
         """Positions along and across the whole image, including its edges."""
@@ -190,7 +190,7 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
 def run_in_lanes(program: Callable, frame, *arrays):
     """The program for arrays [n, …], in blocks of `LANES`, padded."""
     n = len(arrays[0])
-    lanes = LANES if n > FEW else FEW
+    lanes = LANES if n > FEWEST_POINTS else FEWEST_POINTS
     parts = []
     for first in range(0, max(n, 1), lanes):
         chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))

@@ -10,7 +10,7 @@ from typing import NoReturn
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 
-WORTH_KEEPING = 0.02
+SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
 
@@ -56,7 +56,7 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         return False
     watch_cache(folder)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
     return True
 
 

@@ -38,7 +38,7 @@ USUAL, DOUBT = 1.0, 0.06
 """The usual principal distance relative to the longer side, and the relative reduction of the sum
 required to accept one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2
 times as much."""
-WIDE = 0.12
+WIDE_ANGLE = 0.12
 """Angle of intersection, radians, above which wider angles are not better."""
 FARTHEST = 0.35
 """Larger |k1| is rejected."""
@@ -77,7 +77,7 @@ def estimate_interior(
     if len(pairs) > PAIRS:
         first = tried if known else tried[1::3]
         _, _, part, _, angle = _orient([_with(camera, f) for f in first], xy1, xy2, limit)
-        worth = (part * np.sqrt(np.minimum(angle, WIDE))).max(0)
+        worth = (part * np.sqrt(np.minimum(angle, WIDE_ANGLE))).max(0)
         chosen = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
         xy1, xy2 = ([side[k] for k in chosen] for side in (xy1, xy2))
     M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)

@@ -33,11 +33,11 @@ TURN, GAP = np.radians(5.0), 0.15
 ASIDE, NARROW = 0.5, 0.03
 """Maximum distance of a base of unknown length from the angle between the two others; and angle of
 intersection, radians, below which its direction is uncertain."""
-FEW = 1 / 3
+ACCEPTED_SHARE = 1 / 3
 """Share of accepted pairs of a photograph below which only its best are used."""
-COMMON = 8
+FEWEST_COMMON = 8
 """Minimum common features of two pairs for the ratio of their bases."""
-MOST = 12
+MOST_LOOPS = 12
 """Maximum loops examined per pair, those with the most matches."""
 
 
@@ -77,7 +77,7 @@ def _without_weak(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tup
     for k in {k for pair in pairs for k in pair.images}:
         of = [p for p in pairs if k in p.images]
         left = [p for p in of if p.images in taken]
-        if len(left) < FEW * len(of):
+        if len(left) < ACCEPTED_SHARE * len(of):
             most = max(map(len, left), default=0)
             weak += [p for p in left if 2 * len(p) < most]
     for pair in sorted(weak, key=len):
@@ -118,7 +118,7 @@ class _Loops:
             return []
         i, j = of
         fewest = lambda k: min(len(self.pairs[_pair(i, k)]), len(self.pairs[_pair(j, k)]))
-        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST]
+        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST_LOOPS]
 
     def closes(self, of: tuple[int, int], k: int) -> bool | None:
         """Whether a loop closes; None if the bases are unknown."""
@@ -152,7 +152,7 @@ class _Loops:
         _, rows, columns = np.intersect1d(a, b, return_indices=True)
         ratio = depth[rows] / far[columns]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        return float(np.log(np.median(ratio))) if len(ratio) >= COMMON else np.nan
+        return float(np.log(np.median(ratio))) if len(ratio) >= FEWEST_COMMON else np.nan
 
 
 def _between(one, other, b) -> bool:

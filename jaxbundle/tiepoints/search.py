@@ -18,12 +18,12 @@ from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import Matches, distances_within, match_features, single_matches
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.verification import ENOUGH, Pair, verify_pairs
+from jaxbundle.tiepoints.verification import SUFFICIENT_MATCHES, Pair, verify_pairs
 
 Tell = Callable[[str, int, int], None]
 TOLERANCE = 0.0012
 """Maximum Sampson distance of an agreeing match, relative to the longer side."""
-WIDEST = 0.6
+WIDEST_SHARE = 0.6
 """Pairs that determine the principal distance: those with at least this part of the largest number
 of matches, and others with fewer, which have longer bases."""
 MOST_ALIKE = 5
@@ -32,12 +32,12 @@ OF_THE_LENS = ("fx", "fy", "k1")
 OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
 """Other principal distances to try, relative to the longer side, unless they differ by less
 than this factor."""
-MORE, MORE_THAN_TOLD = 1.05, 1.25
+REQUIRED_RATIO, MORE_THAN_TOLD = 1.05, 1.25
 """Required ratio of the numbers of explained matches; also to replace that from a file, which may
 be wrong for cropped or reduced photographs."""
-PLENTY = 0.85
+SUFFICIENT_SHARE = 0.85
 """Share of explained matches above which others are not tried."""
-TRIED = 24
+COMPARED_PAIRS = 24
 """Number of pairs for this comparison."""
 
 
@@ -132,13 +132,13 @@ def start_cameras(
         begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
         start = estimate_interior(begin, xy, told)
         if start.pairs:
-            clear = sorted(found, key=lambda m: -len(m.rows))[:TRIED]
+            clear = sorted(found, key=lambda m: -len(m.rows))[:COMPARED_PAIRS]
             explained = lambda camera, clear=clear, own=own: _count_explained(
                 _with_lens(cameras, own, camera), of, features, clear
             )
             now, every = explained(start.camera), sum(len(m.rows) for m in clear)
-            least = (MORE_THAN_TOLD if told else MORE) * now
-            if now < PLENTY * every and least < every:
+            least = (MORE_THAN_TOLD if told else REQUIRED_RATIO) * now
+            if now < SUFFICIENT_SHARE * every and least < every:
                 start = _choose_principal_distance(start, begin, xy, explained, least)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)
@@ -154,7 +154,7 @@ def start_cameras(
 def _once(matches: Matches) -> Matches:
     """The unique matches, if they are enough."""
     use = matches.single
-    return matches.take(use) if use.sum() >= ENOUGH else matches
+    return matches.take(use) if use.sum() >= SUFFICIENT_MATCHES else matches
 
 
 def _centre(cameras, of, features, matches):
@@ -203,8 +203,8 @@ def _choose_pairs(own):
     if not own:
         return []
     most = len(own[0].rows)
-    first = [found for found in own if len(found.rows) >= WIDEST * most][:MOST_ALIKE]
-    enough = [found for found in own if ENOUGH <= len(found.rows) < WIDEST * most]
+    first = [found for found in own if len(found.rows) >= WIDEST_SHARE * most][:MOST_ALIKE]
+    enough = [found for found in own if SUFFICIENT_MATCHES <= len(found.rows) < WIDEST_SHARE * most]
     others = CANDIDATES - MOST_ALIKE
     step = max(1, len(enough) // others)
     return first + enough[: others * step : step]

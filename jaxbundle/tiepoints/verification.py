@@ -7,9 +7,10 @@ homography, that explains nearly all of them as well is reported: two photograph
 or of a plane, which do not start a model.
 
 Unique matches come first (`Matches.single`): in a row of windows, matches of each window to its
-neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
-used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
-`ENOUGH` unique matches the others are left out: windows follow one another along an epipolar line.
+neighbour are consistent with a wrong orientation, shifted by their distance. All matches are used
+only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
+`SUFFICIENT_MATCHES` unique matches the others are left out: windows follow one another along an
+epipolar line.
 
 Agreeing matches must be distributed over both photographs, not in one corner: a common sign
 in two scenes does not prove that they are the same.
@@ -38,9 +39,9 @@ from jaxbundle.system.compilation import quick_jit
 
 LEAST, PART = 16, 0.2
 """Minimum number of agreeing matches, and their minimum share of all."""
-CLEAR = 0.6
+DISTINCT = 0.6
 """Share of the most distinct matches used to find the orientation."""
-ENOUGH = 60
+SUFFICIENT_MATCHES = 60
 """Sufficient number of unique matches."""
 EXTENT = 0.05
 """Minimum standard deviation of agreeing matches across their longest direction, relative to
@@ -49,7 +50,7 @@ SLOTS, LANES = 192, 8
 ROUNDS, STEPS = 2, 8
 TURNS = 40
 """Number of pairs of matches for trial rotations."""
-LOOSE = 3.0
+FIRST_TOLERANCE = 3.0
 """The first choice of matches, in tolerances."""
 EXPLAINED = 0.9
 """Share of the matches that a simpler relation must explain."""
@@ -110,7 +111,7 @@ def verify_pairs(
     agreed = {**_find_agreeing(others, xy1, xy2, tolerance), **sure}
     for k in sure:
         good, M, b = agreed[k]
-        if (good & single[k]).sum() >= ENOUGH:
+        if (good & single[k]).sum() >= SUFFICIENT_MATCHES:
             agreed[k] = good & single[k], M, b
     turned = {
         k: turn for k in usable if k not in agreed
@@ -133,7 +134,7 @@ def _find_agreeing(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
     apart most matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
     found = _by_some(rows, _clear_rows, xy1, xy2, tolerance)
-    again = {k: r for k, r in rows.items() if k not in found and CLEAR * len(r) > many.SLOTS}
+    again = {k: r for k, r in rows.items() if k not in found and DISTINCT * len(r) > many.SLOTS}
     return {**_by_some(again, lambda _: np.arange(many.SLOTS), xy1, xy2, tolerance), **found}
 
 
@@ -145,10 +146,10 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
     few = [rows[k][clear(len(rows[k]))] for k in rows]
     M, b, part, _ = many.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)], [xy2[k][r] for k, r in zip(rows, few)],
-        LOOSE * tolerance[keys],
+        FIRST_TOLERANCE * tolerance[keys],
     )  # fmt: skip
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
-    for limit in (LOOSE, 1.0):
+    for limit in (FIRST_TOLERANCE, 1.0):
         poses = _improve(poses, rows, xy1, xy2, tolerance, limit)
     found = {}
     for k, (M, b) in poses.items():
@@ -200,7 +201,7 @@ def _triad(a, b):
 
 def _clear_rows(number):
     """The most distinct matches, all of a few."""
-    return many.spread(max(int(CLEAR * number), min(number, many.SLOTS)))
+    return many.spread(max(int(DISTINCT * number), min(number, many.SLOTS)))
 
 
 def _agree(M, b, xy1, xy2, tolerance):

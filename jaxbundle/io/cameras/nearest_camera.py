@@ -3,7 +3,7 @@
 A reader gives the formula of the camera, from rays to pixels. Points of a grid over the image get
 their rays by Newton's method; the parameters of each candidate are those that bring the images of
 these rays nearest to the points (`cameras.convert_fit`). The first candidate with differences below
-`GOOD` is taken, else the nearest.
+`GOOD_FIT` is taken, else the nearest.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ Formula = Callable[..., Float[Array, "2"]]
 one: a function of JAX whose derivatives are finite on the axis, the same object for every camera of
 a kind (it is compiled once)."""
 
-GOOD = 0.05
+GOOD_FIT = 0.05
 """Pixels: a candidate this near is taken without trying the next."""
 ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
@@ -106,7 +106,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         off = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
         largest = float(off.max()) if np.isfinite(off).all() else np.inf
         found.append((largest, float(np.sqrt(np.mean(off**2))), target, values))
-        if largest <= GOOD:
+        if largest <= GOOD_FIT:
             break
     if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
         raise NoPlaceError(f"{where}: no camera model fits it; {problem}")

@@ -32,7 +32,7 @@ from jaxbundle.orientation.network import find_start_values
 PLAIN = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
 NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
-ELSEWHERE = 0.01
+LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
 
@@ -185,7 +185,9 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
     source, target = source[known], target[known]
     found = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
-    if found is None or np.median(np.linalg.norm(source - target, axis=1)) <= ELSEWHERE * extent:
+    if found is None:
+        return network
+    if np.median(np.linalg.norm(source - target, axis=1)) <= LARGEST_OFFSET * extent:
         return network
     A, t = found
     scale = np.cbrt(np.linalg.det(A))

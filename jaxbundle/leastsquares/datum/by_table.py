@@ -74,7 +74,7 @@ def move_into_datum(
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1
-    return values, distance <= datum.THERE * size
+    return values, distance <= datum.AT_DATUM * size
 
 
 def _move_tables(declared, free, motion, values):

@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, facto
 from jaxbundle.leastsquares.indexing.plan import Pairs, Plan
 from jaxbundle.types import present
 
-EXACT = 1e-12
+FULL_PRECISION = 1e-12
 """Relative residual of a reduced system solved iteratively to full precision. A smaller one may be
 unreachable because of rounding, and open motions drift."""
 PIVOT = 1e-13
@@ -78,7 +78,7 @@ def lift(normal: Normal) -> Normal:
 
 
 def factorise(
-    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = EXACT
+    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
 ) -> Factor:
     """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
     solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates

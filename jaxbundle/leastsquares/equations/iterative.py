@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.equations.reduced import Reduced
 
 MOST_STEPS, MOST_MORE = 2000, 100
 """Steps of conjugate gradients, and of their refinement."""
-REACHED = 1e-10
+REACHABLE_RESIDUAL = 1e-10
 """The relative residual that rounding allows in one run: below it the search directions are noise,
 and steps may drift, above all along open motions. Solutions of full precision are refined once
 more, and are NaN if even this was not reached."""
@@ -70,11 +70,12 @@ class ConjugateGradients(eqx.Module):
             less = optx.two_norm(after) < optx.two_norm(left)
             return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
 
-        nothing, reached = jax.tree.map(jnp.zeros_like, right), max(self.tolerance, REACHED)
+        nothing = jax.tree.map(jnp.zeros_like, right)
+        reached = max(self.tolerance, REACHABLE_RESIDUAL)
         y, left = improved(nothing, right, reached, MOST_STEPS)
-        if self.tolerance < REACHED:
-            y, left = improved(y, left, self.tolerance / REACHED, MOST_MORE)
-            solved = optx.two_norm(left) <= 2 * REACHED * optx.two_norm(right)
+        if self.tolerance < REACHABLE_RESIDUAL:
+            y, left = improved(y, left, self.tolerance / REACHABLE_RESIDUAL, MOST_MORE)
+            solved = optx.two_norm(left) <= 2 * REACHABLE_RESIDUAL * optx.two_norm(right)
             y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
         return back(y)
 

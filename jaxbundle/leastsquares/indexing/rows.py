@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.indexing.plan import Part, Plan
 from jaxbundle.leastsquares.spaces import Space, Vector
 from jaxbundle.types import AnyArray
 
-WIDE = 64
+MOST_RESIDUALS = 64
 """Residuals of one observation, as of the priors of a spline camera."""
 
 Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
@@ -117,7 +117,8 @@ class Residual:
 
     def is_wide(self, weight) -> bool:
         """Whether `array` is the way: the kind is one of arrays, with a weight for each."""
-        return not self.kind.scalars and len(weight) > WIDE and not isinstance(weight[0], tuple)
+        many = len(weight) > MOST_RESIDUALS
+        return not self.kind.scalars and many and not isinstance(weight[0], tuple)
 
 
 def residual_of(declared: Declared, part: Part) -> Residual:

@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_afte
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import AnyArray
 
-AT_ONCE = 16
+CHANGES_AT_ONCE = 16
 """Changes handled by one call of the program."""
 REACHED, ENOUGH = 1e-11, 1e-6
 """Relative residual (norm of N⁻¹) at which conjugate gradients stop, and that a result has."""
@@ -50,9 +50,9 @@ def follow(found: Solution, changes: Sequence[Change]) -> Iterator[Values]:
     **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = found.given
     still = jax.tree.map(np.asarray, values)
-    for first in range(0, len(changes), AT_ONCE):
-        some = changes[first : first + AT_ONCE]
-        held = jax.tree.map(lambda x: np.zeros((AT_ONCE, *x.shape)), still)
+    for first in range(0, len(changes), CHANGES_AT_ONCE):
+        some = changes[first : first + CHANGES_AT_ONCE]
+        held = jax.tree.map(lambda x: np.zeros((CHANGES_AT_ONCE, *x.shape)), still)
         for k, change in enumerate(some):
             for table, row, amount in change:
                 jax.tree.map(lambda x, a, k=k, row=row: _add(x, k, row, a), held[table], amount)

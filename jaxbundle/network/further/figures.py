@@ -38,7 +38,7 @@ from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
 from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
 
-EXACT = 1e-3
+EXACT_SIGMA = 1e-3
 """The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with
 its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
 conditioned."""
@@ -135,7 +135,7 @@ class Figures(Further):
     def declare(self, network, origin) -> Declared:
         point = rows_of(self.point, network.points)
         place = network.points.position - origin
-        exact = EXACT * across_rays(network)
+        exact = EXACT_SIGMA * across_rays(network)
         declared = [
             self._of_type(type, point, place, exact) for type in TYPES if type in self.type
         ]
@@ -228,7 +228,7 @@ class Shapes(Further):
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
                       labels=list(names), parameters=DIRECTIONS)  # fmt: skip
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT * across_rays(network))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
         return Declared((frame,), (seen,), (("shape", move_pose),))
