@@ -211,7 +211,7 @@ def problems(given, folder: Path):
     import scenes
 
     for path in given.problems:
-        plain = scenes.unpacked(path, folder)
+        plain = scenes.unpack(path, folder)
         yield baseline.name_of_file(path, plain), plain
     for kind in ("street", "arc"):
         for images, points in getattr(given, kind) or ():

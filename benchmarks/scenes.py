@@ -144,7 +144,7 @@ def half_square(cameras, points, image, point, xy) -> float:
     return 0.5 * float(np.square(computed - xy).sum())
 
 
-def unpacked(path: Path, folder: Path) -> Path:
+def unpack(path: Path, folder: Path) -> Path:
     """The file itself, or its unpacked copy in the folder."""
     opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower())
     if opener is None:

@@ -21,7 +21,7 @@ from jaxbundle.bundle.minimum import (
     weakness_without_solution,
 )
 from jaxbundle.bundle.orient import orient, orient_again, screen
-from jaxbundle.bundle.repeated import (
+from jaxbundle.bundle.readjust import (
     adjust_robustly,
     eliminate_parameters,
     snoop_network,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.bundle.stored import CLASSES, FORMAT, State, Stored, with_own_models
+from jaxbundle.bundle.storage import CLASSES, FORMAT, State, Stored, with_own_models
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.stored_tree import read_tree

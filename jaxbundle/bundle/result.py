@@ -24,7 +24,7 @@ from jaxbundle.adjustment.unknowns import (
 from jaxbundle.arguments import at_least_zero
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle import tables as result_tables
-from jaxbundle.bundle.stored import network_fingerprint, store
+from jaxbundle.bundle.storage import network_fingerprint, store
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result

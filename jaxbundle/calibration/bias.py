@@ -43,7 +43,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
+from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import f_tail

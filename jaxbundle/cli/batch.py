@@ -106,14 +106,14 @@ def batch(
     refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
     status. Only one run at a time may write the file.
     """
-    from jaxbundle.batch.joined import add_parts, run_joined
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
+    from jaxbundle.batch.processes import add_parts, run_joined
     from jaxbundle.batch.run import result_rows, run_batch
     from jaxbundle.batch.stacks import is_camera_stack
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
-    from jaxbundle.cli.board_given import board_given
+    from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting

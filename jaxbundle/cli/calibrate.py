@@ -88,7 +88,7 @@ def calibrate(
         json_text,
     )
     from jaxbundle.calibration.page import KIND, compose_calibrations
-    from jaxbundle.cli.board_given import board_given
+    from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import (
         can_plot,
         check_writable,

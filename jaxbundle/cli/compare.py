@@ -58,7 +58,7 @@ def compare(
 
     from jaxbundle.cameras import get_model
     from jaxbundle.cameras.compare import compare_cameras, difference_rings
-    from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
+    from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
     from jaxbundle.io.networks.assemble import all_parameters
     from jaxbundle.io.text.csv_tables import write_csv
     from jaxbundle.statistics.difference import expected_difference

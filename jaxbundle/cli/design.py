@@ -66,9 +66,9 @@ def design(
     """Design a network: optimal stations, or a selection of photographs."""
     import numpy as np
 
-    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.cli.camera_inputs import pair
     from jaxbundle.cli.design_files import FILES, fill_design
-    from jaxbundle.cli.design_given import box_of, normals_of, parse_aim, sigma_of, words_of
+    from jaxbundle.cli.design_options import box_of, normals_of, parse_aim, sigma_of, words_of
     from jaxbundle.cli.outputs import can_plot, check_writable, network_files, write_result
     from jaxbundle.io.formats import read_oriented
     from jaxbundle.io.results.design_json import design_text

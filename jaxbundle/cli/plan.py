@@ -93,7 +93,7 @@ def plan(
 
 
 def _needed(option: str, text: str) -> tuple[float, float]:
-    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.cli.camera_inputs import pair
 
     found = pair(option, text)
     if found is None:

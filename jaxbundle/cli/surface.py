@@ -69,7 +69,7 @@ def surface(
 
     from jaxbundle.cli.outputs import check_json
     from jaxbundle.cli.progress import counting
-    from jaxbundle.cli.surface_made import (
+    from jaxbundle.cli.surface_outputs import (
         choose,
         make_of_ground,
         make_of_photographs,

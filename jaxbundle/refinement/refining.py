@@ -20,7 +20,7 @@ from jaxbundle.refinement.check_points import CheckPoints, intersect
 from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
 from jaxbundle.refinement.freedom import Name, change_of
 from jaxbundle.refinement.inspection import Inspection, adjust
-from jaxbundle.refinement.refined import refined_image
+from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed

@@ -456,7 +456,7 @@ def test_a_choice_that_means_nothing_is_refused(scanner, given, words):
 
 
 def test_inputs_are_recognised(tmp_path):
-    from jaxbundle.cli.explore_given import recognise
+    from jaxbundle.cli.explore_inputs import recognise
 
     examples = ROOT / "examples"
     assert recognise(str(examples / "convergent4" / "project.toml")) == "network"

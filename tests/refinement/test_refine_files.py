@@ -30,7 +30,7 @@ from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine
 from jaxbundle.refinement.freedom import change_image, change_of, make_form
-from jaxbundle.refinement.refined import refined_image
+from jaxbundle.refinement.refined_image import refined_image
 
 TEXT = """
 [refine]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.calibration.files import COMMAND
 from jaxbundle.choices import EXPLORED
-from jaxbundle.cli.cameras_given import calibration_given, pair
+from jaxbundle.cli.camera_inputs import calibration_given, pair
 from jaxbundle.cli.outputs import trace_files, trace_origin
 from jaxbundle.cli.progress import iterating
 from jaxbundle.cli.pushbroom.shared import open_scanner
