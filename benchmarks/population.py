@@ -76,7 +76,7 @@ def run(cameras: Path, lines: Path) -> tuple[float, float]:
 def rows_of(lines: Path) -> dict[str, str]:
     found = lines.read_text().splitlines()
     rows = {json.loads(line)["key"]: line for line in found}
-    assert len(rows) == len(found), "a key is there twice"
+    assert len(rows) == len(found), "a key occurs twice"
     return rows
 
 

@@ -194,7 +194,7 @@ def test_either_of_two_rays(network):
     assert removed.name.startswith("either of ") and len(removed.rows) == 2
     assert all(f"point {point} in image {image}" in removed.name for image in images)
     assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
-    assert "either of" in text(found) and "does not tell which" in text(found)
+    assert "either of" in text(found) and "does not show which" in text(found)
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 

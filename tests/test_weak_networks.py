@@ -129,7 +129,7 @@ def test_images_from_one_place_are_named_where_there_is_no_solution():
 def test_images_from_one_place_solved_by_control_have_no_depth():
     result = jaxbundle.adjust(network(ONE_PLACE, **CONTROL))
     assert result.converged
-    assert "the images stand at one place, or nearly" in said(result)
+    assert "images taken from one place, or nearly" in said(result)
     sigma = np.stack([result.points[f"s{axis}"] for axis in "XYZ"], 1)
     rows = [result.points["id"].tolist().index(id) for id in result.weakness.points]
     assert (np.linalg.norm(sigma[rows], axis=1) > 0.3).all()  # of about 3.9 m

@@ -58,8 +58,8 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
             return keys
     shown = "; ".join(f"{camera}: {list_some(given, 2)}" for camera, given in names.items())
     raise InputError(
-        f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
-        "one moment alike, or give them the same last number"
+        f"the photographs of the cameras cannot be paired by their names ({shown}): name "
+        "simultaneous ones alike, or give them the same last number"
     )
 
 

@@ -105,7 +105,8 @@ def _parameters(found: Population) -> list[Section]:
     if not rows:
         return []
     note = paragraph("Converged cameras. Robust σ: 1.4826 times the median absolute deviation. A "
-                     "spread far above the median σ is of the cameras, not of the measurements.")
+                     "spread far above the median σ comes from the cameras, not from the "
+                     "measurements.")
     header = ("parameter", "cameras", "median", "robust σ", "median σ", "least", "greatest")
     shown = grid(header, rows) + note + "".join(_histograms(found))
     return [Section("population", "Parameters of the population", shown, "Population")]
@@ -132,12 +133,12 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
         for one in told
     ]  # fmt: skip
     note = paragraph(
-        "Rank correlation (Spearman) over the converged cameras, and the probability of as large a "
-        f"one by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
+        "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
+        f"large by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
         "the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
-    return [Section("correlations", "What parameters go with", grid(header, rows) + note,
+    return [Section("correlations", "What parameters correlate with", grid(header, rows) + note,
                     "Correlations")]  # fmt: skip
 
 

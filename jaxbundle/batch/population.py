@@ -251,7 +251,7 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     rows: dict[str, int] = {}
     for row, id in enumerate(given.ids(ID)):
         if id in rows:
-            raise InputError(f"{given.source(row)}: id {id!r} is there twice")
+            raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]

@@ -145,7 +145,7 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
         return result, excluded
     while result.converged and (bad := _contradicting(rig, result, settings)):
         excluded |= {rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                     "not of the same moment?" for e, rms in bad.items()}  # fmt: skip
+                     "not simultaneous?" for e, rms in bad.items()}  # fmt: skip
         xy = rig.xy.copy()
         xy[:, list(bad)] = np.nan
         rig = dataclasses.replace(rig, xy=xy)

@@ -206,7 +206,7 @@ def _difference(head: dict, work: Work, i: int) -> str:
     """Differences in settings or data of a line, in words; empty if none."""
     old = head.get("settings")
     if not isinstance(old, dict) or "data" not in head:
-        return "its line does not say what it was made of (an earlier version wrote it)"
+        return "its line does not say what it was computed from (written by an earlier version)"
     for name in {**work.settings, **dict.fromkeys(WHERE_GIVEN)}:
         value = work.settings.get(name)
         # A minimum does not depend on the iteration limit.

@@ -106,7 +106,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     try:
         with open(path, "rb") as stream:
             if not zipfile.is_zipfile(stream):
-                raise zipfile.BadZipFile("it is no archive")
+                raise zipfile.BadZipFile("it is not an archive")
             _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
                 arrays = {name: _rows(path, name, file) for name in KNOWN if name in file}

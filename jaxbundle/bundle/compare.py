@@ -128,7 +128,7 @@ class AdjustmentComparison:
                          f": scale {np.exp(self.similarity[6]):.8g}")  # fmt: skip
         if self.shared:
             lines.append(f"{count(self.shared, 'image point')} of both are the same measurements: "
-                         "σ of differences are too large, and nothing is tested")  # fmt: skip
+                         "the σ of differences are too large; nothing is tested")  # fmt: skip
         lines += [f"{name}: {test}" for name, test in self.tests.items()]
         if not self.shared:
             lines.append(f"{int(self.differs.sum())} of {len(self)} differ significantly "
@@ -194,7 +194,7 @@ def compare(
         held = _held(rows.points, held_by)
         frames, tau = _frames(a, b, held)
     elif held_by:
-        raise InputError("held_by: no similarity is found that could be held by points")
+        raise InputError("held_by: no similarity is estimated, so no points hold one")
     one, other = (_In(r, f, r.problem, b.problem) for r, f in zip((a, b), frames))
     return _compare(a, b, one, other, rows, tau, held, significance)
 

@@ -75,7 +75,7 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
     kinds = tuple(o.kind.name for o in problem.system.observations)
     if (tables, kinds) != (state.tables, state.kinds):
         other = set(state.tables + state.kinds) ^ set(tables + kinds)
-        raise InputError(f"{path}: was adjusted with other tables and observations of one's own "
+        raise InputError(f"{path}: was adjusted with other user-defined tables and observations "
                          f"({list_some(sorted(other))}); give the same as also=[…]")  # fmt: skip
     start = _tree(problem.data.start, state.start)
     problem = problem.with_data(dataclasses.replace(problem.data, start=start))

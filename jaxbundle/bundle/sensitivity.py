@@ -154,7 +154,7 @@ def inspection_of(given: Any) -> tuple[Inspection, float, float]:
     if isinstance(given, Problem):
         given = given.with_factor()
         if given.reduction not in FACTORS:
-            raise InputError("the network is too large for its covariance; take part of it")
+            raise InputError("the network is too large for its covariance; use a part of it")
         given = given.with_data(predict(given, given.data))
         return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
     if not isinstance(given, Adjustment):

@@ -111,7 +111,7 @@ class Bias:
                   "the board (--board-free)"}  # fmt: skip
         what = f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
         part = f", {100 * self.ratio:.0f} % of the residual variance" if self.ratio > 0 else ""
-        return f"the residuals hold a bias{part}, {what}"
+        return f"the residuals contain a bias{part}, {what}"
 
 
 def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:

@@ -121,7 +121,7 @@ def convert_camera(
     if not np.isfinite(length).all():
         raise ValueError(
             f"model {target.name!r} has no image of {100 * np.isnan(length).mean():.0f} % of the "
-            "image: its field of view ends before; convert a smaller area, or to another model"
+            "image: its field of view is narrower; convert a smaller area, or to another model"
         )
     worst = int(np.argmax(length))
     return Conversion(

@@ -130,7 +130,7 @@ def batch(
     asked = {"--html": html, "--table": table, "--summary": summary}
     asked = [name for name, value in asked.items() if value]
     if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
-        raise InputError(f"{asked[0]}: is made of the lines in --json-lines, and {json_lines} "
+        raise InputError(f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} "
                          "is no file")  # fmt: skip
     columns = None if against is None else read_csv(against)
     if columns is not None:

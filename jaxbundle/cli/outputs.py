@@ -107,7 +107,7 @@ def check_page(
     """Refuse a page that cannot be written, or would replace an input or a file that is not a
     page."""
     if html == "-":
-        raise InputError("--html -: a page cannot go to standard output; give a file")
+        raise InputError("--html -: a page cannot be written to standard output; give a file")
     check_file("--html", html, out, inputs)
     if not force:
         _check_content("--html", html, HTML, "HTML", OR_FORCE)
@@ -161,7 +161,7 @@ def check_targets(
     inputs = network_files(input, network, control)
     check_writable(json, out, "adjust", FILES, inputs, force, html)
     if save == "-":
-        raise InputError("--save -: it goes into a file; give the name of one")
+        raise InputError("--save -: give the name of a file")
     check_file("--save", save, None, inputs)
     if not force:
         _check_content("--save", save, SAVED, "a saved adjustment", OR_FORCE)

@@ -111,7 +111,7 @@ class Handler(BaseHTTPRequestHandler):
         except (InputError, NotSolvedError) as error:
             status, file = HTTPStatus.BAD_REQUEST, _error(error)
         except Exception as error:
-            self.server.tell(f"a fault of the program: {type(error).__name__}: {_line(error)}")
+            self.server.tell(f"internal error: {type(error).__name__}: {_line(error)}")
             status, file = HTTPStatus.INTERNAL_SERVER_ERROR, _error(error)
         self.send_response(status)
         self.send_header("Content-Type", file.type)
@@ -131,11 +131,11 @@ class Handler(BaseHTTPRequestHandler):
         name leads here must not speak with it."""
         port = self.server.server_port
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
-            raise Refused(HTTPStatus.FORBIDDEN, f"this page is at {HOST} alone")
+            raise Refused(HTTPStatus.FORBIDDEN, f"this page is served at {HOST} only")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
-            raise Refused(HTTPStatus.FORBIDDEN, "the address is not complete: take it from the "
-                          "terminal, with all its letters")  # fmt: skip
+            raise Refused(HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from "
+                          "the terminal")  # fmt: skip
         return "/".join(rest).rstrip("/")
 
     def _get(self, action: str, _: bytes) -> File:
@@ -192,4 +192,4 @@ def _line(error: Exception) -> str:
 
 
 def _no_number(word: str):
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")

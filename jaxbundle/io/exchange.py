@@ -150,7 +150,9 @@ def _kind(output: Path, to: str | None) -> str:
     found = recognise_target(output)
     if found is None:
         known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
-        raise InputError(f"{output}: what to write is not recognised; give --to or a name: {known}")
+        raise InputError(
+            f"{output}: the output format is not recognised; give --to or a name: {known}"
+        )
     return found
 
 
@@ -259,7 +261,7 @@ def _convert_cameras(
 ) -> Converted:  # fmt: skip
     if kind not in CAMERA_KINDS:
         raise InputError(
-            f"{input}: holds cameras alone; they can be written as "
+            f"{input}: contains only cameras; they can be written as "
             f"{', '.join((*CAMERA_KINDS, *(name for name, t in TARGETS.items() if t.alone)))}, not "
             f"as {kind}"
         )

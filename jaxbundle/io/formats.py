@@ -314,7 +314,7 @@ def read_network(
         )
     if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
-            what = "holds a camera alone" if format == "opencv" else "is written only"
+            what = "contains only a camera" if format == "opencv" else "is written only"
             raise InputError(
                 f"--format {format}: {what}; a network is read as {', '.join(FORMATS)}"
             )
@@ -324,7 +324,7 @@ def read_network(
     format = format or recognise_format(path)
     if format is None and is_camera_file(path):
         raise InputError(
-            f"{path}: holds cameras alone, without images and points; a project, or another "
+            f"{path}: contains only cameras, without images and points; a project, or another "
             "network, is expected (jaxbundle camera, compare and convert read it)"
         )
     if format is None:

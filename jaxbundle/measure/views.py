@@ -167,7 +167,7 @@ def collect_views(
     size = sizes.most_common(1)[0][0]
     for name, other, _ in found:
         if other != size:
-            turned = ": it was turned after it was taken" if other == size[::-1] else ""
+            turned = ": it was rotated after exposure" if other == size[::-1] else ""
             failed[name] = (
                 f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
             )

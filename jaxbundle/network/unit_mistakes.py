@@ -59,7 +59,8 @@ def _check_field(camera: Camera, xy) -> str:
         raise InputError(
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
             f"more than {usual:.4g} {model.unit} from the principal point, "
-            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens shows that. "
+            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens has such a field of "
+            "view. "
             f"{_remedy(camera, model.unit, name, c, usual)}"
         )
     if size is not None and max(size) < FINE and usual < NARROW * c:

@@ -74,7 +74,7 @@ class Aim:
         if isinstance(self.of, str):
             one_of("aim: of", self.of, ("points", "cameras"))
         elif not callable(self.of) and not len(self.of):
-            raise InputError("aim: of names nothing; give names, \"points\" or \"cameras\"")
+            raise InputError("aim: no names; give names, \"points\" or \"cameras\"")
 
     @property
     def convex(self) -> bool:
@@ -143,7 +143,7 @@ def task_of(problem: Problem, aim: Aim) -> Task:
     problem = problem.with_factor()
     system, functions = problem.system, functions_of(problem, aim)
     if problem.reduction not in FACTORS:
-        raise InputError("design: the network is too large for its covariance; take part of it")
+        raise InputError("design: the network is too large for its covariance; use a part of it")
     of = None
     if functions is not None:
         of = lambda tables: functions(problem.layout.values(without_filling(system, tables)))

@@ -132,7 +132,7 @@ def _design_configuration(
             best, path, converged = after, steps, done
     if best is None:
         raise NotSolvedError(
-            "design: the stations cannot be brought to keep their conditions (apart, obstacles); "
+            "design: the stations cannot satisfy their conditions (apart, obstacles); "
             "give a larger room, or more starts"
         )
     best = before if _better(before, best) and _keeps(conditions, pairs, variables, start) else best
@@ -142,7 +142,7 @@ def _design_configuration(
 
 def _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed) -> Design:
     if photographs is None:
-        raise InputError("photographs: order \"second\" needs how many of the candidates are taken")
+        raise InputError("photographs: order \"second\" needs the number of candidates to select")
     candidates = network.images.id
     pairs = make_pairs(network, aim, conditions, sigma)
     values = start_at(pairs).values
@@ -215,7 +215,7 @@ def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
         ):
             best = value, end, steps, done
     if best is None:
-        raise NotSolvedError("design: no place for a further photograph keeps the conditions")
+        raise NotSolvedError("design: no place for a further photograph satisfies the conditions")
     return *best[1:], (position + pairs.problem.origin, np.exp(aims))
 
 
@@ -332,6 +332,6 @@ def _sigma(network: Network, given: float | None) -> float:
         return positive("sigma_image", given)
     sigma = network.observations.sigma
     if not len(sigma) or not np.isfinite(sigma).any():
-        raise InputError("sigma_image: the network has no image points; say how well they will be "
-                         "measured")  # fmt: skip
+        raise InputError("sigma_image: the network has no image points; give the σ they will "
+                         "have")  # fmt: skip
     return float(np.nanmedian(sigma))

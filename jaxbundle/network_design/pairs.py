@@ -197,7 +197,7 @@ def _refuse(network: Network) -> None:
     if network.further:
         raise InputError(
             f"{network.further[0].source.name}: a design uses image points, distances, control "
-            "points and priors; leave the other observations out"
+            "points and priors; omit the other observations"
         )
     if len(network.points) < 3 or len(network.images) < 1:
         raise InputError("a design needs three targets and a station to start from")

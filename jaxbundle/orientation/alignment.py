@@ -129,8 +129,8 @@ def describe_mirror(network: Network, model: Model) -> str:
     return (
         f"the {len(source)} control points fit the images only as a mirror image (by "
         f"{off[1]:.3g} {network.object_unit}, otherwise {off[0]:.3g}): X and Y are exchanged, or "
-        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; turn one "
-        "axis round"
+        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; reverse one "
+        "axis"
     )
 
 

@@ -331,7 +331,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
 
 def _in_contradiction(names: Sequence[str]) -> str:
     return (
-        f"left out {count(len(names), 'image point')} in contradiction to the start values: "
+        f"left out {count(len(names), 'image point')} that contradict the start values: "
         f"{list_some(names, 5, str)}"
     )
 

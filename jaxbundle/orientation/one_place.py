@@ -39,8 +39,8 @@ def name_one_place(network: Network) -> str:
         return ""
     names = [network.images.id[image] for image in sorted([base, *others])]
     return (
-        f"images {list_some(names)} were taken from one place, as far as their measurements tell: "
-        "a rotation alone takes one to the other, and points have no depth; add images from other "
+        f"images {list_some(names)} were taken from one place, as far as their measurements show: "
+        "a rotation alone maps one to the other, and points have no depth; add images from other "
         "places"
     )
 

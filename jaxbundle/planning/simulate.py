@@ -270,7 +270,7 @@ def _roles(points: int, control, control_sigma, check):
     role = np.full(points, "tie", dtype=object)
     sigma = _not_negative(control_sigma, 3, "control_sigma")
     if (sigma == 0).any() and (sigma > 0).any():
-        raise InputError("control_sigma: 0 (fixed) must stand for all three axes or for none")
+        raise InputError("control_sigma: 0 (fixed) must be given for all three axes or for none")
     for name, chosen, word in (
         ("control", control, "fixed" if (sigma == 0).all() else "control"),
         ("check", check, "check"),

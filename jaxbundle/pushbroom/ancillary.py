@@ -119,10 +119,10 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
     if (bad := np.diff(times) <= 0).any():
         row = int(bad.argmax()) + 1
         before, time = times[row - 1 : row + 1]
-        wrong = "is there twice" if time == before else f"comes after {before:.15g} s"
+        wrong = "occurs twice" if time == before else f"comes after {before:.15g} s"
         raise InputError(
-            f"{source(row)}: the time {time:.15g} s {wrong}; sort the rows by time and leave "
-            "every time once"
+            f"{source(row)}: the time {time:.15g} s {wrong}; sort the rows by time and keep "
+            "each time once"
         )
 
 

@@ -62,7 +62,7 @@ class RpcStatus(IntEnum):
 _MEANING = {
     RpcStatus.INSIDE: "inside the domain",
     RpcStatus.OUTSIDE: "outside the domain of the coefficients: extrapolated",
-    RpcStatus.NOT_CONVERGED: "no place found: the polynomials lead nowhere from here",
+    RpcStatus.NOT_CONVERGED: "no place found: the iterations do not converge",
 }
 
 

@@ -86,7 +86,7 @@ def report(result: Refinement) -> str:
     strong = _correlations(result)
     if strong:
         lines += ["", f"Correlations above {LISTED_CORRELATION:g}", *strong]
-    lines += ["", "Image points with the greatest tests", *_tests(used)]
+    lines += ["", "Image points with the largest tests", *_tests(used)]
     if result.removed:
         lines += ["", "Removed as blunders"]
         lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]

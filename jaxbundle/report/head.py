@@ -244,7 +244,7 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
     if adjustment.redundancy < 1:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
     if adjustment.sigma_factors:
-        return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
+        return "not done: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
     if unit_weights(adjustment):
         return f"not meaningful: unit weights (a priori σ 1 mm);  {_interval(found, level)}"

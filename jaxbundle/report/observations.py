@@ -187,8 +187,8 @@ def removals(adjustment) -> list[str]:
         lines += ["", "They are excluded from all results in this report."]
         if any(item.others for item in adjustment.removed):
             lines += paragraph(
-                "Either of: one of these rays is wrong and the point does not tell which, so that "
-                "none of them is used; a tie point left with fewer than two rays is not used."
+                "Either of: one of these rays is wrong, but the point does not show which, "
+                "and none of them is used; a tie point left with fewer than two rays is not used."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)

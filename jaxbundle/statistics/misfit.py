@@ -45,7 +45,7 @@ def doubt_of_baarda(
         done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
         return (
             f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
-            f"large as they say: it has {done} ({took}). {_remedy(scale)}, or {pope}"
+            f"large as they imply: it has {done} ({took}). {_remedy(scale)}, or {pope}"
         )
     chance = 3 * math.sqrt(rays * by_chance)
     if removed - by_chance * rays > max(LARGEST_REMOVED * rays, chance):

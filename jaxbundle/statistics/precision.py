@@ -84,7 +84,7 @@ def precision(
     check_given(problem, data)
     problem, wanted = problem.with_factor(), [] if names == () else find_unknowns(problem, names)
     if problem.reduction not in FACTORS:
-        raise InputError("precision: the network is too large for its covariance; take part of it")
+        raise InputError("precision: the network is too large for its covariance; use a part of it")
     data = problem.data if data is None else data
 
     def of(tables):
@@ -121,7 +121,7 @@ def redundancy(problem: Problem, data: Data | None = None) -> Rows:
     check_given(problem, data)
     problem = problem.with_factor()
     if problem.reduction not in FACTORS:
-        raise InputError("redundancy: the network is too large for its cofactors; take part of it")
+        raise InputError("redundancy: the network is too large for its cofactors; use a part of it")
     data, system = problem.data if data is None else data, problem.system
     given = complete_data(system, problem.layout.data(predict(problem, data)))
     found = engine_redundancy(system.declared, system.plan, given)

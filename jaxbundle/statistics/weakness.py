@@ -63,7 +63,7 @@ class Weakness:
             )
         if self.points:
             most = 2 * len(self.points) > self.of
-            where = "the images stand at one place, or nearly" if most else "rays almost parallel"
+            where = "images taken from one place, or nearly" if most else "rays almost parallel"
             found.append(
                 f"poorly determined: X, Y, Z of {len(self.points)} of {count(self.of, 'point')} "
                 f"({list_some(self.points)}), with a σ above {1 / NONLINEAR_RATIO:g} of their "

@@ -63,7 +63,7 @@ class Workers:
                     result = connection.recv()
                 except (EOFError, OSError):
                     process.join()
-                    yield task, Failed(f"the process that worked on it died ({_ended(process)})")
+                    yield task, Failed(f"its worker process died ({_ended(process)})")
                     continue
                 self._idle.append((connection, process))
                 yield task, result

@@ -52,7 +52,7 @@ def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs):
     first, second, third, fourth, fifth = found.rows
     assert "camera right" in fifth["error"] and found.adjustments[4] is None
     assert second["views"] == 2 * VIEWS - 1 and third["views"] == 2 * VIEWS - 2
-    assert list(third["epochs_not_used"]) == ["3"] and "not of the same moment" in str(third)
+    assert list(third["epochs_not_used"]) == ["3"] and "not simultaneous" in str(third)
     assert len(fourth["removed"]) == VIEWS
     truth = [*BASE, *np.radians(ANGLES)]
     for row in found.rows[:4]:

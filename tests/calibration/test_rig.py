@@ -223,7 +223,7 @@ def test_what_only_the_mounting_shows_is_removed(flawed):
     """Epochs that are not of one moment, then single points: named, and without effect."""
     found = calibrate_rig(flawed.cameras, snooping="pope")
     assert {epoch for epoch, _ in found.left_out} == {"3", "8"} and len(found.epochs) == VIEWS - 2
-    assert "photographs not of the same moment" in found.left_out[0][1]
+    assert "photographs not simultaneous" in found.left_out[0][1]
     mounting = found.mountings["right"]
     assert (np.abs(mounting.base - BASE) < 3.5 * mounting.sigma[:3]).all()
     ids = taken.BOARD.ids

@@ -149,5 +149,5 @@ def test_what_a_process_dies_of_spoils_its_task_alone():
         found = dict(workers.run([0, signal.SIGKILL, 9999]))
         found |= dict(workers.run([signal.SIGCONT]))
     assert found[0] is None and found[signal.SIGCONT] is None
-    assert found[signal.SIGKILL] == Failed("the process that worked on it died (signal 9)")
+    assert found[signal.SIGKILL] == Failed("its worker process died (signal 9)")
     assert "ValueError" in found[9999].why or "OSError" in found[9999].why

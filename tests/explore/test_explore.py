@@ -176,7 +176,7 @@ def test_what_cannot_be_answered_is_one_line_of_json(doubling, path, body, statu
 def test_a_fault_is_told_on_the_terminal(doubling):
     doubling.lines.clear()
     ask(doubling, "answer", {"x": 13})
-    assert doubling.lines == ["a fault of the program: ZeroDivisionError: a fault"]
+    assert doubling.lines == ["internal error: ZeroDivisionError: a fault"]
     assert ask(doubling, "answer", {"x": 1})[0] == 200
 
 

@@ -60,7 +60,7 @@ def test_files_cut_short(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "whole.jpg")
     content = (tmp_path / "whole.jpg").read_bytes()
     (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="cut.jpg: the file is cut short"):
+    with pytest.raises(InputError, match="cut.jpg: the file is truncated"):
         read_photograph(tmp_path / "cut.jpg")
     (tmp_path / "more.jpg").write_bytes(content + b"trailer \xff\xda")
     assert read_photograph(tmp_path / "more.jpg").shape == GREY.shape

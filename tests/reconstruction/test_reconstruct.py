@@ -58,7 +58,7 @@ def test_all_photographs_of_a_scene_are_placed_and_foreign_ones_left_out(made):
     assert set(part.adjustment.network.images.id) - same_file == set(truth) - same_file
     why = found.left_out
     assert set(why) - same_file == {"c0.png", "cut.png", "dull.png"}
-    assert "cut short" in why["cut.png"] and "no texture" in why["dull.png"]
+    assert "truncated" in why["cut.png"] and "no texture" in why["dull.png"]
     assert "the same file as" in why.get("again.png", why.get("a2.png"))
 
 

@@ -1,4 +1,4 @@
-"""The population of a batch: distributions, outlying cameras, what parameters go with."""
+"""The population of a batch: distributions, outlying cameras, what parameters correlate with."""
 
 import json
 

@@ -76,7 +76,7 @@ def calibrate_rig(
     left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
     while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
         left_out += [(rig.epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                      "not of the same moment?") for e, rms in bad.items()]  # fmt: skip
+                      "not simultaneous?") for e, rms in bad.items()]  # fmt: skip
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
@@ -96,7 +96,7 @@ def require_solved(found: Result) -> Result:
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
         raise NotSolvedError(
             f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
-            "that share too few epochs, or photographs that are not of the same moment",
+            "that share too few epochs, or photographs that are not simultaneous",
             list(names),
         )  # fmt: skip
     return found

@@ -210,7 +210,7 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
             if not good:
                 word = word.decode(errors="replace")
                 return InputError(f"{path}, line {line}: {show(word)} where a number is expected")
-    return InputError(f"{path}: there is something between the numbers that is none")
+    return InputError(f"{path}: there is something other than numbers")
 
 
 def _images(pose) -> dict:

@@ -166,7 +166,7 @@ def _geo_input(path: Path):
         else:
             raise row.error(
                 f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "
-                "take it out if the network does not need it"
+                "remove it if the network does not need it"
             )
     if not cameras:
         raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")

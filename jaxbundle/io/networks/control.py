@@ -199,7 +199,7 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
         points=dataclasses.replace(points, position=position),
     ).warn(
         "the start values of the input are in another frame than the control: a similarity by "
-        f"{count(len(source), 'point')} took them there (scale {scale:.6g})"
+        f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
     )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def map_of(
         )
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():
-        raise InputError(f"coordinate system {system.crs}: it has no place for the image")
+        raise InputError(f"coordinate system {system.crs}: it is not defined where the image is")
     x = contiguous(system, x)
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]

@@ -131,7 +131,7 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
     if not (max(rows, columns) < LARGEST_SIDE and rows * columns <= most):
         raise InputError(
             f"--spacing {size:g}: the map would have {rows:.3g} × {columns:.3g} pixels; give a "
-            "greater one, in the unit of the map, or another --crs"
+            "larger one, in the unit of the map, or another --crs"
         )
     return MapGrid(left * size, top * size, size, int(columns), int(rows))
 

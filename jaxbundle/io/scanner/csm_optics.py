@@ -30,7 +30,9 @@ def optics_of(
     """
     f = isd.number("focal_length_model.focal_length")
     if f == 0:
-        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; millimetres, please")
+        raise InputError(
+            f"{isd.path}: focal_length_model.focal_length is 0; millimetres are expected"
+        )
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])
@@ -114,4 +116,4 @@ def _transverse(isd, a, b, x, y):
         u, v = u + du, v + dv
         if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):
             return u, v
-    raise InputError(f"{isd.path}: optical_distortion.transverse cannot be undone; look at it")
+    raise InputError(f"{isd.path}: optical_distortion.transverse cannot be inverted; check it")

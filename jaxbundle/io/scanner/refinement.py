@@ -138,7 +138,8 @@ def read_refinement(path: str | Path) -> RefineFile:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
-        raise InputError(f"{section.where}significance is {significance}; between 0 and 1, please")
+        raise InputError(f"{section.where}significance is {significance}; a number between 0 and 1 "
+                         "is expected")  # fmt: skip
     return RefineFile(
         images, points, observations, frames, snooping, significance, tuple(warnings)
     )

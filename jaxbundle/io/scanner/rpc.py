@@ -104,7 +104,7 @@ def _from_text(path, text):
             )
         name = name.strip().upper()
         if name in found:
-            raise InputError(f"{path}, line {number}: {name} is there twice")
+            raise InputError(f"{path}, line {number}: {name} occurs twice")
         found[name] = value.split(), number
 
     def number_of(name, unit=None):
@@ -134,7 +134,7 @@ def _from_rpb(path, text):
                 continue
             key, value = match.groups()
             if key in found:
-                raise InputError(f"{path}, line {number}: {key} is there twice")
+                raise InputError(f"{path}, line {number}: {key} occurs twice")
             found[key] = [value, number]
             name = key if "(" in value and ")" not in value else None
         else:

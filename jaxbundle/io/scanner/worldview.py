@@ -160,7 +160,7 @@ def _detectors(file):
         raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
     other = [band.tag for band, v in zip(bands, values) if v != values[0]]
     warnings = () if not other else (
-        f"{file.path}: the detectors of {', '.join(other)} are elsewhere than those of "
+        f"{file.path}: the detectors of {', '.join(other)} differ in position from those of "
         f"{bands[0].tag}, which are used",
     )  # fmt: skip
     direction = pitch * np.array([np.sin(np.radians(angle)), -np.cos(np.radians(angle))])

@@ -60,7 +60,7 @@ class StoredRows:
                 stream.seek(self.offset + int(wanted[first]) * size * self.dtype.itemsize)
                 read = np.fromfile(stream, self.dtype, (last - first) * size)
                 if read.size < (last - first) * size:
-                    raise InputError(f"{self.path}: has become shorter while it was read")
+                    raise InputError(f"{self.path}: became shorter while it was read")
                 found[first:last] = read.reshape(-1, *self.shape[1:])
         return found[0] if np.ndim(rows) == 0 else found
 

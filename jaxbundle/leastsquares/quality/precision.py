@@ -53,7 +53,7 @@ def precision(
     """
     problem = with_factor(problem)
     if problem.plan.reduction not in FACTORS:
-        raise InputError("precision: the problem is too large for its covariance; take part of it")
+        raise InputError("precision: the problem is too large for its covariance; use a part of it")
     declared, plan, data = problem.declared, problem.plan, complete_data(problem, data)
 
     def functions(change):
