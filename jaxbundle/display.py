@@ -1,4 +1,4 @@
-"""How results show themselves: in one screen, and as gridded data of xarray where it is installed.
+"""Display of results: in one screen, and as gridded data of xarray where it is installed.
 
 Arrays are shown by type and shape, long lists by their first entries; nothing is computed for it.
 """
@@ -55,7 +55,7 @@ def abbreviate(value: Any, depth: int = 0) -> str:
 
 
 def _more(parts: list[str], number: int, depth: int) -> list[str]:
-    """With how many there are, if they are not all; deep inside only that."""
+    """The parts, and the number of all if some are omitted; at depth only the number."""
     if depth > 1 and number:
         return [f"{number} entries"]
     return parts if number <= SHOWN_ENTRIES else [*parts, f"… {number} in all"]

@@ -1,8 +1,8 @@
 """Cameras of a batch from folders of photographs of a board, one folder a camera.
 
-The board is sought by processes of their own, a photograph each at a time: an image that OpenCV
-dies of spoils itself alone. What is found is kept (`io.boards.kept_corners`), so that no photograph
-is searched twice. Cameras of one image size are then calibrated together (`calibrate_batch`).
+The board is searched in separate processes, one photograph at a time: an image that crashes OpenCV
+affects only itself. Results are kept (`io.boards.kept_corners`), so that no photograph is searched
+twice. Cameras of one image size are then calibrated together (`calibrate_batch`).
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ class PhotographFolders:
     workers: Workers
 
     def fingerprint(self, folder: int) -> str:
-        """Of the content of the photographs."""
+        """The fingerprint of the content of the photographs of a folder."""
         files = self._files(folder)
         return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
 
@@ -74,7 +74,7 @@ class PhotographFolders:
     ) -> dict[int, BoardViews | str]:
         """The views of some of the folders, or why there are none.
 
-        `tell(part)`: of the photographs that were to be searched, so many are."""
+        `tell(part)`: the fraction of the photographs searched."""
         files = {folder: self._files(folder) for folder in chosen}
         contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
         tasks = {
@@ -142,7 +142,7 @@ def calibrate_views(
 
 
 def of_photographs(views: BoardViews, brief: bool) -> dict:
-    """What a line says of the photographs of a camera."""
+    """The entries of a line about the photographs of a camera."""
     row: dict[str, Any] = {"image_size": list(views.image_size)}
     if not brief:
         row["photographs"] = list(views.names)

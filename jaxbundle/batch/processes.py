@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.sharding import use_own_devices
 
 ROWS_AT_ONCE = 256
 PAUSE = 0.2
-"""Seconds between two looks for the files of other processes."""
+"""Seconds between checks for the files of other processes."""
 
 
 def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Counter:
@@ -84,7 +84,7 @@ def _in_words(error: Exception) -> str:
 
 
 def _clear(file: str | Path, waiting: str) -> None:
-    """Add the parts that a run that was ended has left, and make the folder of this one."""
+    """Add the parts left by an interrupted run, and make the folder of this one."""
     add_parts(file)
     try:
         os.mkdir(waiting)
@@ -99,7 +99,7 @@ def _tell(waiting: str, name: str, words: str = "") -> None:
 
 
 def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
-    """What each of these has told, when all have."""
+    """The reports of these processes, once all are there."""
     while True:
         found = {name: Path(waiting, name).read_text() for name in names
                  if Path(waiting, name).exists()}  # fmt: skip
@@ -109,8 +109,8 @@ def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def add_parts(file: str | Path) -> None:
-    """Add the lines of all parts beside a file of results to it, and remove what joined processes
-    have left.
+    """Add the lines of all parts beside a file of results to it, and remove other files left by
+    joined processes.
 
     **Raises:** `InputError` while a run writes one of them."""
     found = [(int(end[1]), path) for path in glob.glob(f"{glob.escape(str(file))}.part-*")

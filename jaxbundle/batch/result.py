@@ -103,8 +103,8 @@ class BatchCalibration:
 
     def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
         """The result of camera i as plain dicts and numbers (angles in radians), as a line of
-        `jaxbundle batch`; `brief`: without covariance and poses; `views`: how many it has, without
-        those it was filled up with; all if not given."""
+        `jaxbundle batch`; `brief`: without covariance and poses; `views`: their number without
+        padding; default: all."""
         row = {
             "status": str(self.status[i]),
             "model": str(self.model),
@@ -138,7 +138,7 @@ class BatchCalibration:
         return row
 
     def population(self, ids: Sequence | None = None) -> Population:
-        """How the cameras are distributed, which are outlying, what their parameters go with.
+        """The distribution of the cameras, the outlying ones, and correlations of their parameters.
 
         **Arguments:** `ids` of the cameras; 0, 1, 2, … if not given.
 

@@ -75,7 +75,7 @@ def solve_rigs(
 ) -> list[tuple[dict, Adjustment | None]]:
     """The row of every rig, as a line of `jaxbundle batch`, and its adjustment, if any.
 
-    `tell(part)`: so much is done."""
+    `tell(part)`: the fraction done."""
     firsts, solved = _first_cameras(rigs, settings), []
     for number, (rig, first) in enumerate(zip(rigs, firsts), 1):
         solved.append(_solve(rig, first, settings))
@@ -176,7 +176,7 @@ def _contradicting(
 def _residual_lengths(
     result: Adjustment | None, settings: RigSettings
 ) -> Float[np.ndarray, " n"]:
-    """Of the image points that were used, pixels."""
+    """Residual lengths of the image points used, pixels."""
     if result is None:
         return np.zeros(0)
     used = (np.asarray(result.problem.data.image_weight) > 0).all(1)

@@ -163,7 +163,7 @@ def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
 
 
 def _tell(progress, done: int, number: int, total: int, part: float) -> None:
-    """Of so many that are being computed a part is done."""
+    """Report that a fraction `part` of `number` inputs is done."""
     progress(done + int(part * number), total)
 
 

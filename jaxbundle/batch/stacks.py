@@ -147,7 +147,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
 
 
 def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str):
-    """An array of names, if it is there.
+    """An array of names, if there is one.
 
     **Raises:** `InputError` for another one."""
     found = arrays.get(name)

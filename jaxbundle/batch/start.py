@@ -113,7 +113,7 @@ def _normalise(weight, axes):
 
 
 def _direct_linear(weight, X, x, y):
-    """Rows of H or P, without the last element, which is 1, row after row; views of use."""
+    """Rows of H or P, without the last element, which is 1, row after row; usable views."""
     nil = jnp.zeros_like(weight)
     own, none = [*X, weight], [nil] * (len(X) + 1)
     rows_x = [*own, *none, *(-x * c for c in X), x]

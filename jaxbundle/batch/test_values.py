@@ -29,7 +29,7 @@ LEAST_REDUNDANCY = 1e-6
 def point_tests(model, free, seen: Sightings, used, at: Calibration):
     """Test values of all points seen [views, points], in pixels; NaN where there is none.
 
-    **Arguments:** `seen`: the points of the views that take part; `used` [views, points]: 1 for
+    **Arguments:** `seen`: the points of the included views; `used` [views, points]: 1 for
     those the camera `at` was adjusted from, 0 for those that were removed.
     """
     columns_x, columns_y = design(model, free, seen, at)

@@ -26,7 +26,7 @@ def is_vague(
 ) -> Bool[np.ndarray, "cameras k"]:
     """Principal distances and points with a σ above a fiftieth of the principal distance.
 
-    Distortion never is: the σ of a coefficient of no significance is larger than itself.
+    Distortion coefficients never count: an insignificant one has a σ larger than itself.
     """
     columns = [model.parameters.index(name) for name in model.principal_distance]
     shortest = np.abs(interior[:, columns]).min(1)

@@ -81,7 +81,7 @@ class BatchSettings:
         cls, model, free, board, rig, pixel_size, overrides, max_iterations, snooping, significance,
         brief,
     ) -> "BatchSettings":  # fmt: skip
-        """Of the arguments of `run_batch`.
+        """The settings from the arguments of `run_batch`.
 
         **Raises:** `InputError`."""
         one_of("snooping", snooping, TESTS, none=True)
@@ -111,7 +111,7 @@ class BatchSettings:
         return {name: document[name] for name in (*SECTIONS, SIGMA_IMAGE) if name in document}
 
     def as_rigs(self) -> RigSettings:
-        """Those of cameras and rigs that are networks."""
+        """The settings of cameras and rigs that are adjusted as networks."""
         sections = self.sections()
         sigma = sections.pop(SIGMA_IMAGE, SIGMA)
         return rig_settings(self.model, self.free, sections, self.pixel_size, sigma,

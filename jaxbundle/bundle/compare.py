@@ -45,7 +45,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
 
 MOST_TOGETHER = 1500
-"""Coordinates of points whose joint covariance is formed; of more, portions of so many are."""
+"""Number of point coordinates whose joint covariance is formed at once; more are divided."""
 NULL = 1e-9
 """Eigenvalues of a correlation matrix below this part of the largest are 0."""
 SCALE = SEVEN.index("scale")
@@ -443,8 +443,8 @@ def _rows_of(a: Adjustment, b: Adjustment, rows: _Common, x_a, x_b, v_a, v_b) ->
 
 
 def _congruency(d, C_a, C_b, at, freedom, lost: int = 0) -> Congruency | None:
-    """The test that these differences are 0 together; None where nothing is free. `lost`: what a
-    similarity has taken off their rank."""
+    """The test that these differences are 0 together; None where nothing is free. `lost`: the rank
+    removed by a similarity."""
     C_a, C_b = C_a[np.ix_(at, at)], C_b[np.ix_(at, at)]
     diagonal = np.diagonal(C_a + C_b)
     free = diagonal > 0
@@ -462,7 +462,7 @@ def _congruency(d, C_a, C_b, at, freedom, lost: int = 0) -> Congruency | None:
 
 
 def _freedom(part: float, r: tuple[int, int]) -> float:
-    """Welch's degrees of freedom of a variance of which `part` is that of the first."""
+    """Welch's degrees of freedom of a sum of two variances, the first of which is `part`."""
     return 1 / (part**2 / r[0] + (1 - part) ** 2 / r[1])
 
 

@@ -125,4 +125,4 @@ COLUMNS = {
     "point": lambda kind, image, point, axes: np.repeat(point, len(axes)),
     "axis": lambda kind, image, point, axes: np.tile(np.array(axes, object), len(image)),
 }
-"""What names a measurement."""
+"""The columns that identify a measurement."""

@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.network.columns import list_some
 
 SAME_SIGMA0 = 1e-6
-"""σ0 of a loaded adjustment that differs by more, relatively, is not that of the saved one."""
+"""Largest relative difference of σ0 between a loaded and the saved adjustment."""
 WHAT = "a saved adjustment (Adjustment.save, jaxbundle adjust --save)"
 
 
@@ -33,8 +33,8 @@ def load_adjustment(
 ) -> Adjustment:
     """Load what `Adjustment.save` has written: the whole result, without iterating again.
 
-    **Arguments:** `models`: camera models of one's own that its cameras have; `also`: what `adjust`
-    was given under this name. Both are functions, which no file holds.
+    **Arguments:** `models`: user-defined models of its cameras; `also`: what `adjust`
+    was given under this name. Both are functions, which a file cannot hold.
 
     **Returns:** an `Adjustment` with everything that the saved one has, every covariance included.
 

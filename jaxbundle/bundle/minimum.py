@@ -25,9 +25,10 @@ MISJUDGED = 1.03
 
 INSEPARABLE = 1e-7
 """Scaled eigenvalues of the normal matrix below this: a change of the unknowns by many σ hardly
-changes an observation, and iterations go on for long."""
+changes an observation, and the iterations take long."""
 EIGENVECTORS = 3000
-"""Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
+"""Reduced systems with more unknowns are not searched for null vectors, which would take
+minutes."""
 
 LARGEST_FACTOR = 20.0
 """A principal distance that changed by more than this factor is implausible."""

@@ -459,8 +459,9 @@ class Adjustment:
 
     def save(self, path: str | PathLike) -> None:
         """Write the whole result into a file, which `jaxbundle.load_adjustment` reads; a file of
-        this name is replaced when the new one is complete. Camera models and observations of one's
-        own (`also`) are functions: they are named in it, and have to be given when it is loaded.
+        this name is replaced when the new one is complete. User-defined camera models and
+        observations (`also`) are functions: the file names them, and they must be given when it is
+        loaded.
 
         **Raises:** `NotSolvedError` where there is no result; `InputError` where the file cannot
         be written."""

@@ -45,7 +45,7 @@ REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
-"""Of a comparison of models."""
+"""Files of a comparison of models."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -143,7 +143,7 @@ def write_calibrations(
 def fill_calibrations(
     found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
 ) -> None:
-    """Write the same into an existing folder; `origin` and `choice` are for the page."""
+    """Write a calibration into an existing folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
         return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
     for name, one in found.cameras.items():

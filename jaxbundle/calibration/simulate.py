@@ -1,4 +1,4 @@
-"""Views of a board as a camera would have them: to try a calibration before it is photographed."""
+"""Simulated views of a board, to test a calibration before taking photographs."""
 
 import numpy as np
 

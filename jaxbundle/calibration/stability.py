@@ -92,7 +92,7 @@ class Stability:
     about_slope: Float[np.ndarray, " k"] | None = None
 
     def to_dict(self) -> dict:
-        """As in JSON."""
+        """The result as plain dicts and numbers, as in JSON."""
         test = lambda one: {"chi2": one.chi2, "degrees": one.degrees,
                             "probability": one.probability}  # fmt: skip
         rows = {}

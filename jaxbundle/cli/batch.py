@@ -152,7 +152,7 @@ def batch(
         if not first:
             html, table, summary, asked, quiet = "", None, None, [], True
     elif not part:
-        add_parts(json_lines)  # of joined processes that were ended
+        add_parts(json_lines)  # left by joined processes that were ended
     advise("run the same command again to resume")
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)

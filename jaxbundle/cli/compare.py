@@ -12,7 +12,7 @@ from jaxbundle.errors import InputError
 
 RINGS = 10
 SAVED = b"PK\x03\x04"
-"""How a saved adjustment begins, which no file of cameras does."""
+"""The first bytes of a saved adjustment; no camera file begins with them."""
 
 
 PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"

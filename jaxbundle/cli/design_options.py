@@ -26,7 +26,7 @@ def sigma_of(project: Path, network: Network) -> float | None:
 
 
 def parse_aim(given: list[str] | None):
-    """What the aim is about.
+    """The quantities of the aim.
 
     **Raises:** `InputError`.
     """

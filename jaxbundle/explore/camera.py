@@ -38,7 +38,7 @@ from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
 LINES = 13, 9
-"""Of the grid, across and down."""
+"""Lines of the grid, across and down."""
 RADII = 61
 STEPS = 6
 """Rows of the table of distortion."""
@@ -187,8 +187,8 @@ class CameraView:
         return radius, of(values), of(self.values)
 
     def _grids(self, values) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-        """Where a camera as given without distortion images even rays, and where these values do;
-        [rows, columns, 2], NaN where there is no image."""
+        """The images of evenly spaced rays by the given camera without distortion, and with these
+        values; [rows, columns, 2], NaN where there is no image."""
         axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, LINES)]
         xy = np.stack(np.meshgrid(*axes), -1)
         rays = _plain_rays(self.model, self.values, xy)

@@ -56,9 +56,9 @@ from jaxbundle.statistics.precision import Precision, precision
 MOST_ROWS = 200
 """Points whose σ before and after are listed, those that change most first."""
 MOST_ELLIPSOIDS = 3000
-"""Points whose ellipsoids are drawn anew."""
+"""Maximum number of points whose ellipsoids are redrawn."""
 UPPER = [0, 1, 2, 4, 5, 8]
-"""Of the nine elements of a covariance."""
+"""The six independent ones of the nine elements of a covariance."""
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
@@ -210,7 +210,7 @@ class NetworkView:
 
     @cached_property
     def _corners(self) -> Float[np.ndarray, "images 5 3"]:
-        """Of every image, its pyramid in the frame of its camera, from its projection centre."""
+        """The pyramid of every image in the frame of its camera, from the projection centre."""
         from jaxbundle.plotting.style import extent
         from jaxbundle.plotting.views import camera_pyramids, pyramid_size
 
@@ -287,7 +287,7 @@ class NetworkView:
         return table + more
 
     def page(self, given: Given, live: bool) -> Page:
-        """The network of the report to turn, and the place of what is chosen and moved."""
+        """The network of the report to turn, and the place for the chosen station and its moves."""
         found, answer = self.adjustment, self.answer(given)
         drawings = {"network-data": self._scene, "frames": describe_frames(found)}
         title = f"{clean(found.network.name) or 'network'}: explorer"
@@ -331,7 +331,7 @@ class NetworkView:
 
 
 def _selection() -> Section:
-    """The place of what is clicked."""
+    """The place for the clicked item."""
     parts = [
         paragraph("Click a point, a station, a ray, or an image point in a photograph: its "
                   "observations with σ a priori, redundancy number r, w, τ, the minimal detectable "
@@ -346,7 +346,7 @@ def _unit(v):
 
 
 def _ratio(before, after):
-    """Of the means of σ² of points."""
+    """Ratio of the means of σ² of points."""
     a, b = (np.sqrt(np.mean(s**2, 1)) for s in (before, after))
     return np.where((a > 0) & (b > 0), b / np.where(a > 0, a, 1.0), 1.0)
 

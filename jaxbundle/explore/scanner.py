@@ -75,7 +75,7 @@ from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
 from jaxbundle.report.page.markup import figure, grid, paragraph
 
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
-"""Where an angle stands in an attitude error: about right (pitch), forward (roll), up (yaw)."""
+"""The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
 PLACES = 7, 6
 """Lines and pixels of the error map."""
 EDGE = 9
@@ -421,7 +421,7 @@ def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:
 
 
 def _in_pieces(chosen: Chosen) -> Chosen:
-    """With images whose interpolation is data of the same programs."""
+    """The same with trajectories in pieces: their interpolation is data of the same programs."""
     image, truth = (
         eqx.tree_at(lambda i: i.trajectory, image, _pieces(image.trajectory))
         for image in (chosen.image, chosen.truth)

@@ -28,7 +28,7 @@ from jaxbundle.report.page import write
 
 HOST = "127.0.0.1"
 MOST_BYTES = 256 * 1024
-"""Of the body of a request."""
+"""Maximum bytes of the body of a request."""
 MOST_READ = 16 * MOST_BYTES
 PATIENCE = 30.0
 """Timeout for the announced body of a request, seconds."""
@@ -36,7 +36,7 @@ HTML, JSON = "text/html; charset=utf-8", "application/json"
 
 
 class Refused(Exception):
-    """A request that is not answered: its status, and why."""
+    """A refused request: status and reason."""
 
     def __init__(self, status: HTTPStatus, why: str):
         super().__init__(why)
@@ -84,11 +84,11 @@ class Handler(BaseHTTPRequestHandler):
         self._respond(self._get, b"")
 
     def do_POST(self) -> None:
-        """What follows from values, or a file made of them."""
+        """The answer to values, or a file made from them."""
         length = self.headers.get("Content-Length", "")
         known = length.isascii() and length.isdigit() and len(length) < 10
-        # Read before it is answered, or the browser would lose the answer; of too much enough to
-        # see that it is.
+        # Read before it is answered, or the browser would lose the answer; of an oversized one only
+        # enough to detect that.
         body = self.rfile.read(min(int(length), MOST_READ)) if known else None
         self._respond(self._post, body)
 
@@ -148,7 +148,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def respond(view: View, action: str, given: Given) -> File:
-    """What a view says to the values of its page: `answer`, `save`, or `export/NAME`.
+    """The reply of a view to the values of its page: `answer`, `save`, or `export/NAME`.
 
     **Raises:** `Refused` for anything else, and what the view raises."""
     if action == "answer":

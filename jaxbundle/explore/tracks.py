@@ -20,7 +20,7 @@ LABELS = {
     "altitude": ("altitude of the track", "m"), "speed": ("speed over ground", "m/s"),
     "heading": ("heading, clockwise from y", "°"),
 }  # fmt: skip
-"""What an orbit, or a straight track, is chosen by: label and unit."""
+"""The parameters of an orbit and of a straight track: label and unit."""
 USUAL = {"height": 500e3, "inclination": 97.4, "node": 0.0, "argument": 0.0}
 
 
@@ -56,7 +56,7 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
 
 
 def track_controls(tracks: Tracks) -> list[Number]:
-    """The numbers of both."""
+    """The parameters of both tracks."""
     return [
         Number(name, LABELS[name][0], value, LABELS[name][1])
         for values in tracks.known.values()

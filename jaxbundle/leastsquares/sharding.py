@@ -56,7 +56,7 @@ class Shards:
 
 @contextmanager
 def use_own_devices() -> Iterator[None]:
-    """Problems solved inside are those of this process only: its own devices share them."""
+    """Problems solved in this context belong to this process only: its own devices share them."""
     before = _ALONE.set(True)
     try:
         yield

@@ -93,7 +93,7 @@ def image_points(
     moving: bool = False,
 ) -> Kind:  # fmt: skip
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
-    "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: of
+    "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
     cameras with a rolling shutter."""
     between = (VELOCITIES, READ_OUT) if moving else ()
     of = (*poses, *between, camera, "point")

@@ -31,7 +31,8 @@ class State:
 
     @cached_property
     def smallest_redundancy(self) -> float:
-        """Of an image coordinate; NaN if the network cannot be adjusted."""
+        """The smallest redundancy number of an image coordinate; NaN if the network cannot be
+        adjusted."""
         problem = problem_of(self.exact)
         return np.nan if problem is None else smallest_redundancy(problem)
 

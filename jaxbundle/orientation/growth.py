@@ -27,8 +27,8 @@ images."""
 DRIFTS, LARGER = 30, 2.5
 """Number of images for the first improvement of a model, and its growth factor until the next."""
 PARALLEL, FAR_AWAY = 2e-3, 2e3
-"""Radians between the rays of a point that is far away and their middle; and how far, in radii of
-the places of the images."""
+"""Maximum angle, radians, between the rays of a distant point and their mean; and its distance, in
+radii of the positions of the images."""
 AGREEING_SHARE = 0.4
 """Minimum fraction of consistent points of an image or a pair."""
 

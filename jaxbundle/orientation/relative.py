@@ -133,13 +133,13 @@ def distances_along_rays(
 
 
 def _rays(xy1, xy2):
-    """Of one point in two images, as scalars: over 1500 models of 64 points a twelfth of the time
-    of products of small matrices."""
+    """The rays of one point in two images, as scalars: over 1500 models of 64 points a twelfth of
+    the time of products of small matrices."""
     return (*xy1, -1.0), (*xy2, -1.0)
 
 
 def _refine_best(M, b, data, p):
-    """Of the candidates the best few refined, of these the best, and its score."""
+    """The best few candidates refined; of these the best, and its score."""
     xy1, xy2, _ = data
 
     def score(pair, square):

@@ -313,6 +313,6 @@ def _finite(e):
 
 
 def _median(e, present):
-    """Of those present, the upper one of two."""
+    """The median of those present, the upper one of two."""
     ordered = jnp.sort(jnp.where(present, e, jnp.inf))
     return ordered[jnp.minimum(jnp.sum(present) // 2, e.shape[0] - 1)]

@@ -71,6 +71,6 @@ def _control(points: int, every: int | None) -> list[int]:
 
 
 def _odd(steps: float) -> int:
-    """An odd number of points for at least so many steps."""
+    """An odd number of points for at least this many steps."""
     n = max(FEWEST_ROWS, math.ceil(steps - 1e-9) + 1)
     return n + (n + 1) % 2

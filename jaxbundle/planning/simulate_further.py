@@ -19,7 +19,7 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
 
 MOST_ROUNDS, SETTLED = 50, 1e-13
-"""Of the search for the line of an image point, and the change that ends it, relative to the
+"""Rounds of the search for the line of an image point, and the change that ends it, relative to the
 largest image coordinate."""
 
 

@@ -27,7 +27,7 @@ FIGURES = ("plan.png", "perspective.png", "histogram.png",
            "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
 """Patterns of the names of the figures of a result."""
 PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
-"""Those of the pairs of photographs, and of the tracks in them."""
+"""Patterns of the figures of pairs of photographs, and of the tracks in them."""
 
 
 def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:

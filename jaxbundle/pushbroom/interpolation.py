@@ -35,7 +35,7 @@ from jaxbundle.types import AnyArray, Scalar
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
 LEAST_DEGREE = 3
-"""Of a piece, for the cubic ones."""
+"""Minimum degree of a piece, for the cubic methods."""
 
 
 class Table(eqx.Module):

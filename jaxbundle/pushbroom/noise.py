@@ -54,7 +54,7 @@ class Errors(NamedTuple):
 
 
 def zero_errors(image: PushbroomImage) -> Errors:
-    """Errors of zero."""
+    """Errors that are all zero."""
     rows = [len(t.times) for t in (image.trajectory.attitude.table, image.trajectory.position)]
     shapes = [(3,), (3,), (rows[0], 3), (3,), (3,), (rows[1], 3)]
     return Errors(*(jnp.zeros(shape) for shape in shapes))

@@ -45,7 +45,7 @@ TO_HALVES = np.array([
     [[comb(k, j) * side ** (k - j) / 2**k for k in range(DEGREE + 1)] for j in range(DEGREE + 1)]
     for side in (-1.0, 1.0)
 ])  # fmt: skip
-"""Of a polynomial in τ: with τ = (τ' ∓ 1)/2, its coefficients in τ' from −1 to 1."""
+"""From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 
 class Pieces(eqx.Module):

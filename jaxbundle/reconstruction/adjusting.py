@@ -33,8 +33,8 @@ SMALLEST, LARGEST = 0.3, 8.0
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 400
-"""Of one adjustment. Photographs with the same viewing direction determine the principal distance
-of an unknown camera only weakly, and the search then needs more than a hundred."""
+"""Iterations of one adjustment. Photographs with the same viewing direction determine the principal
+distance of an unknown camera only weakly, and the search then needs more than a hundred."""
 
 
 @dataclasses.dataclass(frozen=True)

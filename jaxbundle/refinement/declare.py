@@ -54,7 +54,7 @@ class Given:
 
     @property
     def ids(self) -> list[str]:
-        """Of all images, photographs after scanner images."""
+        """The ids of all images, photographs after scanner images."""
         frames = () if self.frames is None else self.frames.images.id
         return [*(one.id for one in self.images), *frames]
 
@@ -137,7 +137,7 @@ class Declared:
 
     @property
     def number_of_rays(self) -> Int[np.ndarray, " points"]:
-        """Of the points used."""
+        """The number of rays of each point used."""
         points = np.concatenate([part.point for part in self.parts])
         return np.bincount(points, minlength=len(self.rays.points))
 

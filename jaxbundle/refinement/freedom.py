@@ -205,7 +205,7 @@ def change_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
 
 
 def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
-    """Of the detector line, in pixels."""
+    """Middle and half length of the detector line, in pixels."""
     return (image.pixels - 1) / 2, image.pixels / 2
 
 

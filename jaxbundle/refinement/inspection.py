@@ -70,7 +70,7 @@ class Inspection:
 
     @functools.cached_property
     def shared(self) -> Shared:
-        """Where the shared unknowns are."""
+        """The location of the shared unknowns."""
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
@@ -85,7 +85,7 @@ class Inspection:
 
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
-        """Of the shared unknowns."""
+        """Cofactors of the shared unknowns."""
         return self.solution.propagate(self.shared)
 
     @property
@@ -95,7 +95,7 @@ class Inspection:
 
     @property
     def point_cofactor(self) -> Float[np.ndarray, "points 3 3"]:
-        """Of the points along their axes."""
+        """Cofactors of the points along their axes."""
         return self.solution.cofactor("point")
 
     @property

@@ -90,7 +90,7 @@ def _attitude(image, form, change) -> Attitude:
         half = rotations[left] @ _pad(_exponentials, turn / 2)
         wrong = np.linalg.norm(_turns(half, there), axis=1) > TOLERANCE
         wrong &= ~np.isin(times[left + 1], gaps)
-        # both halves of what was split are looked at again
+        # both halves of a split interval are checked again
         order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
         split = np.zeros(len(times) - 1, bool)
         split[left[wrong]] = True

@@ -47,7 +47,7 @@ WEAK, FEW = 0.05, 0.02
 """σ of a disparity, pixels, above which the texture is weak; the share of weak pixels below which
 no larger windows are tried."""
 MOST_RATIO = 5.0
-"""Of the contrasts of two windows that may be alike."""
+"""Maximum ratio of the contrasts of two windows that may be alike."""
 ROUNDS = 2
 BAND, MARGIN = 128, 32
 """Rows refined together, and rows above and below covered by their windows."""
@@ -57,11 +57,10 @@ which is a change of disparities by more than `JUMP`. Found on rendered roofs.""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
 """Pixels of a block for the scatter; the quantile of the blocks used."""
 COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
-"""At a resolution so much coarser, windows of half this side are compared with others of the image
-itself; their correlation from which a texture repeats itself; the part of the image which a surface
-of such a texture must have."""
+"""Reduction factor; half the side of windows compared with others of the same image; correlation
+from which the texture repeats itself; minimum part of the image for a surface of such a texture."""
 SURFACE_TOLERANCE = 0.7
-"""Pixels: by so much disparities of one surface differ within a window, about."""
+"""Approximate difference of disparities of one surface within a window, pixels."""
 MOST_CHANGE = 1.0
 """Maximum change of a disparity by least squares, pixels."""
 LEAST_CORRELATION, SURE = 0.5, 0.9
@@ -70,8 +69,8 @@ LEAST_SIGMA, MOST_SIGMA = 0.008, 0.5
 """σ of a disparity, pixels: added by interpolation and sampling, and the limit above which the
 texture does not determine it."""
 INNER, SIGNIFICANT = 2, 3.0
-"""By how much the window is larger than its middle, which must have texture of its own: more than
-the variance of noise by so many σ of it; else a window tells of what is beside its pixel."""
+"""Margin of the window around its middle, which must have texture of its own: variance above that
+of noise by this many σ. Otherwise the window shows the surroundings of its pixel."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
 
@@ -298,7 +297,7 @@ def _solve(left, warped, half) -> _Solved:
 
 
 def _variance(a, half):
-    """Of the grey values of windows."""
+    """Variance of the grey values of windows."""
     cv2 = need_opencv()
     side = (2 * half + 1, 2 * half + 1)
     mean = lambda x: cv2.boxFilter(x, cv2.CV_64F, side, borderType=cv2.BORDER_REFLECT_101)
@@ -320,7 +319,8 @@ def _invert_normal(N, g, textured):
 
 
 def _gradient(a, axis):
-    """Of the cubic spline through the pixels' neighbours (fourth order central difference)."""
+    """Derivative of the cubic spline through the pixels' neighbours (fourth order central
+    difference)."""
     kernel = np.array([1, -8, 0, 8, -1], np.float32) / 12
     return ndimage.correlate1d(a, kernel, axis=axis, mode="nearest")
 

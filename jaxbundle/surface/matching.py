@@ -47,7 +47,7 @@ BLOCK_SIDE, SMOOTH = 16, 0.45
 """Points per side of a block for the scatter; the quantile of the blocks used, in
 the smoother direction."""
 SIGNIFICANCE = 1e-3
-"""Of the test of a point's residuals."""
+"""Level of the test of a point's residuals."""
 
 
 @dataclasses.dataclass(frozen=True)

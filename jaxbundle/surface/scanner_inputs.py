@@ -216,7 +216,7 @@ def _raster_of(path: Path, folder: Path | None) -> Path:
 
 
 def _middle(orientation) -> Neighbourhood:
-    """Of the first image."""
+    """The neighbourhood of the middle of the first image."""
     if isinstance(orientation, Rpc):
         return neighbourhood(np.radians(float(orientation.longitude_offset)),
                              np.radians(float(orientation.latitude_offset)))  # fmt: skip

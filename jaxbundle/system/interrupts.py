@@ -25,7 +25,7 @@ GRACE = 0.3
 """Seconds for the main thread to handle a signal."""
 
 PATIENCE = 10.0
-"""Seconds to finish unbroken blocks; a hanging disk delays the exit no longer."""
+"""Seconds to finish a block of `defer_interrupts`; a hanging disk delays the exit no longer."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":

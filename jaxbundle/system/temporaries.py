@@ -15,7 +15,7 @@ _temporaries: dict[str, bool] = {}
 _caches: set[str] = set()
 _lock = threading.RLock()
 _inside: list[int] = []
-"""The thread in blocks `defer_interrupts`, once for each of them."""
+"""The thread inside `defer_interrupts`, once per nested block."""
 _put_off: list[Callable[[], None]] = []
 
 
@@ -51,8 +51,8 @@ def defer_interrupts() -> Iterator[None]:
 
 
 def defer(action: Callable[[], None]) -> bool:
-    """Whether this thread is in a block `defer_interrupts`; then the action is called at its
-    end."""
+    """Whether this thread is inside `defer_interrupts`; then the action is called at the end of the
+    block."""
     if threading.get_ident() not in _inside:
         return False
     _put_off.append(action)

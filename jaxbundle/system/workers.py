@@ -1,7 +1,7 @@
-"""Tasks done by processes of their own: what one of them dies of spoils its task alone.
+"""Tasks in separate processes: a crash affects only its own task.
 
 A process is a fresh interpreter that is handed a task at a time through a pipe. It ends when the
-pipe is closed, and so with the process that started it, however that ends.
+pipe is closed, and hence with the process that started it, however that ends.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ class Failed:
 
 
 class Workers:
-    """So many processes at most, started when they are needed, that call one function; a context.
+    """At most this many processes, started on demand, that call one function; a context.
 
     `function` is importable; it, its tasks and results are pickled.
     """
@@ -46,7 +46,7 @@ class Workers:
         self._idle, self._busy = [], {}
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Every task with its result or `Failed`, as they come to an end."""
+        """Every task with its result or `Failed`, in the order of completion."""
         left = list(tasks)[::-1]
         while left or self._busy:
             while left and len(self._busy) < self._number:
@@ -83,7 +83,7 @@ def _ended(process) -> str:
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
-    """The life of a process: Ctrl-C is for the one that started it."""
+    """The loop of a process; Ctrl-C is handled by the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
@@ -94,4 +94,4 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
                 result = Failed(f"{type(error).__name__}: {error}")
             connection.send(result)
     except (EOFError, OSError):
-        os._exit(0)  # nobody is there any more
+        os._exit(0)  # the parent process is gone

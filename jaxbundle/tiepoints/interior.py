@@ -36,8 +36,8 @@ distortion is not yet known."""
 ROUNDS, STEPS = 4, 8
 USUAL, DOUBT = 1.0, 0.06
 """The usual principal distance relative to the longer side, and the relative reduction of the sum
-required to accept one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2
-times as much."""
+required to accept one that differs by a factor of e; for another factor x·(1 + x)/2 times as much,
+x = |ln| of it."""
 WIDE_ANGLE = 0.12
 """Angle of intersection, radians, above which wider angles are not better."""
 FARTHEST = 0.35

@@ -14,7 +14,7 @@ ALL_PAIRS_UP_TO = 60
 NEXT = 5
 """Neighbours of a photograph on each side in a sequence."""
 NEIGHBOURS = 20
-"""Neighbours of a photograph, by position or by similarity."""
+"""Number of neighbours of a photograph, by position or by similarity."""
 FEWEST_MATCHES = 4
 """Minimum matches of the largest features for a candidate pair."""
 

@@ -27,7 +27,7 @@ WIDEST_SHARE = 0.6
 """Pairs that determine the principal distance: those with at least this part of the largest number
 of matches, and others with fewer, which have longer bases."""
 MOST_ALIKE = 5
-"""Of the former."""
+"""Minimum number of the former."""
 OF_THE_LENS = ("fx", "fy", "k1")
 OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
 """Other principal distances to try, relative to the longer side, unless they differ by less

@@ -145,4 +145,4 @@ FORMULAS = {
     "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, FISHEYE_PARAMS),
     "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, FISHEYE_PARAMS),
 }  # fmt: skip
-"""Of a kind its formula, the number of its Etats, the number of its Params."""
+"""By kind: the formula, the number of Etats, the number of Params."""

@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.types import present
 
 ROWS_AT_ONCE = 1 << 16
-"""Observations whose derivatives are looked at together where they are many."""
+"""Observations differentiated together, if there are many."""
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
@@ -102,8 +102,8 @@ def differentiate_chunks(
     declared: Declared, plan: Plan, number: int, prepared, laid: Laid, of_chunk
 ):
     """`of_chunk(part, r, touches, E)` of every chunk of a part, [length, …] each, some chunks at a
-    time, so that derivatives of all of it (2 000 000 rows) are never there at once. The incidences
-    of the touches are always numbered."""
+    time, so that derivatives of all of it (2 000 000 rows) are never in memory at once. The
+    incidences of the touches are always numbered."""
     part = plan.parts[number]
     chunks, length = part.source.shape
     in_order = jnp.arange(chunks * length).reshape(chunks, length)

@@ -44,7 +44,7 @@ class LocalJacobian:
 
 
 def local_touch(declared: Declared, part: Part) -> int | None:
-    """Which touch of a part is of few of many columns; None: none is."""
+    """The touch of a part that uses few of many columns; None if there is none."""
     kind = declared.kinds[part.observations]
     if kind.local is None or not part.large:
         return None
@@ -139,7 +139,7 @@ def products_of(
         products = jnp.einsum("kri,krj->kij", J, J)
         return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
 
-    nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # of the devices that J is of
+    nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # varying over the devices like J
     return jax.lax.scan(add, nothing, (row, J, columns))[0]
 
 

@@ -56,7 +56,7 @@ class _LaidPart:
 
 @dataclasses.dataclass
 class _LaidIncidences:
-    """Incidences of a group in their chunks; of those that are one: place, both rows."""
+    """Incidences of a group in their chunks; for each incidence: place, both rows."""
 
     incidences: Incidences
     live: Int[np.ndarray, " n"]

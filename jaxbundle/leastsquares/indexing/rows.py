@@ -99,7 +99,7 @@ class Residual:
 
     def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
         """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
-        of columns, as scalars of which XLA compiles for minutes."""
+        of columns, which XLA would compile for minutes as scalars."""
         moved = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
@@ -116,7 +116,7 @@ class Residual:
         return jnp.where(w > 0, w * v, 0.0)
 
     def is_wide(self, weight) -> bool:
-        """Whether `array` is the way: the kind is one of arrays, with a weight for each."""
+        """Whether to use `array`: the kind works on arrays and has a weight per residual."""
         many = len(weight) > MOST_RESIDUALS
         return not self.kind.scalars and many and not isinstance(weight[0], tuple)
 

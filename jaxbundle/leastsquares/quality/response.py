@@ -127,12 +127,12 @@ def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: 
 
 @eqx.filter_jit
 def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
-    """By measurement, by residual, and the residual of the equations."""
+    """Derivatives by measurements and by residuals, and the residual of the equations."""
     at = Linearised(declared, plan, values, data, factor, {})
     still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
     def changes(change):
-        """Of all tables."""
+        """The changes of all tables."""
         moved = _in_datum(at, change, data.start)
         of = lambda name, space: jax.vmap(space.difference)(moved[name], values[name])
         return {name: of(name, space) for name, space in declared.named_spaces}

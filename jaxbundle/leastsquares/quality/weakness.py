@@ -36,7 +36,7 @@ NONLINEAR_RATIO = 10.0
 """A row whose σ is above a tenth of its extent: errors of the second order in it are as large as
 those that least squares propagate."""
 DIRECTIONS, ROUNDS = 6, 8
-"""Of the subspace iteration: directions looked for, products with A."""
+"""Numbers of directions and of products with A of the subspace iteration."""
 SMALL_SYSTEM = 1000
 """Reduced systems with fewer unknowns have their cofactors computed for this."""
 
@@ -57,7 +57,7 @@ class Weak:
 
 
 def find_weak(found: Solution, extents: Extents, sigma0: float) -> Weak:
-    """The weak directions of a solution; none are looked for where there is no factor."""
+    """The weak directions of a solution; none without a factor."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
     at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL_SYSTEM
