@@ -140,7 +140,7 @@ def make_problem(
     also: Sequence[Table | Observations] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> Problem:
-    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
+    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check.check_network`).
 
     Check points and their rays are excluded.
 

@@ -98,7 +98,7 @@ def calibrate_rigs(
     - `sigma_image`: a priori σ of an image coordinate, pixels; it matters beside the priors of
       velocities and splines, whose σ are multiplied by σ0 as all others.
     - `snooping`: `"pope"`: exclude epochs that contradict the mounting, then blunders, rig by rig.
-    - `progress(part)`: so much is done.
+    - `progress(part)`: the fraction done.
 
     **Returns:** a `RigBatch`; check `status` first.
 

@@ -239,10 +239,10 @@ def _ranks(values: np.ndarray) -> np.ndarray:
 
 def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.ndarray]:
     """The columns of a table (numbers, or dates as 2026-05-01: days) for these keys, by its column
-    `id`: the key of an input, or of a camera what stands after # in it.
+    `id`: the key of an input, or of a camera its part after #.
 
-    **Raises:** `InputError` for a table without `id`, or without another column, for an id twice,
-    for what is neither number nor date, and where no key is in it."""
+    **Raises:** `InputError` for a table without `id`, or without another column, for a repeated id,
+    a cell that is neither number nor date, and no matching key."""
     given: Columns = as_columns(table, name)
     others = [column for column in given.values if column != ID]
     if ID not in given.values or not others:

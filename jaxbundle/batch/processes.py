@@ -2,10 +2,10 @@
 that see the same folder.
 
 JAX tells every process its number, and ends all of them when one is lost. Each computes its part of
-the inputs (`run_batch`) into a file of its own beside that of the results; the first adds the parts
-to the results, in the order of the inputs, and removes them. Parts of a run that was ended are
-added by the next one, whatever the number of its processes. The processes wait for each other by
-files, since a collective waits for half a minute only.
+the inputs (`run_batch`) into its own file beside that of the results; the first adds the parts to
+the results, in the order of the inputs, and removes them. Parts of a run that was ended are added
+by the next one, whatever the number of its processes. The processes wait for each other through
+files, since a collective waits only half a minute.
 """
 
 import glob

@@ -64,7 +64,7 @@ def run_batch(
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
     - `board`: the board in the photographs; every folder without a network is then one of
       photographs of one camera. Found corners are stored in `FILE.corners` beside the file.
-    - `rig`: such a folder has a folder for every camera of a rig; photographs of one moment have
+    - `rig`: such a folder has a folder for every camera of a rig; simultaneous photographs have
       equal names or last numbers.
     - `pixel_size`: mm, for a model in mm.
     - `settings`: KEY=VALUE, of a project as with `jaxbundle adjust`; of cameras and rigs

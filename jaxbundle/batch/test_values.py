@@ -1,7 +1,7 @@
 """Test values of the image points of one camera of a batch, as data snooping needs them.
 
-    |v|/√(1 − h)    a point that took part, 1 − h its redundancy number
-    |v|/√(1 + h)    one that did not: its predicted residual
+    |v|/√(1 − h)    an included point, 1 − h its redundancy number
+    |v|/√(1 + h)    an excluded one: its predicted residual
 
 with the leverage h = a·Q·aᵀ, for the rows a = [aₑ aᵢ] of x and of y, the larger of the two. With
 the factor of the normal equations, N = L·Lᵀ in the order views, interior orientation,

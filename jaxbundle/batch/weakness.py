@@ -1,10 +1,10 @@
 """What the views of a camera do not determine: parameters that a status alone does not name.
 
 A singular camera has directions of its interior orientation in which the normal equations, scaled
-by their diagonal before the elimination of the views, vanish; the parameters that have part in them
-are named. Where the equations can be solved all the same, by the noise of the measurements, what
-comes out says so by its σ: views of a board all parallel to the image determine neither principal
-distance nor distances, and the σ of fx is as large as fx.
+by their diagonal before the elimination of the views, vanish; the parameters involved are named. If
+the noise of the measurements makes the equations solvable, the σ of the result show it: views of a
+board all parallel to the image determine neither principal distance nor distances, and the σ of fx
+is as large as fx.
 """
 
 import numpy as np

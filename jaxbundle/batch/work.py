@@ -48,9 +48,9 @@ Tell = Callable[[float], None]
 class Work:
     """The work for an input, or for all folders of photographs.
 
-    **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`,
-    the rows of some, from their numbers, telling what part of them is done; `made_of`: what the
-    fingerprint is of, in words; `portion`: the most that are computed between two writes.
+    **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`
+    computes the rows of some inputs by number and reports the fraction done; `made_of`: the
+    fingerprinted data in words; `portion`: maximum number computed between two writes.
     """
 
     keys: tuple[str, ...]

@@ -87,8 +87,8 @@ def adjust(
     - `reduction`: solver of the reduced system of images and cameras: `"dense"`, `"banded"` or
       `"iterative"`; by default chosen by size and fill.
     - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly are downweighted by
-      the a posteriori scale of the residuals (`jaxbundle.statistics.robust_scale`, a MAD). The
-      result uses the last weights; its σ are a few per cent too small.
+      the a posteriori scale of the residuals (`leastsquares.quality.robust.robust_scale`, a MAD).
+      The result uses the last weights; its σ are a few per cent too small.
     - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: for `"pope"`
       the probability of removing anything from a network without blunders, for `"baarda"` that of
       removing a single observation; also the probability that `robust` suspects anything. If

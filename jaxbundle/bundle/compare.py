@@ -1,4 +1,4 @@
-r"""`compare`: what two adjustments have in common, and which of it differs by more than its σ.
+r"""`compare`: the common unknowns of two adjustments, and those that differ significantly.
 
 The unknowns x of the same names are brought into one datum and subtracted,
 
@@ -169,14 +169,14 @@ def compare(
     **Arguments:**
 
     - `similarity`: whether coordinates are compared after a similarity (of seven parameters, or six
-      where both networks have a scale of their own). If not given: where observations of one of
-      them leave its datum open.
-    - `held_by`: ids of the points it is found on, such as those that are known to be stable; if not
-      given all that both have.
+      if both networks have their own scale). Default: if the observations of one of them leave its
+      datum open.
+    - `held_by`: ids of the points it is found on, such as those known to be stable; default: all
+      common points.
     - `significance`: the probability that any row is called different by chance.
 
-    **Raises:** `InputError` where they have nothing in common, other units, or too few points for a
-    similarity; `NotSolvedError` where one has no result.
+    **Raises:** `InputError` if they have nothing in common, different units, or too few points for
+    a similarity; `NotSolvedError` if one has no result.
     """
     for name, one in (("a", a), ("b", b)):
         if not isinstance(one, Adjustment):

@@ -38,7 +38,7 @@ def load_adjustment(
 
     **Returns:** an `Adjustment` with everything that the saved one has, every covariance included.
 
-    **Raises:** `InputError` for a file that is none, and where `models` or `also` are missing;
+    **Raises:** `InputError` for another kind of file, and if `models` or `also` are missing;
     `RuntimeError` without 64-bit floats.
     """
     given_path("path", path)

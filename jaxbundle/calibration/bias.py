@@ -22,8 +22,8 @@ all t), Ω' with r'. Without a bias
     F = ((Ω − Ω')/(r − r')) / (Ω'/r')   ~   F(r − r', r')
 
 **Smooth biases.** The cell test has little power because it is unspecific. Two more tests add a
-smooth field with q free coefficients b to the calibration (`linearised.lagrange_multipliers`, no
-second adjustment),
+smooth field with q free coefficients b to the calibration
+(`observation_equations.lagrange_multipliers`, no second adjustment),
 
     F = (bᵀSb/q) / ((Ω − bᵀSb)/(r − q))   ~   F(q, r − q)
 

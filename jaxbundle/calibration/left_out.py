@@ -1,10 +1,10 @@
 r"""Test for a missing affinity of the camera model.
 
-`brown` and `brown-projected` have one principal distance; non-square pixels and shear
-are modelled by b1 and b2, which are not estimated by default. Whether the residuals v
-(over their σ) require them is tested by one step from the adjusted values, with all other unknowns
-adapting, S·b = −Bᵀ·v (`linearised.lagrange_multipliers`); the cofactors of b are S⁻¹. This is the
-score (Lagrange multiplier) test: no second adjustment is needed.
+`brown` and `brown-projected` have one principal distance; non-square pixels and shear are modelled
+by b1 and b2, which are not estimated by default. Whether the residuals v (over their σ) require
+them is tested by one step from the adjusted values, with all other unknowns adapting, S·b = −Bᵀ·v
+(`observation_equations.lagrange_multipliers`); the cofactors of b are S⁻¹. This is the score
+(Lagrange multiplier) test: no second adjustment is needed.
 """
 
 import dataclasses

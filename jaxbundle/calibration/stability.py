@@ -19,7 +19,7 @@ below a tenth (a shift of the principal point is nearly a rotation) are excluded
 **Between epochs.** For each parameter τ², a variance on top of its σᵢ², by Paule and Mandel:
 Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. Against a temperature or a date the
 same with a straight line a + b·xᵢ in place of m, and n − 2: its slope b has its own τ, about the
-line, for a trend is no scatter. In the image, rotation removed, the
+line, since a trend is not scatter. In the image, rotation removed, the
 variance between epochs is that of the differences less what is expected by chance,
 
     Σ (pᵢ − p̄ₐ)ᵀ·H·(pᵢ − p̄ₐ)/(n − 1) − mean of tr(H·Cᵢ),        p̄ₐ the arithmetic mean
@@ -70,8 +70,8 @@ class Stability:
     `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
     `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
     over the image of an epoch against the mean, pixels; `at`, `slope`, `slope_sigma`,
-    `slope_probability` (of as large a slope by chance), `about_slope` (τ about the line): with what
-    the epochs were at (temperatures), else None."""
+    `slope_probability` (of as large a slope by chance), `about_slope` (τ about the line): if
+    numbers of the epochs (temperatures) are given, else None."""
 
     names: tuple[str, ...]
     values: Float[np.ndarray, "epochs k"]

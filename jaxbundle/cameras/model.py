@@ -160,7 +160,7 @@ class CameraModel:
 
     @property
     def core(self) -> tuple[str, ...]:
-        """Principal distance and principal point: what is no additional parameter."""
+        """Principal distance and principal point: the parameters that are not additional ones."""
         return (*self.principal_distance, *self.principal_point)
 
     def __str__(self) -> str:

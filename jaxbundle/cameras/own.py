@@ -77,8 +77,8 @@ def _check_form(model: CameraModel) -> None:
 
 @partial(jax.jit, static_argnums=0)
 def _near_the_axis(model: CameraModel, p):
-    """Image of the axis, derivative of the formula there, and by how much a point near it misses
-    itself through formula and inverse."""
+    """Image of the axis, derivative of the formula there, and the error of a point near it after
+    formula and inverse."""
     p = tuple(p)
     zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
     size = p[model.parameters.index(model.principal_distance[0])]

@@ -2,8 +2,8 @@
 
     show(NetworkView(result))
 
-The page is in a frame; requests of its controls go through the notebook to the view in this
-process, and answers back. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
+The page is in a frame; requests of its controls and the answers pass through the notebook to and
+from the view in this process. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
 """
 
 import functools

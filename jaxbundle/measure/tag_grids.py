@@ -1,9 +1,9 @@
 """Grids of AprilTags as Kalibr prints them: tag 0 at the lower left, numbers to the right and then
 up, black squares in the gaps between the corners of tags, borders of two bits.
 
-Tags are found and read by OpenCV. Which corner of a tag is which follows from the place of the tag
-among the others (a homography of all of them), not from how the tag itself is turned. Grids
-numbered from the upper left, and borders of one bit, are recognised.
+Tags are found and read by OpenCV. The corners of a tag are identified by its position among the
+others (a homography of all of them), not by its own orientation. Grids numbered from the upper
+left, and borders of one bit, are recognised.
 
 Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
 """

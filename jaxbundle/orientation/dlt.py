@@ -12,9 +12,9 @@ P by the singular value decomposition of the normalised equations (Hartley, 1997
     K = ⎢    fy y0⎥        x = x0 − fx·r/q − s·s/q,  y = y0 − fy·s/q  (r, s, q in the camera frame)
         ⎣        1⎦
 
-by making the rows of P's left part perpendicular from the last to the first. Refined, the
-misclosures of the collinearity equations are least, if asked with radial distortion as a
-correction of the measured coordinates, (x̄, ȳ)·(1 + K1·r² + K2·r⁴ + …).
+by making the rows of P's left part perpendicular from the last to the first. Refinement minimises
+the misclosures of the collinearity equations, optionally with radial distortion as a correction of
+the measured coordinates, (x̄, ȳ)·(1 + K1·r² + K2·r⁴ + …).
 """
 
 import equinox as eqx

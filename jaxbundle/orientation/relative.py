@@ -1,9 +1,9 @@
 """Relative orientation of two images by coplanarity, without start values.
 
 The first camera is the frame: M₁ = I, X0₁ = 0; the second has the rotation M from the first and its
-centre at the base b, |b| = 1. Essential matrices in closed form (`essential`) give candidates of
-which that is taken whose points are in front of both cameras with the least vᵀPv. It is refined on
-the five-parameter manifold with the misclosures of coplanarity as lengths in the image,
+centre at the base b, |b| = 1. Essential matrices in closed form (`essential`) give candidates; the
+one with the points in front of both cameras and the least vᵀPv is taken, and refined on the
+five-parameter manifold with the misclosures of coplanarity as lengths in the image,
 
     v = a₂ᵀ·E·a₁/√(|(E·a₁)ₓᵧ|² + |(Eᵀ·a₂)ₓᵧ|²),        E = M·[b]×,        Σ p·v² = min
 

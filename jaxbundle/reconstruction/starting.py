@@ -2,7 +2,8 @@
 
 1. With the cameras from consistent pairs of photographs: misclosures above `START_TOLERANCE` of the
    image are contradictions. If photographs are left out, the limit is that of an unknown lens.
-2. With other principal distances, unless the file gives one; those that explain most come first.
+2. With other principal distances, unless the file gives one; those that explain the most matches
+come first.
 
 In both cases, left out photographs are tried again with the adjusted cameras.
 """

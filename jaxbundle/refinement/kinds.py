@@ -100,8 +100,8 @@ class Row(Vector):
 
 class Line(NamedTuple):
     """What belongs to a measured line and pixel: the pose that the tables give, seconds from the
-    middle line, offsets, mounting and axes F of the image; how much of every unknown of the spline
-    is in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
+    middle line, offsets, mounting and axes F of the image; the coefficient of every unknown of the
+    spline in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
 
     pose: Pose
     dt: Scalar

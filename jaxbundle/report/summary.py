@@ -24,7 +24,7 @@ MOST_CAMERAS, MOST_PARAMETERS = 3, 20
 
 
 def one_line(adjustment) -> str:
-    """What `repr` shows."""
+    """The text of `repr`."""
     network = adjustment.network
     name = f"Adjustment {clean(network.name)!r}"
     if not adjustment.converged:

@@ -110,13 +110,13 @@ def precision(
 def redundancy(problem: Problem, data: Data | None = None) -> Rows:
     """The redundancy numbers of a design, differentiable to every order in all of it.
 
-    r = 1 − diag(J·Q·Jᵀ) of every observation: 0, nothing controls it, to 1. Use it as `precision`;
-    nothing is adjusted, and image coordinates are those that the given values have.
+    r = 1 − diag(J·Q·Jᵀ) of every observation: 0 (uncontrolled) to 1. Use it as `precision`;
+    nothing is adjusted, and image coordinates are predicted from the given values.
 
     **Returns:** `Rows`: `image` [rays, 2], `control`, `exterior`, `interior`, `distance` and
     `other` in the order of `Data`; 0 where the weight is 0.
 
-    **Raises:** `InputError` where no factor of the network fits into memory.
+    **Raises:** `InputError` if no factor of the network fits into memory.
     """
     check_given(problem, data)
     problem = problem.with_factor()

@@ -90,7 +90,7 @@ def has_texture(
     """Whether windows have texture on all sides of their points, by the squares of its gradients
     relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof.
 
-    Smoothed noise of variance σ² has σ²/4πs², twice of which are σ0²; central differences of it
+    Smoothed noise of variance σ² has σ²/4πs², twice this is σ0²; central differences of it
     have σ²/2 on each axis.
     """
     k = np.arange(-half - 1, half + 2)

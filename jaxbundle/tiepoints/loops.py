@@ -15,8 +15,8 @@ left out. A pair that alone connects photographs has no loop: it stays, unless i
 and its photographs are already connected: any two photographs of a long row of windows match, even
 distant ones as if they were neighbours, and such pairs are consistent.
 
-A photograph most of whose pairs are left out so shows mostly what moves or repeats itself, and its
-other pairs may do so unnoticed: only those with half the matches of its best pair, or more, stay.
+A photograph with most of its pairs left out shows mostly moving or repeated objects, and its other
+pairs may show them unnoticed: only those with at least half the matches of its best pair stay.
 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """

@@ -58,7 +58,7 @@ SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 OF_A_MESSAGE = b"distortion_model"
-"""Required beside a lone `k` in a message of ROS 2."""
+"""Required in addition to a lone `k` in a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 LENGTHS = (4, 5, 8, 12)
 FISHEYE = ("equidistant", "fisheye")

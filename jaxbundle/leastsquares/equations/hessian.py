@@ -1,7 +1,7 @@
 """The exact Hessian of ½vᵀPv in the blocks of the normal equations.
 
 It differs from JᵀPJ by Σ p·v·∂²v, the curvature of the observation equations and, by
-`Space.moved`, which is right to second order, that of the manifolds. Second derivatives come from
+`Space.move`, which is correct to second order, that of the manifolds. Second derivatives come from
 the function of one observation, forward over reverse, and are summed like those of Gauss–Newton
 (`normal.Sums`).
 """

@@ -2,13 +2,13 @@
 hundreds of knots of a spline camera.
 
 A kind that declares this (`Kind.local`) names, for one observation, the columns its residuals
-depend on at the values as they are, and has its residual as a function of the values in these
+depend on at the current values, and has its residual as a function of the values in these
 columns. J then has their derivatives alone, and products are added to N where they belong:
 
     N[cᵢ, cⱼ] += JᵢᵀJⱼ,    g[cᵢ] += Jᵢᵀr        c the columns of the observation
 
 in place of products of rows that are zero nearly everywhere. Which columns they are may change from
-iteration to iteration; nothing of it is planned.
+iteration to iteration; they are not part of the plan.
 """
 
 import dataclasses

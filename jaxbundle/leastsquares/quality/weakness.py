@@ -1,15 +1,16 @@
 """What observations determine in name only: the weakest directions, in the words of the unknowns.
 
-The σ of an unknown says little by itself; compared with an *extent* e of what it measures it does:
-a place with a distance, an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
+The σ of an unknown means little by itself; it is compared with an *extent* e: that of a position
+with a distance, that of an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
 largest eigenvalues μ of
 
     A = E⁻¹·S·Q·Sᵀ·E⁻¹
 
 belong to the weakest directions, and no σ is larger than σ0·√μ₁ extents. They are found by subspace
-iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the factor
-that exists, never an inverse; where the cofactors are at hand, the σ are read from these. What has
-no extent is not judged. Eliminated rows count by the σ they have where everything else is given.
+iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the
+existing factor, never an inverse; if the cofactors are available, the σ are taken from them.
+Unknowns without an extent are not judged. Eliminated rows are judged by their σ with everything
+else given.
 """
 
 import dataclasses

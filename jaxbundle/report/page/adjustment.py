@@ -41,7 +41,7 @@ class Addition(NamedTuple):
 
 ALONE = Addition()
 BELOW = ("Note", "Redundancy", "σ0", "Image precision", "χ² test")
-"""Lines of the summary that are said again below it."""
+"""Lines of the summary that are repeated below it."""
 
 
 def compose(
