@@ -14,7 +14,7 @@ from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
     inspect_solution,
-    misjudged,
+    is_misjudged,
     name_inseparable,
     names_of_defects,
     start_with,
@@ -144,7 +144,7 @@ class _First:
         """Adjust from the start values of `network`, a part of `given` that may contain
         `outliers`."""
         found = self._minimise(network)
-        while len(network.observations) < len(given.observations) and misjudged(*found[:2]):
+        while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
             # Observations excluded by a wrong principal distance may agree with the adjusted one.
             cameras, fewer = adjusted_cameras(found[0], found[1].values), network
             network = orient_again(given, fewer, cameras)

@@ -374,7 +374,7 @@ def _compare(
     value, variance = lambda x, C: x, lambda x, C: np.diagonal(C)
     x_a, x_b = join(0, value), join(1, value)
     v_a, v_b = (np.clip(join(side, variance), 0, None) for side in (0, 1))
-    shared = _shared(a, b)
+    shared = _count_shared(a, b)
     tests = {}
     if not shared:
         freedom = partial(_freedom, r=(a.redundancy, b.redundancy))
@@ -466,7 +466,7 @@ def _freedom(part: float, r: tuple[int, int]) -> float:
     return 1 / (part**2 / r[0] + (1 - part) ** 2 / r[1])
 
 
-def _shared(a: Adjustment, b: Adjustment) -> int:
+def _count_shared(a: Adjustment, b: Adjustment) -> int:
     """Image points that both adjustments have with the same coordinates."""
 
     def measured(r: Adjustment):

@@ -85,7 +85,7 @@ def minimise_with_infinity(
         start = legs[-1].values
         there = at_infinity(problem, start)
         if there.any():
-            outward = _pulled_outward(problem, start)
+            outward = _are_pulled_outward(problem, start)
             there &= np.where(held, outward | (released >= MOST_RELEASES), outward)
         released += held & ~there
         changed = (there != held).any()
@@ -172,7 +172,7 @@ def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
     return problem.with_free("point", free)
 
 
-def _pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+def _are_pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
     """Whether vᵀPv decreases with the distance of a point."""
     free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
     solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))

@@ -44,7 +44,7 @@ def minimise(problem: Problem, start: Values, **options) -> Minimum[Values]:
 def inspect_solution(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
     """The solution if it converged, no camera collapsed and all unknowns are determined; else
     None."""
-    if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
+    if not bool(converged(int(minimum.termination))) or _find_collapsed(problem, minimum.values):
         return None
     inspection = Inspection(problem, minimum.values)
     return inspection if inspection.determined else None
@@ -54,8 +54,8 @@ def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
     """The undetermined unknowns where the iterations ended; for a large network, where eigenvectors
     take too long, the weak ones if it is singular."""
     values = minimum.values
-    if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
-        return _collapsed(problem, values)
+    if bool(converged(int(minimum.termination))) and _find_collapsed(problem, values):
+        return _find_collapsed(problem, values)
     system = problem.system
     if system.plan.reduction == "dense" and system.reduced_size <= EIGENVECTORS:
         return undetermined(system, problem.layout.tables(_last(problem, minimum)))
@@ -110,7 +110,7 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
     return found
 
 
-def _collapsed(problem: Problem, values: Values) -> list[str]:
+def _find_collapsed(problem: Problem, values: Values) -> list[str]:
     """Principal distances that diverged from their start values by a factor of `LARGEST_FACTOR`.
 
     If c and an image scale are both free, c = 0 makes all corrected residuals zero.
@@ -122,7 +122,7 @@ def _collapsed(problem: Problem, values: Values) -> list[str]:
     ]
 
 
-def misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
+def is_misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
     """Whether an adjusted principal distance differs from the given one, but plausibly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
     sane = all(1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR for ratio in ratios)

@@ -70,10 +70,10 @@ def _describe_one(calibration, choice=None) -> Addition:
     if choice is not None:
         sections.append(_models(choice))
     if not calibration.converged:
-        return Addition("", overview=overview, sections=(*sections, *_failed(views)))
+        return Addition("", overview=overview, sections=(*sections, *_list_failed(views)))
     sections += [
         _quality(calibration.coverage, calibration.reported_maps, _unit(calibration)),
-        _validation(calibration), *_failed(views),
+        _validation(calibration), *_list_failed(views),
     ]  # fmt: skip
     findings = (_coverage(calibration.coverage), *_halves(calibration))
     return Addition(
@@ -131,7 +131,7 @@ def _validation(calibration) -> Section:
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
 
 
-def _failed(views) -> list[Section]:
+def _list_failed(views) -> list[Section]:
     if not views.failed:
         return []
     rows = grid(("photograph", "reason"), views.failed, "words")

@@ -114,7 +114,7 @@ def compare_cameras(
     shift, step = between_frames(other, source, image_size, pixel_size)
     rays = rays_of(source, values, xy)
     back = np.abs(images_of(source, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
-    seen = back & _unfolded(other, others, rays)
+    seen = back & _are_one_to_one(other, others, rays)
     if seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
     near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
@@ -169,7 +169,7 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     }  # fmt: skip
 
 
-def _unfolded(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
+def _are_one_to_one(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
     """Which rays have an image that belongs to no other ray: a polynomial turns back, and beyond
     that radius its images are those of rays nearer to the axis."""
     images = images_of(model, values, rays)

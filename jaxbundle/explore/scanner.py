@@ -230,7 +230,7 @@ class ScannerView:
         if not np.isfinite(length).all():
             raise InputError("not every image position has a point on the ground: check "
                              "attitude, mounting and height")  # fmt: skip
-        expected = self._expected(chosen)
+        expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
         field = length.reshape(PLACES)
@@ -305,7 +305,7 @@ class ScannerView:
             chosen.image, chosen.truth, chosen.surface, *self._places()
         )
 
-    def _expected(self, chosen: Chosen) -> list[dict[str, float]]:
+    def _expected_accuracy(self, chosen: Chosen) -> list[dict[str, float]]:
         """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
@@ -397,7 +397,8 @@ class ScannerView:
             for line, pixel, (e, n) in zip(lines.tolist(), pixels.tolist(), errors.tolist())
         ]
         rows += ["", "sigma_degrees,rms,ce90,closed_rms,closed_ce90"]
-        rows += [",".join(repr(float(v)) for v in row.values()) for row in self._expected(chosen)]
+        expected = self._expected_accuracy(chosen)
+        rows += [",".join(repr(float(v)) for v in row.values()) for row in expected]
         return "\n".join(rows) + "\n"
 
     def _picture(self, chosen: Chosen) -> bytes:

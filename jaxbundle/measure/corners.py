@@ -127,7 +127,7 @@ def _chessboard(cv2, grey, board):
             "with a light margin"
         )
     xy = _refine(cv2, grey, xy.reshape(*board.grid, 2))
-    return _first_black(grey, _turned_right(xy), board).reshape(-1, 2)
+    return _first_black(grey, _turn_upright(xy), board).reshape(-1, 2)
 
 
 def _in_copies(cv2, grey, seek):
@@ -158,7 +158,7 @@ def _refine(cv2, grey, xy):
     return refine_by_gradients(grey, xy.reshape(-1, 2), half).reshape(xy.shape)
 
 
-def _turned_right(xy):
+def _turn_upright(xy):
     """Rows from the top, each from the left: not mirrored, the first row at the top."""
     right, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
     if np.linalg.det([right.sum(0), down.sum(0)]) < 0:
@@ -234,9 +234,9 @@ def _circles(cv2, grey, board):
         )
     xy = xy.reshape(*board.grid, 2)
     if uneven:
-        xy = _uneven_rows(xy)
+        xy = _number_asymmetric(xy)
     else:
-        xy = _turned_right(xy)
+        xy = _turn_upright(xy)
     return np.array([centre_by_ellipse(grey, place).xy for place in xy.reshape(-1, 2)])
 
 
@@ -251,7 +251,7 @@ def _blob_finder(cv2, grey, shade):
     return cv2.SimpleBlobDetector_create(wanted)
 
 
-def _uneven_rows(xy):
+def _number_asymmetric(xy):
     """The numbering with the second row shifted to the right, not mirrored."""
 
     def fits(xy):

@@ -28,9 +28,9 @@ class InObjectSpace:
 
     def __call__(self, *blocks_and_measured):
         *blocks, measured = blocks_and_measured
-        return self.residual(*map(self._placed, self.of, blocks), measured)
+        return self.residual(*map(self._place, self.of, blocks), measured)
 
-    def _placed(self, table, block):
+    def _place(self, table, block):
         if table == "image":
             centre = tuple(c + o for c, o in zip(block.centre, self.origin))
             return Posed(block.rotation, centre)

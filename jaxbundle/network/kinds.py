@@ -52,7 +52,7 @@ class ColumnsOfImagePoint:
     def __call__(self, *touched):
         *poses, p, ray, _ = touched
         model = cameras.get_model(self.model)
-        return present(model.local).columns(p, *model.ideal(p, *_seen(poses, ray)))
+        return present(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,12 +64,12 @@ class LocalImagePoint:
     def __call__(self, *touched):
         *poses, p, ray, columns, values, xy = touched
         model = cameras.get_model(self.model)
-        at = model.ideal(p, *_seen(poses, ray))
+        at = model.ideal(p, *_transform_ray(poses, ray))
         x, y = present(model.local).distort(p, columns, values, *at)
         return x - xy[0], y - xy[1]
 
 
-def _seen(poses, ray):
+def _transform_ray(poses, ray):
     for pose in poses:
         ray = pose.ray(ray)
     return ray

@@ -78,7 +78,7 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
     return dataclasses.replace(points, role=roles)
 
 
-def controlled_axes(points: Points):
+def count_controlled_axes(points: Points):
     """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
     axes = np.isfinite(points.sigma).sum(1)
     return np.where(
@@ -102,7 +102,7 @@ def leave_out_undetermined(network: Network) -> Network:
     points, distances = network.points, network.distances
     fixed, check = points.has_role("fixed"), points.has_role("check")
     rays = np.bincount(network.observations.point, minlength=len(points))
-    known = controlled_axes(points) + equations_of(network, "POINTS")
+    known = count_controlled_axes(points) + equations_of(network, "POINTS")
     keep = np.ones(len(points), bool)
     while True:
         ends = distances.points[keep[distances.points].all(1)]
@@ -177,9 +177,9 @@ def check_images(before: Network, network: Network) -> None:
 def check_parts(network: Network) -> None:
     """Refuse parts of the network that are neither connected nor positioned."""
     images, points, rays = network.images, network.points, network.observations
-    known = controlled_axes(points) == 3
+    known = count_controlled_axes(points) == 3
     ties = ~(known | points.has_role("check"))[rays.point]
-    part = connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
+    part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
         return
@@ -200,7 +200,7 @@ def check_parts(network: Network) -> None:
         )
 
 
-def connected_parts(image, point, images: int, points: int):
+def label_connected_parts(image, point, images: int, points: int):
     """A label for each image; images that share points, directly or in a chain, have the same.
 
     Smallest labels travel along the rays, with hooking and halving, so that a strip of n images
@@ -240,7 +240,7 @@ def check_redundancy(network: Network) -> None:
     )  # fmt: skip
     conditions = 0
     if network.datum != "control":
-        known = controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
+        known = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
         conditions = max(0, 7 - known - (len(network.distances) > 0))
     missing = unknowns - rows - conditions
     if missing > 0:

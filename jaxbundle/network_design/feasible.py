@@ -73,7 +73,7 @@ def check_feasible(pairs: Pairs, tried: int = TRIAL_POSITIONS) -> None:
     rotation = np.concatenate([rotation, start.rotation])
     found = {}
     for c in range(len(pairs.views)):
-        seen = _seen(pairs, c, start, position, rotation)
+        seen = _test_conditions(pairs, c, start, position, rotation)
         for name, rows in seen.items():
             found[name] = found.get(name, False) | rows
         both = np.logical_and.reduce(list(seen.values()))
@@ -112,7 +112,7 @@ def _why(found, tried: int) -> str:
     return (f"conditions: no station can satisfy {names} together for any target {places}{hint}")
 
 
-def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
+def _test_conditions(pairs: Pairs, c: int, start: Values, position, rotation):
     """Which conditions the stations of a camera satisfy, [stations, points] each."""
     view = pairs.views[c]
     interior = jnp.asarray(start.camera)[c, : len(view.model.parameters)]

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, controlled
+from jaxbundle.orientation.growth import Model, are_controlled
 from jaxbundle.orientation.sights import Sights
 
 OUTLIER_LIMIT = 3.0
@@ -25,7 +25,7 @@ def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model
     """The model in the frame of control points and of images whose position is given, else of the
     rays to control points, else of the approximate coordinates of points; None without enough."""
     points, images = network.points, network.images
-    control = controlled(points) & model.known
+    control = are_controlled(points) & model.known
     stations = model.placed & np.isfinite(images.position).all(1)
     found = similarity(
         np.concatenate([model.X[control], model.X0[stations]]),
@@ -44,7 +44,7 @@ def _by_rays(network: Network, sights: Sights, model: Model):
 
     Start values use a point at the typical distance along each ray."""
     points = network.points
-    rows = np.flatnonzero(model.placed[sights.image] & controlled(points)[sights.point])
+    rows = np.flatnonzero(model.placed[sights.image] & are_controlled(points)[sights.point])
     if len(rows) < LEAST_RAYS or len(np.unique(sights.point[rows])) < 3 or not model.known.any():
         return None
     image, point = sights.image[rows], sights.point[rows]
@@ -118,7 +118,7 @@ def describe_mirror(network: Network, model: Model) -> str:
     """Whether a model in an arbitrary frame fits the control points only as a mirror image, in
     words; empty if not, or if undecidable (fewer than four, or coplanar)."""
     points = network.points
-    control = controlled(points) & model.known
+    control = are_controlled(points) & model.known
     source, target = model.X[control], points.position[control]
     if len(source) < LEAST_TO_TELL:
         return ""

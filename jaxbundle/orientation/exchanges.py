@@ -16,7 +16,7 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import FITS
-from jaxbundle.orientation.growth import FOR_ITSELF, Model, controlled, intersect
+from jaxbundle.orientation.growth import FOR_ITSELF, Model, are_controlled, intersect
 from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTION = "control points contradict each other"
@@ -38,7 +38,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
     seen = sights(network) if seen is None else seen
     points = network.points
     alone = _without_control(network, seen, model)
-    control = np.flatnonzero(controlled(points) & alone.known)
+    control = np.flatnonzero(are_controlled(points) & alone.known)
     found = contradiction(alone.X[control], points.position[control])
     if found is None:
         return ""

@@ -79,7 +79,7 @@ class Model:
         )
 
 
-def controlled(points: Points) -> Bool[np.ndarray, " points"]:
+def are_controlled(points: Points) -> Bool[np.ndarray, " points"]:
     """Points whose three coordinates are known: fixed, or control with all axes."""
     return points.has_role("fixed") | (
         points.has_role("control") & ~np.isposinf(points.sigma).any(1)

@@ -35,7 +35,7 @@ from jaxbundle.orientation.growth import (
     FEWEST_POINTS,
     FOR_OTHERS,
     Model,
-    controlled,
+    are_controlled,
     finish,
     grow,
     misclosures,
@@ -95,7 +95,7 @@ class Oriented:
 def lacks_start_values(network: Network) -> bool:
     """Whether an image or a tie point has no start value."""
     images, points = network.images, network.points
-    tie = points.has_role("tie") | (points.has_role("control") & ~controlled(points))
+    tie = points.has_role("tie") | (points.has_role("control") & ~are_controlled(points))
     return bool(
         np.isnan(images.position).any()
         or np.isnan(images.angles).any()
@@ -123,7 +123,7 @@ def find_start_values(
     found = _result(network, seen, model, frame)
     missed = _find_missed(network, seen, model)
     finding = name_contradiction(network, seen, model) if missed.any() else ""
-    left = (controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
+    left = (are_controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
     why = ""
     if _control_contradicts(network, seen, model):
         why = _describe_mirror(network, seen) or (finding if left < LEAST_CONTROL else "")
@@ -144,7 +144,7 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
 def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
     wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
-    return controlled(network.points) & (2 * wrong > _rays_of(seen, model))
+    return are_controlled(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
 def _rays_of(seen: Sights, model: Model):
@@ -155,7 +155,7 @@ def _rays_of(seen: Sights, model: Model):
 def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     """Whether many rays miss their control points grossly, or many points have rays that do not
     intersect."""
-    control = controlled(network.points)
+    control = are_controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
     wrong = _out_of_the_question(seen, model)
@@ -209,7 +209,7 @@ def _given_model(network: Network, seen: Sights) -> Model:
 
 
 def _with_control(network: Network, model: Model) -> Model:
-    held = controlled(network.points)
+    held = are_controlled(network.points)
     X = np.where(held[:, None], network.points.position, model.X)
     return dataclasses.replace(model, X=X, known=model.known | held, held=held)
 
@@ -377,7 +377,8 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
 
 
 def _why_nothing(network: Network, seen: Sights) -> str:
-    control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
+    known = are_controlled(network.points)
+    control = np.bincount(seen.image, known[seen.point], minlength=seen.images)
     best = int(control.argmax())
     begin = (
         f"no image sees {FEWEST_POINTS} control points that agree ({int(control[best])} in "

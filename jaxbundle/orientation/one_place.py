@@ -35,7 +35,7 @@ def name_one_place(network: Network) -> str:
                   for camera in network.cameras])  # fmt: skip
     of_camera = network.images.camera[seen.image]
     sigma = network.observations.sigma[seen.row] / c[of_camera, None]
-    if not others or not all(_turned_only(seen, sigma, base, image) for image in others):
+    if not others or not all(_is_rotation(seen, sigma, base, image) for image in others):
         return ""
     names = [network.images.id[image] for image in sorted([base, *others])]
     return (
@@ -45,7 +45,7 @@ def name_one_place(network: Network) -> str:
     )
 
 
-def _turned_only(seen, sigma, one: int, other: int) -> bool:
+def _is_rotation(seen, sigma, one: int, other: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
     a, b = seen.of(one), seen.of(other)
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)

@@ -171,7 +171,7 @@ def simulate_with_truth(
     if max_rays is not None:
         kept[kept] = _at_most(rays[1][kept], max_rays, rng)
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    (image, point, xy), used = _imaged(rays, kept, need)
+    (image, point, xy), used = _select_imaged(rays, kept, need)
     row = np.cumsum(used) - 1
     points = _points(targets, role, used, control_sigma)
     ends = _ends(distances, len(targets), used, row)
@@ -189,7 +189,7 @@ def simulate_with_truth(
     return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
 
 
-def _imaged(rays, kept, need):
+def _select_imaged(rays, kept, need):
     """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""

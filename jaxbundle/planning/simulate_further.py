@@ -52,7 +52,7 @@ def simulate_further(
         known |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
         if isinstance(rows, RollingShutter):
-            shift = _moved_image_points(truth, rows, values) - truth.observations.xy
+            shift = _expose_moving(truth, rows, values) - truth.observations.xy
             network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
@@ -68,7 +68,7 @@ def simulate_further(
     return network.replace(further=tuple(made))
 
 
-def _moved_image_points(truth: Network, rows: RollingShutter, values):
+def _expose_moving(truth: Network, rows: RollingShutter, values):
     """The image points of the truth in the moving camera: an image point is exposed with
     its line, which depends on the image point."""
     truth = truth.replace(further=(rows,), residuals="measured")

@@ -95,7 +95,7 @@ def block_places(
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
     if occlusion and isinstance(surface, Terrain):
-        inside &= ~np.asarray(_occluded(scanner, search, surface, line, pixel, ground))
+        inside &= ~np.asarray(_are_occluded(scanner, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
@@ -143,7 +143,7 @@ def _locate(image, search, surface, line, pixel):
 
 
 @jax.jit
-def _occluded(image, search, surface, line, pixel, ground):
+def _are_occluded(image, search, surface, line, pixel, ground):
     """Whether the rays of image positions end before their points [3, rows, columns].
 
     A ray without heights on its way to the point hides nothing.

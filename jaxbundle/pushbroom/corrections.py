@@ -84,7 +84,7 @@ def true_direction(seen: Vector, velocity: Vector) -> Triple:
     return scale_vector(1 / LIGHT, along(scale_vector(-1.0, velocity), seen, k))
 
 
-def seen_direction(true: Vector, velocity: Vector) -> Triple:
+def apparent_direction(true: Vector, velocity: Vector) -> Triple:
     """The direction in which a camera with this velocity sees light from `true`."""
     return along(velocity, unit(true), LIGHT)
 
@@ -139,7 +139,7 @@ def require_ellipsoid(earth: Ellipsoid | None) -> Ellipsoid:
     return earth
 
 
-def seen_point(
+def apparent_point(
     corrections: Corrections, earth: Ellipsoid | None, P: Vector, V: Vector, X: Vector
 ) -> Triple:
     """The apparent position of the point X for a camera at P with the velocity V.
@@ -164,6 +164,6 @@ def seen_point(
     if corrections.light_time:
         d = earlier_earth(d, -distance)
     if corrections.aberration:
-        seen = seen_direction(d, inertial_velocity(P, V))
+        seen = apparent_direction(d, inertial_velocity(P, V))
         d = scale_vector(length(d) / length(seen), seen)
     return along(P, d, 1.0)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbundle.geometry.vectors import difference
-from jaxbundle.pushbroom.corrections import seen_point
+from jaxbundle.pushbroom.corrections import apparent_point
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 
 STEPS = 2
@@ -91,10 +91,10 @@ def line_period(image):
     return image.times.time(1.0) - image.times.time(0.0)
 
 
-def seen_position(image, earth, motion, X):
+def apparent_position(image, earth, motion, X):
     """The apparent position of X for a camera at P with the velocity V; `motion` is (P, V)."""
     P, V = motion
-    return seen_point(image.corrections, earth, P, V, X) if image.corrections.any else X
+    return apparent_point(image.corrections, earth, P, V, X) if image.corrections.any else X
 
 
 def motion(numbers, rates, origin):
@@ -118,7 +118,7 @@ def _round(image, pieces, earth, X, t, u):
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
         at = motion(numbers, [r / half for r in rates], pieces.origin)
-        X = seen_position(image, earth, at, X)
+        X = apparent_position(image, earth, at, X)
         # otherwise XLA recomputes it for each of the twelve sums below
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)

@@ -11,7 +11,7 @@ method continues with the polynomials of `pieces` (`newton`).
 `project_near` is the textbook method for one point near a known image position, with the
 trajectory itself. Its derivatives are exact by the implicit function theorem.
 
-With corrections, X is replaced by its apparent position (`seen_point`).
+With corrections, X is replaced by its apparent position (`apparent_point`).
 """
 
 from enum import IntEnum
@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, rotate_back
 from jaxbundle.implicit import implicit_root, solve_dense
-from jaxbundle.pushbroom.corrections import Corrections, seen_point
+from jaxbundle.pushbroom.corrections import Corrections, apparent_point
 from jaxbundle.pushbroom.footprint import Footprint, make_footprint
 from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.newton import first_of, gather, refine, replace_chosen
@@ -217,7 +217,7 @@ def misclosure_of(
 ) -> Float[Array, "2"]:
     """Slopes of the ray to X from a pose minus given ones."""
     P, R, V = pose
-    r, s, q = rotate_back(R, difference(seen_point(corrections, earth, P, V, X), P))
+    r, s, q = rotate_back(R, difference(apparent_point(corrections, earth, P, V, X), P))
     xi, eta = slopes
     return jnp.stack([-r / q - xi, -s / q - eta])
 

@@ -26,7 +26,7 @@ from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
-from jaxbundle.reconstruction.parts import SMALLEST_PART, connected, why_alone
+from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
     Photograph,
@@ -239,7 +239,7 @@ class _Making:
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
         least = min(SMALLEST_PART, len(self.photographs))
-        waiting = connected(len(self.photographs), pairs)
+        waiting = group_connected(len(self.photographs), pairs)
         parts: list[Part] = []
         failed: list[str] = []
         while waiting:
@@ -260,7 +260,7 @@ class _Making:
             parts.append(part)
             rest = [k for k in group if self.names[k] in reasons]
             among = [p for p in pairs if set(p.images) <= set(rest)]
-            again = [[rest[k] for k in g] for g in connected(
+            again = [[rest[k] for k in g] for g in group_connected(
                 len(rest), [dataclasses.replace(p, images=(rest.index(p.images[0]),
                                                            rest.index(p.images[1])))
                             for p in among])]  # fmt: skip
@@ -306,14 +306,14 @@ class _Making:
         )  # fmt: skip
         network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
-        oriented, weighted, note = self._adjusted(network, measured)
+        oriented, weighted, note = self._adjust_first(network, measured)
         self._begin("")
         _refuse_folded(weighted.adjustment, measured, self.names)
         self.notes += [note] if note else []
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
-    def _adjusted(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
+    def _adjust_first(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
         guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)

@@ -141,7 +141,7 @@ class Declared:
         points = np.concatenate([part.point for part in self.parts])
         return np.bincount(points, minlength=len(self.rays.points))
 
-    def rescaled(self, problem: Problem, values: Values) -> tuple[Problem, float]:
+    def rescale(self, problem: Problem, values: Values) -> tuple[Problem, float]:
         """The problem with S at these values, and the largest relative change of S."""
         measured, X, change = list(problem.data.measured), np.asarray(values["point"].position), 0.0
         for part in self.parts:

@@ -138,11 +138,11 @@ def adjust(declared: Declared, snooping: str, significance: float) -> Inspection
 
     def again(problem: Problem, values: Values) -> Solution:
         nonlocal steps
-        problem, _ = declared.rescaled(problem, values)
+        problem, _ = declared.rescale(problem, values)
         for _ in range(ROUNDS):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
-            problem, change = declared.rescaled(problem, values)
+            problem, change = declared.rescale(problem, values)
             if not (change > SAME and converged(minimum.termination)):
                 break
         found = Solution(problem, values)

@@ -41,7 +41,7 @@ def orthophoto(
     inside = is_inside(view, uv)
     d = line_of_sight(view.derivative(P))
     d = d * np.where(d[:, 2:] < 0, -1.0, 1.0)
-    seen = inside & ~_hidden(dsm, X[known], d)
+    seen = inside & ~_are_hidden(dsm, X[known], d)
     safe = np.where(inside[:, None], uv, 0.0)
     grey = ndimage.map_coordinates(np.asarray(view.grey, np.float32), [safe[:, 1], safe[:, 0]],
                                    order=1, mode="nearest")  # fmt: skip
@@ -78,7 +78,7 @@ def write_orthophoto(
         raster.write(stored[None])
 
 
-def _hidden(dsm, X, d):
+def _are_hidden(dsm, X, d):
     """Whether the surface rises above the lines of sight, towards their image."""
     top = np.nanmax(dsm.height)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -63,7 +63,7 @@ class Workers:
                     result = connection.recv()
                 except (EOFError, OSError):
                     process.join()
-                    yield task, Failed(f"its worker process died ({_ended(process)})")
+                    yield task, Failed(f"its worker process died ({_describe_end(process)})")
                     continue
                 self._idle.append((connection, process))
                 yield task, result
@@ -77,7 +77,7 @@ class Workers:
         return ours, process
 
 
-def _ended(process) -> str:
+def _describe_end(process) -> str:
     code = process.exitcode
     return f"signal {-code}" if code is not None and code < 0 else f"status {code}"
 

@@ -136,7 +136,7 @@ class _Loops:
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
-            between = _between(ij.b, ij.M.T @ jk.b, ik.b)
+            between = _is_between(ij.b, ij.M.T @ jk.b, ik.b)
             return None if between or ik.angle < NARROW else False
         of_jk = at_i - at_k if np.isnan(at_j) else at_j
         of_ik = at_j + at_k if np.isnan(at_i) else at_i
@@ -155,7 +155,7 @@ class _Loops:
         return float(np.log(np.median(ratio))) if len(ratio) >= FEWEST_COMMON else np.nan
 
 
-def _between(one, other, b) -> bool:
+def _is_between(one, other, b) -> bool:
     """Whether a direction is a sum of two others with positive factors, to `ASIDE`."""
     from scipy.optimize import nnls
 

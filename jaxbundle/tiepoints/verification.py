@@ -156,12 +156,12 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
         enough = len(use) >= max(LEAST, PART * len(rows[k]))
-        if enough and all(_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
+        if enough and all(_is_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
             found[k] = good, M, b
     return found
 
 
-def _extended(some, every) -> bool:
+def _is_extended(some, every) -> bool:
     """Whether some points extend over more than a spot or a line among all."""
     return np.linalg.eigvalsh(np.cov(some.T))[0] > (EXTENT * every.std()) ** 2
 

@@ -70,7 +70,7 @@ CORRECTED = "hermite, angles in the orbit by splines, uneven times, light time, 
 # lagrange with slerp, there and back: test_csm, test_scanner_file
 CASES = {
     LINEAR: satellite("linear", "linear", 4, table_optics()),
-    # refraction, slow to compile here, is undone by `seen_point` alike: test_locate
+    # refraction, slow to compile here, is undone by `apparent_point` alike: test_locate
     CORRECTED: satellite("hermite", "angles", 4, times=LineTimes(
         jnp.float64(0), jnp.float64(0),
         jnp.asarray(PERIOD * (np.arange(LINES) + rng.uniform(-0.2, 0.2, LINES))),

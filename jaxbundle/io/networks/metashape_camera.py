@@ -132,7 +132,7 @@ def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
     return pixel if min(pixel) > 0 else None
 
 
-def _published(kind: str, p: dict, X, Y, Z):
+def _project_metashape(kind: str, p: dict, X, Y, Z):
     """The manual's formula, from the centre of the first pixel."""
     if kind == "frame":
         x, y = X / Z, Y / Z
@@ -151,7 +151,7 @@ def _published(kind: str, p: dict, X, Y, Z):
     return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - 0.5
 
 
-FORMULAS = {kind: partial(_published, kind) for kind in TYPES}
+FORMULAS = {kind: partial(_project_metashape, kind) for kind in TYPES}
 
 
 def label_of(element: ET.Element) -> str:

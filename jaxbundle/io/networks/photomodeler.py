@@ -182,18 +182,18 @@ def _photos(rows: Rows, header) -> list[Photo]:
         if any(photo.number == number for photo in photos):
             raise row.error(f"photograph {number} is in the file twice")
         name = row.text.split(None, 1)[1].strip() if len(row) > 1 else ""
-        outer = _numbered(rows, number, "orientation").numbers(OUTER, 1)
-        _numbered(rows, number, "σ of the orientation").numbers(OUTER, 1)
+        outer = _read_numbered(rows, number, "orientation").numbers(OUTER, 1)
+        _read_numbered(rows, number, "σ of the orientation").numbers(OUTER, 1)
         rows.take("covariances of the orientation or an empty line")
-        inner = photo_camera(_numbered(rows, number, "the camera"), header)
-        _numbered(rows, number, "σ of the camera").numbers(INNER, 1)
+        inner = photo_camera(_read_numbered(rows, number, "the camera"), header)
+        _read_numbered(rows, number, "σ of the camera").numbers(INNER, 1)
         photos.append(Photo(number, name or f"photo {number}", row.number, outer, *inner))
     if rows.more():
         rows.take("an empty line")
     return photos
 
 
-def _numbered(rows: Rows, number: int, what: str) -> Row:
+def _read_numbered(rows: Rows, number: int, what: str) -> Row:
     row = _take(rows, f"{what} of photograph {number}")
     if row.integer(0, f"the number of the photograph before {what}") != number:
         raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")

@@ -80,7 +80,7 @@ def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
             f"{did_you_mean(interpolation, INTERPOLATIONS)}"
         )
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
-    return _given(isd, lines) if older else _resample(isd, lines, interpolation)
+    return _read_even_table(isd, lines) if older else _resample(isd, lines, interpolation)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -105,7 +105,7 @@ def slerp(t: Float[np.ndarray, " n"], R: Rotation, at: Float[np.ndarray, " m"]) 
     return R[i] * Rotation.from_rotvec(part[:, None] * (R[i].inv() * R[i + 1]).as_rotvec())
 
 
-def _given(isd, lines):
+def _read_even_table(isd, lines):
     """Even tables as they are."""
     P = isd.array("sensor_position.positions", (None, 3)) * unit_of(isd, "sensor_position", "m")
     q = isd.array("sensor_orientation.quaternions", (None, 4))

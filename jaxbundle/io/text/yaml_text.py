@@ -106,7 +106,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]
             value, lines = _block([inner, *lines], inner.indent, depth + 1)
             values.append(value)
         else:
-            value, lines = _nested(lines, indent, depth)
+            value, lines = _parse_nested(lines, indent, depth)
             values.append(value)
     return values, lines
 
@@ -124,11 +124,11 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]
         if text:
             values[key] = _value(line, text)
         else:
-            values[key], lines = _nested(lines, indent, depth)
+            values[key], lines = _parse_nested(lines, indent, depth)
     return values, lines
 
 
-def _nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
     """The value below a key or the dash of a list; a list may have the indentation of its key."""
     if not lines or lines[0].indent < indent:
         return None, lines

@@ -164,7 +164,7 @@ def _refuse_others(
     if not entries:
         return
     own = marker.files if marker else {}
-    taken = [str(folder / name) for name in _taken(real, names, own)]
+    taken = [str(folder / name) for name in _list_taken(real, names, own)]
     listed = list_some(taken, MOST_NAMED, str)
     way = "give a new folder, or --force (force=True in Python) to"
     if marker is None and taken:
@@ -198,7 +198,7 @@ def _entries(real: Path) -> list[str]:
         return []
 
 
-def _taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
+def _list_taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
     """Existing files among `names`, except those listed by the marker."""
     found = {}
     for name in names:
@@ -255,7 +255,7 @@ def _replace(
             _refuse_others(folder, real, by, (*files, *names), str(folder))
         marker = read_marker(real)
         own = [name for name in (marker.files if marker else ()) if os.path.lexists(real / name)]
-        going = [*own, *_taken(real, names, own)]
+        going = [*own, *_list_taken(real, names, own)]
         for name in (*files, *going):
             _check_way(real, name)
             if os.path.lexists(real / name) and name not in going:

@@ -39,14 +39,14 @@ def hold_lock(
     lock = real.with_name(f".{real.name}.lock")
     with ExitStack() as held:
         with defer_interrupts():  # A lock is removed only by the process that holds it.
-            held.enter_context(_taken(lock, told, needed))
+            held.enter_context(_acquire(lock, told, needed))
             # Removed before release: no other process locks a file about to vanish.
             # Windows cannot remove open files: there it stays.
             held.enter_context(temporary(lock))
         yield
 
 
-def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
+def _acquire(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
     """The locked file.
 
     **Raises:** `InputError` as `hold_lock`."""

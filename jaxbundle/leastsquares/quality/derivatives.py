@@ -104,7 +104,7 @@ class Linearised(eqx.Module):
     factor: elimination.Factor
     pins: Tangent
 
-    def given(self, data: Data) -> Values:
+    def hold_given(self, data: Data) -> Values:
         """The solution with held values taken from the start values."""
         free = datum.free_of_tables(self.plan, self.declared, self.values)
         return {
@@ -119,7 +119,7 @@ class Linearised(eqx.Module):
         return residuals(self.declared, plan, self.move(change, data), laid)
 
     def move(self, change: Tangent, data: Data) -> Values:
-        return retract(self.declared, self.plan, self.given(data), change)
+        return retract(self.declared, self.plan, self.hold_given(data), change)
 
 
 @eqx.filter_jit

@@ -160,7 +160,7 @@ class Figures(Further):
                       parameters=tuple(DIRECTIONS[c] for c in columns))  # fmt: skip
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
         if type not in ROUND:
-            seen = self._seen(type, (type,), (figure,), point[rows], sigma)
+            seen = self._observe_points(type, (type,), (figure,), point[rows], sigma)
             return Declared((frame,), (seen,), ((type, move_pose),))
         known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
                           for k in range(len(names))])  # fmt: skip
@@ -171,13 +171,14 @@ class Figures(Further):
             those = np.flatnonzero((known > 0)[figure] == given)
             if len(those):
                 touched = (figure[those],) * 2
-                seen.append(self._seen(type, (type, size.name), touched, point[rows[those]],
-                                       sigma[those], not given))  # fmt: skip
+                seen.append(self._observe_points(
+                    type, (type, size.name), touched, point[rows[those]], sigma[those], not given
+                ))  # fmt: skip
         actions = (type, move_pose), (size.name, _move_radius)
         return Declared((frame, size), tuple(seen), actions)
 
     @staticmethod
-    def _seen(type, tables, figure, point, sigma, invariant=True):
+    def _observe_points(type, tables, figure, point, sigma, invariant=True):
         """The conditions of points on figures. A figure of unknown size moves with its points;
         residuals of points not yet on it must not count as observations of scale or rotation
         (`invariant`)."""
