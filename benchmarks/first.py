@@ -1,12 +1,12 @@
-"""The first adjustment of a process: compiling everything, and with the programs of one before.
+"""The first adjustment of a process: with and without compiled programs of an earlier one.
 
     python benchmarks/first.py [--input PROJECT] [--repeat N] [--json FILE]
 
-`jaxbundle adjust PROJECT --quiet`, in processes of their own and in pairs: the first finds an empty
-folder of compiled programs (a temporary one), the second what the first left there. Told are the
-seconds from the start of a process to its end, on the clock and of the processor, the best of the
-pairs; beside them a process that only imports JAX. Demanded of a small network on two cores: below
-10 s and below 3 s; a demand that is not met is told, and does not change the exit status.
+Runs `jaxbundle adjust PROJECT --quiet` in pairs of separate processes: the first starts with an
+empty temporary folder of compiled programs, the second uses what the first left there. The output
+gives wall-clock and processor seconds from start to end of a process, the best of the pairs, and
+those of a process that only imports JAX. Limits for a small network on two cores: 10 s and 3 s; a
+limit that is not met is reported and does not change the exit status.
 """
 
 import os
@@ -25,7 +25,7 @@ DEMANDED = {"empty folder of programs": 10.0, "full folder of programs": 3.0}
 
 
 def seconds_of(command: list[str], folder: str) -> tuple[float, float]:
-    """Seconds of a process, on the clock and of the processor."""
+    """Wall-clock and processor seconds of a process."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder}
     begin = time.perf_counter()
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
