@@ -1,4 +1,4 @@
-"""One rule for 64-bit floats: who refuses without them, and who brings them along."""
+"""One rule for 64-bit floats: which functions refuse without them, and which switch them on."""
 
 import os
 import subprocess
@@ -107,7 +107,7 @@ for _ in range(100):
 
 
 def test_batched_factorisations_at_once_come_to_an_end():
-    """jaxlib 0.10 blocks for ever where as many of them as XLA has threads are in work."""
+    """jaxlib 0.10 deadlocks if as many of them as XLA has threads are running."""
     here = {k: v for k, v in os.environ.items() if k != "NPROC"}
     program = [sys.executable, "-c", FACTORISATIONS_AT_ONCE]
     subprocess.run(program, env=here, check=True, timeout=120)

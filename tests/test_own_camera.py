@@ -26,7 +26,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "own_camera.md").read_text(encoding
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """What the page's code leaves behind."""
+    """The names defined by the page's code."""
     names, codes = {}, re.findall(r"```python\n(.*?)```", PAGE, re.S)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("page"))

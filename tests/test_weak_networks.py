@@ -1,4 +1,4 @@
-"""Networks that determine something in name only say so: what is weak, and how to mend it.
+"""Weak networks are reported: what is weakly determined, and the remedy.
 
 Four images of 25 targets; of the first two shapes (with and without control) all share one solver.
 """
@@ -183,7 +183,7 @@ def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
 
 
 def test_c_in_pixels_is_the_first_cause_of_a_far_off_chi_square():
-    """A long lens cannot be told from it; it is asked of misfits only."""
+    """It cannot be distinguished from a long lens; only misfits are checked for it."""
     lens = Camera("cam", "brown", {"c": 400.0}, free=("c",))
     given = network(RING, lens, TARGETS / 20, **CONTROL)
     sigma = given.observations.sigma / 10

@@ -95,8 +95,8 @@ def test_derivatives_by_everything_that_was_given():
 
 
 def test_a_fixed_point_takes_the_datum_with_it():
-    """Free but for a point that is held: where that goes, all goes, and the minimum stays. (The
-    rotations and the scale that are open are those about the point.)"""
+    """Free but for one held point: if that moves, all points move with it, and the minimum stays.
+    (The rotations and the scale that are open are those about the point.)"""
     problem, minimum = adjusted("one fixed point")
     start, shift = problem.data.start, jnp.array([0.3, -0.2, 0.1])
     moved = dataclasses.replace(start, point=start.point.at[0].add(shift))

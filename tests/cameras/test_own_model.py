@@ -1,4 +1,4 @@
-"""A user's own model: one function and names; the rest follows as for those that are built in."""
+"""A user's own model: one function and names; the rest follows as for built-in models."""
 
 import dataclasses
 

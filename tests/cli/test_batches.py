@@ -1,4 +1,4 @@
-"""What is taken for a result of an input that is there, and what is not."""
+"""Which lines count as the result of an existing input."""
 
 import json
 import os

@@ -1,6 +1,6 @@
 """An interrupt of the command line: one line, its status, nothing half-written, at any moment.
 
-The processes here import no JAX: what they do stands for what it does at such a moment.
+The processes here import no JAX: their work stands for that of JAX at such a moment.
 """
 
 import os
@@ -122,7 +122,7 @@ open("third", "w").close()
 
 
 def test_what_belongs_together_and_does_not_end_holds_nobody(tmp_path):
-    """A disk that does not answer between two renames: after `PATIENCE` all is as without it."""
+    """If a disk does not answer between two renames, the process ends after `PATIENCE`."""
     code = """
 from jaxbundle.system import interrupts
 interrupts.PATIENCE = 0.2

@@ -1,4 +1,4 @@
-"""`convert`: what is recognised, what a conversion costs and loses, and what is refused."""
+"""`convert`: formats recognised, accuracy and losses of conversions, refusals."""
 
 import dataclasses
 import os

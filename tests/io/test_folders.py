@@ -1,4 +1,4 @@
-"""Folders of results: never over what is not their own, whole whatever ends the program."""
+"""Folders of results never overwrite foreign files, and are complete however the program ends."""
 
 import errno
 import json
@@ -157,7 +157,7 @@ def test_a_link_to_a_folder_stays_one(out):
 
 
 def test_a_folder_that_cannot_be_moved_to_from_beside(out, monkeypatch):
-    """A mount point: what is beside is on another disk."""
+    """A mount point: its parent folder is on another disk."""
     rename = Path.rename
 
     def refuse(path, target):
@@ -184,7 +184,7 @@ def test_what_fails_leaves_no_trace(out, error):
 
 
 def in_child(action) -> int:
-    """Do something in another process; what it ended with."""
+    """Run something in another process; its exit status."""
     child = os.fork()
     if not child:
         try:
@@ -203,7 +203,7 @@ def test_a_full_disk_leaves_the_old_result_whole(out):
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_kill_at_any_rename_leaves_old_or_new(tmp_path, inside):
     """Killed before the n-th rename, for every n: the old files or the new ones are all there, in
-    the folder once the next command has settled it, with the user's own files untouched."""
+    the folder once the next command has recovered it, with the user's own files untouched."""
     real, mine, outcomes = os.rename, {"notes.txt": "mine", "network/mine": "mine"}, []
     for n in range(20):
         out = tmp_path / str(n) / "out"
@@ -330,7 +330,7 @@ def test_two_files_that_belong_together_are_both_replaced_or_none(tmp_path, name
 
 
 def test_a_list_of_names_that_is_there_is_renewed(tmp_path):
-    """Else the names of other images would be taken for those of this network."""
+    """Otherwise names of other images would be taken for those of this network."""
     (tmp_path / "list.txt").write_text("x\ny\nz\n")
     write_bundler(exchange_cases.network("snavely", ("0", "1", "2")), tmp_path / "bundle.out")
     assert read_network(tmp_path / "bundle.out").images.id == ("0", "1", "2")

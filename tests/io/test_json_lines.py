@@ -42,7 +42,7 @@ def test_lines_are_kept_and_dropped(tmp_path):
     "my notes\n", "my notes", '{"key": "a", "sta\n', '{"a": 1}', '{"precious": [1, 2', '{"key": 1}',
 ])  # fmt: skip
 def test_a_file_of_something_else_is_not_taken_for_a_torn_line(tmp_path, text):
-    """It stays as it is, also where it does not end with a line feed."""
+    """It stays unchanged, even if it does not end with a line feed."""
     file = tmp_path / "notes.txt"
     file.write_text(text)
     with pytest.raises(InputError, match="line 1: not a result"):
@@ -120,7 +120,7 @@ def valid(tmp_path_factory):
 @often(200)
 @what_is_done
 def test_a_garbled_file_is_taken_up_or_refused(valid, **done):
-    """What is taken up is whole afterwards, every key once."""
+    """A file that is continued is complete afterwards, every key once."""
 
     def read(folder):
         file = folder / "results.jsonl"

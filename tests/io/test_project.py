@@ -1,4 +1,4 @@
-"""The project format: what it says, what it refuses, and that writing is the inverse of reading."""
+"""The project format: meaning, refusals, and writing as the inverse of reading."""
 
 import dataclasses
 import re

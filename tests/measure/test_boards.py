@@ -1,4 +1,4 @@
-"""Boards in rendered photographs: where their points are, and which is which."""
+"""Boards in rendered photographs: positions and labels of their points."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What every further kind of observations is asked: Jacobians against differences, σ against a
+"""Checks of every further kind of observations: Jacobians against differences, σ against a
 sample."""
 
 import dataclasses

@@ -267,7 +267,7 @@ def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
 
 
 def test_start_values_of_a_horizon_are_found(horizon):
-    """Of nothing but image coordinates and a distance; most of its rays do not meet."""
+    """From image coordinates and one distance alone; most of the rays do not intersect."""
     network, _, result = horizon
     points, images = network.points, network.images
     blank = lambda x: np.full_like(x, np.nan)
@@ -285,7 +285,7 @@ def test_start_values_of_a_horizon_are_found(horizon):
 
 @pytest.mark.further
 def test_images_from_one_place_are_not_solved_by_points_at_infinity():
-    """A panorama determines no distance at all: that is said."""
+    """A panorama determines no distance at all; the message says so."""
     network, _ = simulated(np.full(FAR, 50.0))
     images = network.images
     position = np.tile(images.position[:1], (len(images), 1))

@@ -29,7 +29,7 @@ SIGMA = 0.002
 
 @pytest.fixture(scope="module")
 def page():
-    """What the code of docs/design.md leaves behind."""
+    """The names defined by the code of docs/design.md."""
     names = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE, re.S):
         exec(code, names)

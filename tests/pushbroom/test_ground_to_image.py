@@ -84,7 +84,7 @@ SIZE = 5 * len(SOME_LINES) * len(SOME_PIXELS)
 
 
 def placed(image, X, earth=el.WGS84, most=1):
-    """`project_points` of few points [3, n], among others that are not looked at."""
+    """`project_points` of few points [3, n], among others that are ignored."""
     n = X.shape[1]
     found = project_points(
         image, make_search(image, earth), np.pad(X, [(0, 0), (0, SIZE - n)], "wrap"), most=most
@@ -117,7 +117,8 @@ def test_project_from_a_place_near_by():
 
 
 def rocking(size, period, angles=(0.0, 0.0, 0.0)):
-    """A camera above a plane that nods, so that the ground is seen forth, back, and forth again."""
+    """A pitching camera above a plane that sees the ground forwards, backwards, and forwards
+    again."""
     image = above_a_plane()
     t = np.arange(-0.1, 6.2, 0.02)
     nod = np.stack([size * np.sin(2 * np.pi * t / period), 0 * t, 0 * t], 1) + angles

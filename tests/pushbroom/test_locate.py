@@ -156,7 +156,7 @@ def test_aberration_is_the_sum_of_velocities():
 
 
 def test_light_time_turns_the_earth():
-    """In an inertial frame light is straight, and the ground moves on while it travels."""
+    """In an inertial frame light travels in a straight line, and the ground moves meanwhile."""
     v = np.array([6378e3, 1e5, 2e5])
     seconds = 5e5 / 299792458
     turn = Rotation.from_rotvec([0, 0, EARTH_RATE * seconds])

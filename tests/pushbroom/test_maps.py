@@ -1,4 +1,4 @@
-"""Systems and grids of maps: across 180°, what is no map, what is too large."""
+"""Systems and grids of maps: across 180°, invalid maps, maps that are too large."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A disk that is full: the raster that is written is named with its disk, and nothing is left."""
+"""A full disk: the raster is named with its disk, and nothing is left behind."""
 
 import os
 
@@ -24,7 +24,7 @@ def write(target):
 
 @pytest.mark.parametrize("cache", [64, 2**20], ids=["at closing", "at a block"])
 def test_a_full_disk_names_the_map_and_its_disk(tmp_path, capfd, cache):
-    """GDAL with a large cache writes when the file is closed, and swallows what fails then."""
+    """GDAL with a large cache writes when the file is closed, and ignores errors then."""
     target = tmp_path / "map.tif"
     target.write_text("the old one")
     with rasterio.Env(GDAL_CACHEMAX=cache), files_end_at(100_000):

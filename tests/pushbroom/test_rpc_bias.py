@@ -38,7 +38,7 @@ def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
 
 
 def test_covariance_redundancy_and_tests_by_drawing():
-    """With σ of image and ground: unknowns scatter as told, w is standard normal, σ0 is 1."""
+    """With σ of image and ground: unknowns scatter as stated, w is standard normal, σ0 is 1."""
     rng, noise, ground = np.random.default_rng(1), 0.4, np.array([2.0, 1.0, 5.0])
     draws = 400
     base = control(BIAS)

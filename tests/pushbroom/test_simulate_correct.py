@@ -209,7 +209,7 @@ def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
 
 @pytest.mark.further
 def test_a_rough_trajectory_leaves_no_holes():
-    """Every pixel of the map that the search finds in the image is placed, and where it is found.
+    """Every pixel of the map that the search finds in the image is filled from where it is found.
 
     Attitudes change their course within the distance of two nodes.
     """

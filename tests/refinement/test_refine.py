@@ -1,4 +1,5 @@
-"""Refinement: what was injected comes back, σ is honest, blunders are found, weakness is named."""
+"""Refinement: injected errors are recovered, σ is correct, blunders are found, weakness is
+named."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The refine file and command: what is written is read again, what is wrong is said with row."""
+"""The refine file and command: round trips, and errors reported with their row."""
 
 import json
 

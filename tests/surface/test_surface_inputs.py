@@ -1,5 +1,5 @@
-"""Photographs and rasters as surfaces are given them: folders with masks beside, COLMAP models, the
-σ of orientations, colours, large rasters by blocks."""
+"""Inputs of surfaces: folders of photographs with masks, COLMAP models, the σ of orientations,
+colours, large rasters by blocks."""
 
 import dataclasses
 
