@@ -38,8 +38,8 @@ UNREADABLE = (
 )  # fmt: skip
 """Errors of numpy and zipfile for truncated, damaged or oversized archives."""
 
-NEEDED = ("object_points", "image_points", "image_size")
-KNOWN = (*NEEDED, "visible", "ids", "cameras")
+REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
+KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
 BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
 """Numbers of axes of arrays with one row per camera, or per rig."""
 
@@ -109,17 +109,17 @@ def read_camera_stack(path: str | Path) -> CameraStack:
                 raise zipfile.BadZipFile("it is not an archive")
             _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: _rows(path, name, file) for name in KNOWN if name in file}
+                arrays = {name: _rows(path, name, file) for name in KNOWN_ARRAYS if name in file}
     except UNREADABLE as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
-    missing = [name for name in NEEDED if name not in arrays]
+    missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
     if missing:
         raise InputError(
-            f"{path}: no array {missing[0]!r}; expected {', '.join(NEEDED)} and, if needed, "
-            "visible and ids"
+            f"{path}: no array {missing[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, if "
+            "needed, visible and ids"
         )
-    X, xy, size = (arrays[name] for name in NEEDED)
+    X, xy, size = (arrays[name] for name in REQUIRED_ARRAYS)
     visible, cameras = arrays.get("visible"), _names(path, arrays, "cameras")
     try:
         for name in [n for n, array in arrays.items() if isinstance(array, np.ndarray)]:
@@ -177,7 +177,7 @@ def _check_size(stream: BinaryIO) -> None:
     with zipfile.ZipFile(stream) as archive:
         unpacked = sum(
             member.file_size for member in archive.infolist()
-            if member.filename.removesuffix(".npy") in KNOWN
+            if member.filename.removesuffix(".npy") in KNOWN_ARRAYS
         )  # fmt: skip
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)

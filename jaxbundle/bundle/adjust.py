@@ -41,7 +41,7 @@ from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Camera, Network, require_network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation.angle_units import name_angle_unit
-from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
@@ -272,7 +272,7 @@ def _likely_causes(
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
         return ()
-    told = any(CONTRADICTION in line for line in network.warnings)
+    told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     causes = (
         name_pixels(network), name_angle_unit(network),
         "" if told else name_contradiction(network),

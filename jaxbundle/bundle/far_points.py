@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution, minimise
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.any_distance import FARTHEST, is_at_infinity
+from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.network.arrays import Values
@@ -142,7 +142,7 @@ def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]
     depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = FARTHEST * present(problem.layout.lengths)
+    most = LARGEST_DISTANCE * present(problem.layout.lengths)
     move = (most > 0) & ((sides < 0) | (length > most))
     factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
     return X * factor[:, None]

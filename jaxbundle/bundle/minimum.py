@@ -20,7 +20,7 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
 
-MISJUDGED = 1.03
+MISJUDGED_RATIO = 1.03
 """If a principal distance changed by more than this factor, start values are computed again."""
 
 INSEPARABLE = 1e-7
@@ -126,7 +126,7 @@ def is_misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
     """Whether an adjusted principal distance differs from the given one, but plausibly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
     sane = all(1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR for ratio in ratios)
-    return sane and any(not 1 / MISJUDGED < ratio < MISJUDGED for ratio in ratios)
+    return sane and any(not 1 / MISJUDGED_RATIO < ratio < MISJUDGED_RATIO for ratio in ratios)
 
 
 def adjusted_cameras(problem: Problem, values: Values) -> dict[str, Camera]:

@@ -43,7 +43,7 @@ from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.orientation.exchanges import CONTRADICTION
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
 from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints, intersect_check_points
 from jaxbundle.statistics.components import groups
@@ -162,7 +162,8 @@ class Adjustment:
         if self._weakness is not None or not self.converged:
             return self._weakness or Weakness()
         scale = self._scale
-        if any(CONTRADICTION in line for line in (*self.problem.network.warnings, *self.findings)):
+        lines = (*self.problem.network.warnings, *self.findings)
+        if any(CONTRADICTORY_CONTROL in line for line in lines):
             scale = min(scale, 1.0)
         return weakness(self.inspection, min(self.sigma0, scale))
 

@@ -20,7 +20,7 @@ RANGE = 1.3
 REACH, PART = 0.85, 0.6
 LARGEST_RMS = 1.0
 """A larger RMS, in pixels, is not caused by corner detection."""
-CONTRADICTION = 3.0
+LARGEST_TEST = 3.0
 SMALLEST_T = 1.0
 """A distortion coefficient with smaller |value|/σ is insignificant."""
 
@@ -53,7 +53,7 @@ def advice(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
             "board (--board-sigma), or free more parameters"
         )
-    if validation is not None and validation.test > CONTRADICTION:
+    if validation is not None and validation.test > LARGEST_TEST:
         found.append(
             f"the two halves of the photographs contradict each other (test {validation.test:.1f}, "
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "

@@ -58,7 +58,7 @@ FEWEST = 10
 
 DEGREES = {"camera": 5, "heights": 4, "plane": 2}
 """Degrees of the polynomials of a smooth bias."""
-ABSORBED = 0.01
+SMALLEST_REMAINDER = 0.01
 """Smallest fraction of the square of a field that the unknowns must leave."""
 
 
@@ -160,7 +160,7 @@ def _gain(adjustment, found, B) -> tuple[float, int]:
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
     score, S = lagrange_multipliers(adjustment, found, B)
     size, V = np.linalg.eigh(S)
-    new = size > ABSORBED
+    new = size > SMALLEST_REMAINDER
     return float(((V[:, new].T @ score) ** 2 / size[new]).sum()), int(new.sum())
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxbundle.calibration.advice import CONTRADICTION, PART, REACH
+from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
@@ -94,7 +94,7 @@ def _halves(calibration) -> list[Finding]:
     checked = calibration.cross_validation
     if checked is None:
         return []
-    state = DOUBTFUL if checked.test > CONTRADICTION else GOOD
+    state = DOUBTFUL if checked.test > LARGEST_TEST else GOOD
     return [Finding("Cross-validation", state, " ".join(cross_validation_in_words(calibration)))]
 
 

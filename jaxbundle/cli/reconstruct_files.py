@@ -25,7 +25,7 @@ from jaxbundle.report.page import UNKNOWN, Origin
 BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
 OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
 FILES = (*OF_A_PART, *(f"part_*/{name}" for name in OF_A_PART), PAIRS, *PAIR_FIGURES)
-SHOWN = 1200
+FIGURE_PIXELS = 1200
 """Pixels of the longer side of a photograph in a figure."""
 
 
@@ -80,7 +80,7 @@ def _thumbnail(path: Path):
         grey = read_photograph(path)
     except InputError:
         return np.full((2, 2), 255, np.uint8)
-    step = max(1, max(grey.shape) // SHOWN)
+    step = max(1, max(grey.shape) // FIGURE_PIXELS)
     return grey[::step, ::step]
 
 

@@ -11,8 +11,8 @@ from jax import monitoring
 
 from jaxbundle.report.page.origin import software_versions
 
-MADE = "/jax/core/compile/backend_compile_duration"
-FOUND = "/jax/compilation_cache/cache_hits"
+COMPILED_EVENT = "/jax/core/compile/backend_compile_duration"
+CACHE_HIT_EVENT = "/jax/compilation_cache/cache_hits"
 
 
 def say(words: str) -> None:
@@ -28,11 +28,11 @@ def report_times() -> Iterator[None]:
     found: list[str] = []
 
     def hear_time(event: str, duration_secs: float, **_: str | int) -> None:
-        if event == MADE:
+        if event == COMPILED_EVENT:
             made.append(duration_secs)
 
     def hear(event: str, **_: str | int) -> None:
-        if event == FOUND:
+        if event == CACHE_HIT_EVENT:
             found.append(event)
 
     monitoring.register_event_duration_secs_listener(hear_time)

@@ -45,7 +45,7 @@ STEPS = 6
 SLIDER = 0.04
 """Range of a slider: largest motion of an image point near a corner, relative to the half
 diagonal."""
-WIDEST = 1000
+PAGE_PIXELS = 1000
 """Pixels across of a photograph on the page."""
 JPEG_QUALITY = 85
 
@@ -258,7 +258,7 @@ class CameraView:
     def _lookup(self, shape: tuple[int, int], values):
         """Columns and rows in a photograph of the pixels of its undistorted picture."""
         rows, columns = shape
-        every = max(1.0, columns / WIDEST)
+        every = max(1.0, columns / PAGE_PIXELS)
         u, v = (np.arange(0, n - 1 + 1e-9, every) for n in (columns, rows))
         pixels = np.stack(np.meshgrid(u, v), -1)
         xy = (pixels - self.origin_of_pixels) / self.step

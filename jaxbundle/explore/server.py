@@ -30,7 +30,7 @@ HOST = "127.0.0.1"
 MOST_BYTES = 256 * 1024
 """Maximum bytes of the body of a request."""
 MOST_READ = 16 * MOST_BYTES
-PATIENCE = 30.0
+REQUEST_TIMEOUT = 30.0
 """Timeout for the announced body of a request, seconds."""
 HTML, JSON = "text/html; charset=utf-8", "application/json"
 
@@ -77,7 +77,7 @@ class Handler(BaseHTTPRequestHandler):
 
     server: Server
     server_version, sys_version = "jaxbundle", ""
-    timeout = PATIENCE
+    timeout = REQUEST_TIMEOUT
 
     def do_GET(self) -> None:
         """The page."""

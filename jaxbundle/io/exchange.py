@@ -24,7 +24,7 @@ from jaxbundle.io.formats import (
 )
 from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
-from jaxbundle.io.networks.jaicov import BESIDE
+from jaxbundle.io.networks.jaicov import COMPANION_SUFFIXES
 from jaxbundle.io.networks.project import FILE_NAME
 from jaxbundle.io.results.coordinates import images_path
 from jaxbundle.io.writing.folders import check_folder, replace_folder
@@ -218,7 +218,7 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
     beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST],
-              "jaicov": [output.with_suffix(suffix) for suffix in BESIDE]}  # fmt: skip
+              "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES]}  # fmt: skip
     there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(

@@ -47,7 +47,7 @@ from jaxbundle.leastsquares.quality.cofactors import (
 from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 
-HERE = "the plan"
+PLAN_PLACEHOLDER = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
 
 TO_SHARE = 10_000
@@ -271,7 +271,7 @@ def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Facto
 def without_plan(factor: Factor) -> Factor:
     """A factor without its plan, which a compiled function would copy."""
     is_plan = lambda x: isinstance(x, Plan)
-    return jax.tree.map(lambda x: HERE if is_plan(x) else x, factor, is_leaf=is_plan)
+    return jax.tree.map(lambda x: PLAN_PLACEHOLDER if is_plan(x) else x, factor, is_leaf=is_plan)
 
 
 def with_plan(factor: Factor, plan: Plan) -> Factor:

@@ -29,7 +29,10 @@ from jaxbundle.choices import BOARDS
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
-LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2}
+SMALLEST_SIDE = {
+    "chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2
+}  # fmt: skip
+"""Minimum columns and rows of a board."""
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
 ARUCO, APRILTAGS = "DICT_4X4_50", "DICT_APRILTAG_36h11"
@@ -69,7 +72,7 @@ class Board:
     def __post_init__(self):
         if not isinstance(self.kind, str) or self.kind not in BOARDS:
             raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, BOARDS)}")
-        least = LEAST[self.kind]
+        least = SMALLEST_SIDE[self.kind]
         for name in ("columns", "rows"):
             integer(f"board: {name}", getattr(self, name), least=0)
         if min(self.columns, self.rows) < least or self.columns * self.rows > 100_000:

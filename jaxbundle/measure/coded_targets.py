@@ -30,7 +30,7 @@ from jaxbundle.photographs.opencv import need_opencv
 
 CORNER = 0.1
 """σ of a corner, pixels."""
-WITHIN = 3
+CORNER_HALF_WINDOW = 3
 """Half a window in which a corner is refined, pixels."""
 SAMPLES = 20
 """Samples in every sector of a ring."""
@@ -109,7 +109,7 @@ def _markers(grey, dictionary, border):
     found = []
     for four, id in zip(corners, [] if ids is None else ids.ravel().tolist()):
         side = np.linalg.norm(np.diff(four[0], axis=0), axis=1).min()
-        half = int(np.clip(side / 8, 1, WITHIN))
+        half = int(np.clip(side / 8, 1, CORNER_HALF_WINDOW))
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.005)
         xy = cv2.cornerSubPix(grey, four[0].astype(np.float32).copy(), (half, half), (-1, -1), stop)
         found += [(f"{id}-{k}", place, (CORNER, CORNER)) for k, place in enumerate(xy, 1)]

@@ -60,7 +60,7 @@ LARGEST_SHIFT = 0.5
 """The centre may move from its start by this part of the side of the window."""
 SMALLEST_CONTRAST = 1e-6
 """Standard deviation of grey values, relative to the largest, below which there is no contrast."""
-DETERMINED = 1e-5
+SMALLEST_PIVOT = 1e-5
 """Smallest square of a pivot of N, scaled to a unit diagonal; below it nothing is determined."""
 TINY = 1e-20
 UNKNOWNS = 8
@@ -320,7 +320,7 @@ def _inverse(N):
     scaled = N * scale * scale[:, None]
     factor = cho_factor(scaled)
     least = jnp.min(jnp.diag(factor[0]) ** 2)
-    determined = jnp.isfinite(least) & (least > DETERMINED)
+    determined = jnp.isfinite(least) & (least > SMALLEST_PIVOT)
     safe = jnp.where(determined, scaled, jnp.eye(UNKNOWNS, dtype=N.dtype))
     return cho_solve(cho_factor(safe), jnp.eye(UNKNOWNS, dtype=N.dtype)) * scale * scale[
         :, None

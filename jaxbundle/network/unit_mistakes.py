@@ -29,7 +29,7 @@ LEAST_PIXELS = 300.0
 """No camera has a c of fewer pixels."""
 HALF_OF_POINTS = 1 / 3
 """Width of an image evenly filled from whose centre half of its points lie (sides 3 : 2)."""
-THOUSAND = (300.0, 3000.0)
+MILLIMETRE_RATIOS = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
 
@@ -167,4 +167,4 @@ def _distances_against_control(network: Network) -> str:
 def _thousand(a: float, b: float) -> bool:
     if not min(a, b) > 0:
         return False
-    return THOUSAND[0] < max(a / b, b / a) < THOUSAND[1]
+    return MILLIMETRE_RATIOS[0] < max(a / b, b / a) < MILLIMETRE_RATIOS[1]

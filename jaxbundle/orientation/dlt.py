@@ -29,7 +29,7 @@ from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
-FLAT = 1e-7
+SMALLEST_SINGULAR_VALUE = 1e-7
 """Extents of points, and second last singular values, below this part of the first are zero."""
 
 
@@ -77,9 +77,9 @@ def direct_linear_transformation(
     at_mean = P[2, :3] @ m + P[2, 3]
     size = extent(X, p)
     status = first_of(
-        (size[1] < FLAT, Status.COLLINEAR_POINTS),
-        (size[2] < FLAT, Status.COPLANAR_POINTS),
-        (singular[-2] < FLAT * singular[0], Status.UNDETERMINED),
+        (size[1] < SMALLEST_SINGULAR_VALUE, Status.COLLINEAR_POINTS),
+        (size[2] < SMALLEST_SINGULAR_VALUE, Status.COPLANAR_POINTS),
+        (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0], Status.UNDETERMINED),
     )
     return P / jnp.where(at_mean == 0, 1, at_mean), status
 

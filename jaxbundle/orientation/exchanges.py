@@ -19,14 +19,14 @@ from jaxbundle.orientation.alignment import FITS
 from jaxbundle.orientation.growth import FOR_ITSELF, Model, are_controlled, intersect
 from jaxbundle.orientation.sights import Sights, sights
 
-CONTRADICTION = "control points contradict each other"
+CONTRADICTORY_CONTROL = "control points contradict each other"
 TRIPLES = 120
 """Largest number of tested similarities of three points."""
 ALL_PAIRS_UP_TO = 12
 """With at most this many points every swap of two is tried."""
 FEWEST_AGREEING = 4
 """Minimum number of consistent points before the others are suspected; three always agree."""
-AS_GOOD = 3.0
+EQUAL_FIT_RATIO = 3.0
 """Explanations with a fit worse than the best by at most this factor are also reported."""
 
 
@@ -46,7 +46,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
     causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in found.exchanges]
     causes += [f"the coordinates or the number of {ids[k]!r} are wrong" for k in found.wrong]
     shown = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
-    begin = f"the {len(ids)} {CONTRADICTION} by {found.before:.2g} {unit}"
+    begin = f"the {len(ids)} {CONTRADICTORY_CONTROL} by {found.before:.2g} {unit}"
     if found.together or len(causes) == 1:
         return (
             f"{begin}, and fit to {found.after:.2g} {unit} if {' and '.join(shown)}: correct the "
@@ -132,7 +132,7 @@ def _by_trial(source, target, tolerance, before):
     if not found:
         return None
     best = min(found)[0]
-    found = [entry for entry in sorted(found) if entry[0] <= AS_GOOD * best]
+    found = [entry for entry in sorted(found) if entry[0] <= EQUAL_FIT_RATIO * best]
     exchanges = [pair for _, pair, _ in found if pair]
     wrong = [k for *_, left_out in found for k in left_out]
     return Contradiction(before, best, exchanges, wrong, together=False)

@@ -4,8 +4,8 @@
 
 An image is resected from at least `FEWEST_POINTS` known points, most of which must agree; images
 with the most known points come first. A point is intersected from at least two consistent rays with
-an angle above `NARROW`. All tests use the tolerance of start values; the subsequent adjustment
-refines the result.
+an angle above `Demands.angle`. All tests use the tolerance of start values; the subsequent
+adjustment refines the result.
 """
 
 import dataclasses

@@ -44,15 +44,15 @@ from jaxbundle.orientation.growth import (
 from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.types import Index
 
-IN_COMMON = 6
+FEWEST_COMMON = 6
 """Minimum common points of a starting pair."""
 PAIRS = 16
 """Largest number of pairs for relative orientation."""
 SEEDS = 6
 """Largest number of pairs a model is grown from."""
-OUT_OF_THE_QUESTION = 3.0
+EXCLUSION_RATIO = 3.0
 """Image points with larger misclosures, in tolerances, are excluded."""
-CONTRADICTED = 0.1
+CONTRADICTED_SHARE = 0.1
 """Fraction of rays that miss their control points, or of points whose rays do not intersect, above
 which a mirror image is tested."""
 LEAST_CONTROL = 3
@@ -162,8 +162,8 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
-        wrong[rays].sum() > CONTRADICTED * rays.sum()
-        or unmet.sum() > CONTRADICTED * seen_twice.sum()
+        wrong[rays].sum() > CONTRADICTED_SHARE * rays.sum()
+        or unmet.sum() > CONTRADICTED_SHARE * seen_twice.sum()
     )
 
 
@@ -245,7 +245,7 @@ def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.nd
     """The images that share enough points with some of these."""
     of_these = np.zeros(seen.points, bool)
     of_these[seen.point[images[seen.image]]] = True
-    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= IN_COMMON
+    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= FEWEST_COMMON
 
 
 def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
@@ -267,7 +267,7 @@ def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
     pairs, number = _all_pairs(seen, among)
-    use = (number >= IN_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
+    use = (number >= FEWEST_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
     pairs, number = pairs[use], number[use]
     order = np.argsort(-number, kind="stable")
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
@@ -338,7 +338,7 @@ def _in_contradiction(names: Sequence[str]) -> str:
 
 def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
-    return misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+    return misclosures(seen, model) > EXCLUSION_RATIO * seen.tolerance[seen.image]
 
 
 def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
@@ -385,17 +385,17 @@ def _why_nothing(network: Network, seen: Sights) -> str:
         f"{network.images.id[best]!r} at most), and "
     )
     one, other, most = _most_in_common(seen)
-    if most < IN_COMMON:
+    if most < FEWEST_COMMON:
         pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
         return (
-            f"{begin}no two images have the {IN_COMMON} points in common that a relative "
+            f"{begin}no two images have the {FEWEST_COMMON} points in common that a relative "
             f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
             "give start values"
         )
     return (
-        f"{begin}no two images share {IN_COMMON} points whose rays meet at an angle ({most} points "
-        "in common at most): take images from different positions, look for wrong point numbers, "
-        "or give start values"
+        f"{begin}no two images share {FEWEST_COMMON} points whose rays meet at an angle ({most} "
+        "points in common at most): take images from different positions, look for wrong point "
+        "numbers, or give start values"
     )
 
 

@@ -16,7 +16,7 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.sights import sights
 
-IN_COMMON = 5
+FEWEST_COMMON = 5
 """Minimum common points: a rotation has 3 parameters, the points 10 coordinates."""
 MOST_COMPARED = 200
 """Number of images compared with the one that has the most image points."""
@@ -49,7 +49,7 @@ def _is_rotation(seen, sigma, one: int, other: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
     a, b = seen.of(one), seen.of(other)
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
-    if len(k) < IN_COMMON:
+    if len(k) < FEWEST_COMMON:
         return False
     noise = np.sqrt((sigma[a][k] ** 2).sum(1) + (sigma[b][l] ** 2).sum(1))
     field = min(_field(seen.xy[a][k]), _field(seen.xy[b][l]))

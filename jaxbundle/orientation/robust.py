@@ -41,7 +41,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 IMPOSSIBLE_ERROR = 1e6
 """Error of an observation that is impossible in a model (a point behind the camera)."""
-CUT = 2.5
+OUTLIER_LIMIT = 2.5
 """Observations beyond this number of robust standard deviations are gross errors (LMedS)."""
 ROUNDING = 1e-11
 """Smallest standard deviation."""
@@ -102,9 +102,10 @@ def consensus(
 
 
 def robust_limit(e: Float[AnyArray, " n"], present: Bool[AnyArray, " n"], size: int) -> Array:
-    """CUT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p. 202)."""
+    """OUTLIER_LIMIT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p.
+    202)."""
     spare = jnp.maximum(jnp.sum(present) - size, 1)
-    return CUT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
+    return OUTLIER_LIMIT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
 
 
 def robust_resection(

@@ -27,7 +27,7 @@ BLOCKS = (32, 8)
 STEPS, SECANTS = 400, 12
 NEAR_SURFACE = 1e-3
 """A ray is traced to f below this fraction of the relief, then by secants."""
-GRAZING = 1e-9
+GRAZING_TOLERANCE = 1e-9
 """Like `NEAR_SURFACE`, if the secants diverge because the ray grazes a summit."""
 ON_SURFACE = 1e-9
 """Tolerance of f for a point on the surface, relative to the length of the ray."""
@@ -127,9 +127,9 @@ class HeightField:
         found = self._settle(o, d, t)
         lost = np.flatnonzero(np.isfinite(t) & ~np.isfinite(found))
         if len(lost):  # a ray that grazes a summit goes on
-            t = self._march(o, d, t, lost, ends, GRAZING * relief)
+            t = self._march(o, d, t, lost, ends, GRAZING_TOLERANCE * relief)
             with np.errstate(invalid="ignore"):
-                on = self._above(o[lost], d[lost], t[lost]) <= GRAZING * relief
+                on = self._above(o[lost], d[lost], t[lost]) <= GRAZING_TOLERANCE * relief
             found[lost] = self._inside(o[lost], d[lost], np.where(on, t[lost], np.inf))
         return found
 

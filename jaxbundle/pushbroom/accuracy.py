@@ -29,7 +29,7 @@ from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas, zero_erro
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray
 
-TINY = 1e-300
+SMALLEST_DENOMINATOR = 1e-300
 """Replaces zero in a denominator."""
 
 
@@ -124,7 +124,8 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     angle = (np.arange(2000) + 0.5) * np.pi / 2000
     # in axes of unit variance the circle has the radius r/√(λ₁cos² + λ₂sin²)
     small, great = variances.swapaxes(0, 1) / large
-    stretch = np.maximum(great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2, TINY)
+    stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
+    stretch = np.maximum(stretch, SMALLEST_DENOMINATOR)
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 

@@ -31,7 +31,7 @@ from jaxbundle.types import AnyArray
 
 BLOCK, STEP = 256, 16
 """Pixels of a block of the map along each side, and between its nodes."""
-BESIDE = 2.0 * BLOCK
+SEARCH_MARGIN = 2.0 * BLOCK
 """Nodes are searched this many lines and pixels beyond the image, to enclose its edges."""
 
 
@@ -79,7 +79,7 @@ def block_places(
     """
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
-    found = project_points(image, search, raised.reshape(3, -1), margin=BESIDE)
+    found = project_points(image, search, raised.reshape(3, -1), margin=SEARCH_MARGIN)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():

@@ -41,7 +41,7 @@ LAST_STEP = 1e-9
 """A last step below this, in units of the scales, ends Newton's method."""
 MARGIN = 0.1
 """Tolerance beyond the scales (of 1) that counts as inside."""
-AHEAD = 20e3
+START_HEIGHT = 20e3
 """A line of sight begins this far above the highest height of the domain, metres."""
 ROUNDS = 3
 
@@ -165,7 +165,7 @@ def locate_on(
         return (along(o, difference(own, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-    start = (along(top, d, -AHEAD), nothing)
+    start = (along(top, d, -START_HEIGHT), nothing)
     (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=ROUNDS)
     missed = jnp.isnan(h)
     return longitude, latitude, h, jnp.where(missed, int(RpcStatus.NOT_CONVERGED), status)

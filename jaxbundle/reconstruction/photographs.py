@@ -12,7 +12,7 @@ from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
 from jaxbundle.photographs.reading import SUFFIXES, photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
-GUESSED = 1.2
+DEFAULT_RATIO = 1.2
 """Default principal distance relative to the longer side."""
 SHORTEST_SIDE = 64
 """Minimum pixels of the shorter side."""
@@ -127,7 +127,7 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
-        f = told[0] if told else GUESSED * max(exif.size)
+        f = told[0] if told else DEFAULT_RATIO * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
         cameras.append(_new_camera(id, f, exif.size))
         known.append(told is not None)

@@ -24,7 +24,7 @@ from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.further.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
 
-EVERY = "*"
+WILDCARD = "*"
 """Wildcard for all ids, or all names, of held quantities."""
 ANGLES_OF_POSES = EXTERIOR[3:]
 
@@ -110,7 +110,7 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     text, estimated = ":".join((kind, id, parameter)), []
     tables = _tables_of(problem, kind)
     ids = [table.label(row) for table in tables for row in range(table.rows)]
-    if id != EVERY and id not in ids:
+    if id != WILDCARD and id not in ids:
         raise InputError(
             f"{text}: there is no {kind} {id!r}{did_you_mean(id, ids, listing=len(ids) <= 20)}"
         )
@@ -119,10 +119,10 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
         names = _names(problem, table)
         known += [name for name in names if name not in known]
         for row in range(table.rows):
-            if id not in (EVERY, table.label(row)):
+            if id not in (WILDCARD, table.label(row)):
                 continue
             for column, of in enumerate(names):
-                if parameter not in (EVERY, of):
+                if parameter not in (WILDCARD, of):
                     continue
                 place = table, row, column, of
                 (estimated if _is_free(table, row, column) else found).append(place)

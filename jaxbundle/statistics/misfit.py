@@ -8,9 +8,9 @@ import math
 
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
-CONTRADICTED = 1.2
+CONTRADICTING_RATIO = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is also significant."""
-BEYOND_CHANCE = 0.001
+SIGNIFICANCE = 0.001
 LARGEST_REMOVED = 0.05
 """A larger fraction of removed image points, beyond chance, is reported."""
 UNRECOGNISABLE = 20.0
@@ -21,9 +21,9 @@ def contradicts(scale: float, redundancy: int) -> bool:
     """Whether a scale of 1 can be excluded."""
     low, high = (
         math.sqrt(chi2_quantile(p, redundancy) / redundancy)
-        for p in (BEYOND_CHANCE / 2, 1 - BEYOND_CHANCE / 2)
+        for p in (SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2)
     )
-    return not (min(1 / CONTRADICTED, low) <= scale <= max(CONTRADICTED, high))
+    return not (min(1 / CONTRADICTING_RATIO, low) <= scale <= max(CONTRADICTING_RATIO, high))
 
 
 def doubt_of_baarda(
@@ -83,7 +83,7 @@ def doubt_of_fit(
     sigma, blunders = "a priori σ that are too small", "blunders (--snooping pope)"
     missing = "a camera parameter that is missing or held"
     mirrored = "image coordinates with a mirrored axis or in another unit"
-    if scale < CONTRADICTED or scale < sigma0 / 2:
+    if scale < CONTRADICTING_RATIO or scale < sigma0 / 2:
         causes = [blunders, missing, sigma]
     elif scale > UNRECOGNISABLE:
         causes = [mirrored, missing, sigma, blunders]

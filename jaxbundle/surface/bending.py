@@ -25,7 +25,7 @@ from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage
 
-REACHES = 4, 2
+NODE_REACHES = 4, 2
 """Nodes on each side of the centre for the polynomial. The wide one reduces the errors of the
 nodes, which are those of the matches around it, to an eighth; the narrow one is for surfaces
 that the wide one does not fit."""
@@ -56,7 +56,7 @@ class Bend(NamedTuple):
 
 def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
     """Derivatives of the widest fitting polynomial around the nearest node."""
-    wide, narrow = (_polynomials(guide, uv, reach) for reach in REACHES)
+    wide, narrow = (_polynomials(guide, uv, reach) for reach in NODE_REACHES)
     derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
     return Bend(derivatives, wide.known | narrow.known)
 

@@ -13,7 +13,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.surface.cloud import Cloud
 
 NEIGHBOURS = 8
-FARTHEST = 3.0
+LARGEST_DISTANCE = 3.0
 """Maximum distance of neighbours, in median spacings of the second cloud."""
 POINTS_AT_ONCE = 1 << 16
 
@@ -31,7 +31,8 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     for first in range(0, len(cloud), POINTS_AT_ONCE):
         part = slice(first, min(first + POINTS_AT_ONCE, len(cloud)))
-        distance[part], sigma[part] = _to_planes(cloud, other, tree, k, part, FARTHEST * spacing)
+        found = _to_planes(cloud, other, tree, k, part, LARGEST_DISTANCE * spacing)
+        distance[part], sigma[part] = found
     v = distance[np.isfinite(distance)]
     if not len(v):
         raise InputError("the clouds have nothing in common: check their coordinate systems")

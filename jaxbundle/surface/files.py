@@ -16,7 +16,7 @@ from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.reconstruct import Surface
 
 COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
-NEEDED = COLUMNS[:3]
+REQUIRED_COLUMNS = COLUMNS[:3]
 POINTS_AT_ONCE = 1 << 16
 
 
@@ -54,7 +54,7 @@ def read_cloud_csv(path: str | Path) -> Cloud:
     **Raises:** `InputError` naming file, line and column.
     """
     table = read_csv(Path(path))
-    X = np.stack([table.numbers(name, required=True) for name in NEEDED], axis=1)
+    X = np.stack([table.numbers(name, required=True) for name in REQUIRED_COLUMNS], axis=1)
     n = len(X)
     column = lambda name, default: (
         table.numbers(name) if name in table.values else np.full(n, default)

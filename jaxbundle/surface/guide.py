@@ -31,7 +31,7 @@ HALF_WINDOW = 4
 """Half the side of the windows, pixels of the level."""
 SEARCH_MARGIN = 2.0
 """Pixels of the coarser level searched beyond the neighbours' range."""
-WEAKEST = 0.35
+SMALLEST_CORRELATION = 0.35
 """Minimum correlation of a node."""
 LARGEST_DEVIATION = 2.0
 """Maximum distance of a node from the median of its neighbours, pixels of the level."""
@@ -220,7 +220,7 @@ def _smooth(base, level, uv, shape, q, rate, rho, _):
     """A guide from matches: poor or isolated nodes follow their neighbours."""
     step = SPACING * 2.0**level
     q, rate, rho = (np.asarray(a, float).reshape(shape) for a in (q, rate, rho))
-    known = np.isfinite(q) & (rho > WEAKEST)
+    known = np.isfinite(q) & (rho > SMALLEST_CORRELATION)
     rate = np.where((rate > 0) & np.isfinite(rate), rate, np.nan)
     rate = np.where(np.isfinite(rate), rate, np.nanmedian(rate))
     middle = _median(np.where(known, q, np.nan))

@@ -21,9 +21,9 @@ from jaxbundle.surface.views import FrameView
 
 ROOM, LEAST_ROOM = 0.15, 8.0
 """Margin of disparities beyond those of the points: relative to their range, and pixels."""
-WIDEST = 1.25
+LARGEST_ANGLE = 1.25
 """Radians from the axis of the rectified camera to the farthest ray."""
-LARGEST = 5.0
+LARGEST_SIZE_RATIO = 5.0
 """Pixels of the rectified image, as a multiple of those of the base image."""
 
 
@@ -81,13 +81,13 @@ def rectify(
     R = np.stack([x, np.cross(z, x), z])
     edge = base.edge()
     d = (base.points(edge, np.ones(len(edge))) - base.X0) @ R.T
-    if not (d[:, 2] > np.cos(WIDEST)).all():
+    if not (d[:, 2] > np.cos(LARGEST_ANGLE)).all():
         return None
     f = _resolution(base)
     low, high = (f * d[:, :2] / d[:, 2:]).min(0), (f * d[:, :2] / d[:, 2:]).max(0)
     first = np.floor(low)
     columns, rows = (int(n) for n in np.ceil(high) - first + 1)
-    if columns * rows > LARGEST * base.size[0] * base.size[1]:
+    if columns * rows > LARGEST_SIZE_RATIO * base.size[0] * base.size[1]:
         return None
     depth = (X - base.X0) @ z
     depth = depth[depth > 0]

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import jax
 
-QUICK = {"xla_backend_optimization_level": 0}
+QUICK_OPTIONS = {"xla_backend_optimization_level": 0}
 
 
 def quick_jit(function: Callable, **options) -> Callable:
     """`jax.jit` for functions rarely called from the host; with its options."""
-    return jax.jit(function, compiler_options=QUICK, **options)
+    return jax.jit(function, compiler_options=QUICK_OPTIONS, **options)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 GRACE = 0.3
 """Seconds for the main thread to handle a signal."""
 
-PATIENCE = 10.0
+LONGEST_DEFERRAL = 10.0
 """Seconds to finish a block of `defer_interrupts`; a hanging disk delays the exit no longer."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
@@ -98,7 +98,8 @@ def _watch(reader: int) -> None:
     while number not in WORDS:
         number = os.read(reader, 1)[0]
     time.sleep(GRACE)
-    last = threading.Timer(2 * PATIENCE, _say_and_exit, (number,))  # The disk does not answer.
+    # The disk does not answer.
+    last = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
     last.daemon = True
     last.start()
     _end(number)
@@ -110,7 +111,7 @@ def _end(number: int) -> None:
         _say_and_exit(number)
     _ending.acquire()
     _become_deaf()
-    _temporaries.remove_temporaries(PATIENCE)
+    _temporaries.remove_temporaries(LONGEST_DEFERRAL)
     _say_and_exit(number)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-PATIENCE = 5.0
+EXIT_TIMEOUT = 5.0
 """Seconds for a process without work to end."""
 
 
@@ -42,7 +42,7 @@ class Workers:
             connection.close()
             if connection in self._busy:
                 process.terminate()
-            process.join(PATIENCE)
+            process.join(EXIT_TIMEOUT)
         self._idle, self._busy = [], {}
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:

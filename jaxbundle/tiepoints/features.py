@@ -18,7 +18,7 @@ from jaxbundle.photographs.opencv import need_opencv
 
 CELLS = 16
 """Cells of the grid along the longer side."""
-AMPLE = 1.6
+SEARCH_FACTOR = 1.6
 """Searched features, as a multiple of those kept."""
 TILE = 2400
 """Side of the tiles in which a large photograph is searched, reduced pixels."""
@@ -83,7 +83,7 @@ def find_features(
 
 
 def _detector(cv2, settings: Detection):
-    ample = int(AMPLE * settings.number)
+    ample = int(SEARCH_FACTOR * settings.number)
     if settings.kind == "sift":
         return cv2.SIFT_create(nfeatures=ample, contrastThreshold=0.02)
     if settings.kind == "orb":

@@ -40,9 +40,9 @@ required to accept one that differs by a factor of e; for another factor x·(1 +
 x = |ln| of it."""
 WIDE_ANGLE = 0.12
 """Angle of intersection, radians, above which wider angles are not better."""
-FARTHEST = 0.35
+LARGEST_K1 = 0.35
 """Larger |k1| is rejected."""
-KNOWN = 1.35
+LARGEST_RATIO = 1.35
 """A principal distance tried, or from the file, may be wrong by this factor."""
 
 
@@ -89,8 +89,8 @@ def estimate_interior(
     if not len(use):
         return Start(_with(camera, f), 0, np.nan)
     f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
-    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < FARTHEST
-    sane &= 1 / KNOWN < f / tried[best] < KNOWN
+    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < LARGEST_K1
+    sane &= 1 / LARGEST_RATIO < f / tried[best] < LARGEST_RATIO
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
     return Start(better, len(use), float(np.median(np.abs(e))))
 

@@ -22,7 +22,7 @@ LARGEST_MOTION = 0.001
 """Maximum motion of a still feature, relative to the longer side."""
 SMALL_MOTION = 5.0
 """A small motion: below this multiple of it."""
-ALIKE = 1.25, 0.2
+FEATURE_TOLERANCES = 1.25, 0.2
 """Ratio of the sizes of equal features, and difference of their directions, radians."""
 LEAST, CLEAR = 16, 0.4
 """Minimum moved matches of a pair, and at least as many as still ones; and maximum of those with
@@ -68,7 +68,7 @@ def _still(
         return np.zeros(len(m.rows), bool), np.full(len(m.rows), np.inf)
     a, b = features[i].take(m.rows[:, 0]), features[j].take(m.rows[:, 1])
     motion = np.linalg.norm(a.xy - b.xy, axis=1) / (LARGEST_MOTION * max(sizes[i]))
-    ratio, turn = ALIKE
+    ratio, turn = FEATURE_TOLERANCES
     same = np.abs(np.log(a.size / b.size)) < np.log(ratio)
     same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < turn
     return same & (motion < 1), motion

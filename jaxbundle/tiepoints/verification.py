@@ -52,7 +52,7 @@ TURNS = 40
 """Number of pairs of matches for trial rotations."""
 FIRST_TOLERANCE = 3.0
 """The first choice of matches, in tolerances."""
-EXPLAINED = 0.9
+EXPLAINED_SHARE = 0.9
 """Share of the matches that a simpler relation must explain."""
 KINDS = ("relative", "plane", "rotation")
 
@@ -270,8 +270,8 @@ def _kinds(found, xy1, xy2, tolerance):
     for k, (good, *_) in enumerate(found):
         number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]
         by_rotation, by_plane = (float((e[k, :number] < near).mean()) for e in (turn, plane))
-        kind = "plane" if by_plane > EXPLAINED else "relative"
-        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED else kind))
+        kind = "plane" if by_plane > EXPLAINED_SHARE else "relative"
+        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED_SHARE else kind))
     return kinds
 
 

@@ -122,10 +122,10 @@ open("third", "w").close()
 
 
 def test_what_belongs_together_and_does_not_end_holds_nobody(tmp_path):
-    """If a disk does not answer between two renames, the process ends after `PATIENCE`."""
+    """If a disk does not answer between two renames, the process ends after `LONGEST_DEFERRAL`."""
     code = """
 from jaxbundle.system import interrupts
-interrupts.PATIENCE = 0.2
+interrupts.LONGEST_DEFERRAL = 0.2
 with temporary("half"), defer_interrupts():
     open("half", "w").close()
     interrupt()

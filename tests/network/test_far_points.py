@@ -14,7 +14,7 @@ from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
 from jaxbundle.bundle.minimum import inspect_solution
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_text
-from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
+from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, AnyDistance, derivative
 from jaxbundle.leastsquares.indexing.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.problem import pad_data, pad_values
 from jaxbundle.leastsquares.spaces import Vector
@@ -104,7 +104,7 @@ def test_a_step_beyond_infinity_ends_there():
     space, value = AnyDistance(), jnp.array([3.0, -2, 500, 2])
     u = value[:3] / jnp.linalg.norm(value[:3])
     there = space.retract(value, jnp.array([0.0, 0.0, -5.0]))
-    np.testing.assert_allclose(there[:3], FARTHEST * 2 * u, rtol=1e-12)
+    np.testing.assert_allclose(there[:3], LARGEST_DISTANCE * 2 * u, rtol=1e-12)
     back = space.retract(there, jnp.array([0.0, 0.0, 0.5]))
     assert 0 < jnp.linalg.norm(back[:3]) < 10 and back[:3] @ u > 0
 
@@ -206,7 +206,7 @@ def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
     problem, values = result.problem, result.values
     point = np.array(values.point)
     u = point[NEAR:] / np.linalg.norm(point[NEAR:], axis=1)[:, None]
-    point[NEAR:] = FARTHEST * LENGTHS[NEAR:, None] * u
+    point[NEAR:] = LARGEST_DISTANCE * LENGTHS[NEAR:, None] * u
     for start in (problem.data.start, dataclasses.replace(values, point=jnp.asarray(point))):
         again, minimum = minimise_with_infinity(problem, start, max_steps=100)
         np.testing.assert_array_equal(

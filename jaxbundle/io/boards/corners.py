@@ -27,7 +27,7 @@ from jaxbundle.network.columns import count, list_some
 
 COLUMNS = ("filename", "x", "y")
 QUALITY = ("level", "weight")
-NOTHING = "-"
+NO_COORDINATE = "-"
 
 
 def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> BoardViews:
@@ -78,12 +78,12 @@ def _legend(row: Row) -> list[str]:
 
 def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
-    if NOTHING in (given["x"], given["y"]):
+    if NO_COORDINATE in (given["x"], given["y"]):
         return np.nan, np.nan
     own = Row(row.path, row.number, f"{given['x']} {given['y']}")
     x, y = own.numbers(("x", "y"))
     for name in QUALITY:
-        if given.get(name, NOTHING) != NOTHING:
+        if given.get(name, NO_COORDINATE) != NO_COORDINATE:
             (value,) = Row(row.path, row.number, given[name]).numbers((name,))
             if value < 0 or (name == "weight" and value == 0):
                 return np.nan, np.nan

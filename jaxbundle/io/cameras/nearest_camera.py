@@ -48,7 +48,7 @@ PERSPECTIVE = (("opencv", OPENCV), ("opencv", RATIONAL), ("opencv", PRISM),
                ("opencv", (*RATIONAL, *PRISM[-4:])),
                ("brown-projected", fitted_parameters(get_model("brown-projected"))))  # fmt: skip
 FISHEYE = (("kannala-brandt", fitted_parameters(get_model("kannala-brandt"))),)
-NARROW = np.cos(np.radians(75))
+NARROW_COSINE = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
 
 
@@ -89,7 +89,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         )
     uv, rays = uv[there], rays[there] * [1, -1, -1]
     source = get_model("kannala-brandt" if camera.fisheye else "opencv")
-    narrow = (-rays[:, 2] > NARROW).all()
+    narrow = (-rays[:, 2] > NARROW_COSINE).all()
     found, problem = [], ""
     for name, free in (*(FISHEYE if camera.fisheye else ()), *(PERSPECTIVE if narrow else ())):
         target = get_model(name)

@@ -34,7 +34,7 @@ from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Distances, Network, Source
 
 SUFFIX = ".phc"
-BESIDE = (".ior", ".eor", ".obc", ".scale")
+COMPANION_SUFFIXES = (".ior", ".eor", ".obc", ".scale")
 CAP = 0
 """The order of rotations ω, φ, κ."""
 NOT_ORIENTED = 1
@@ -56,7 +56,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    beside = {suffix: path.with_suffix(suffix) for suffix in BESIDE}
+    beside = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
     cameras = _cameras(beside[".ior"])
     images, angles, position, camera, told = _images(beside[".eor"])
     points, at, datum = _points(beside[".obc"])

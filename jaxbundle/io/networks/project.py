@@ -42,7 +42,7 @@ from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, is_own
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.settings import (
-    NEEDED,
+    REQUIRED_TABLES,
     SETTINGS,
     TABLES,
     Document,
@@ -155,7 +155,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
         columns = as_columns(document[key], table)
         return Columns(columns.values, Source(f"{path} [[{key}]]", None, "entry"))
     if file is None:
-        if table not in NEEDED:
+        if table not in REQUIRED_TABLES:
             return None
         raise InputError(
             f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
@@ -251,7 +251,8 @@ def _document_text(network: Network) -> str:
     lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
     settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
     further = among(network)
-    tables = [*NEEDED, *["distances"] * (len(network.distances) > 0), *(f.TABLE for f in further)]
+    distances = ["distances"] * (len(network.distances) > 0)
+    tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in further)]
     settings |= {table: f"{table}.csv" for table in tables}
     if not network.datum_points:
         del settings["datum_points"]

@@ -16,8 +16,8 @@ from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import Network
 
-NEEDED = ("images", "points", "observations")
-TABLES = (*NEEDED, "distances", *KINDS)
+REQUIRED_TABLES = ("images", "points", "observations")
+TABLES = (*REQUIRED_TABLES, "distances", *KINDS)
 TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
 SETTINGS = (*TEXT, "sigma_image", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(

@@ -66,7 +66,7 @@ SECTIONS = {
     "noise": Noise._fields,
     "simulation": ("seed",),
 }
-NEEDED = ("scanner", "times", "optics", "track")
+REQUIRED_FIELDS = ("scanner", "times", "optics", "track")
 
 
 class FlightFile(NamedTuple):
@@ -82,7 +82,7 @@ def read_flight(path: str | Path) -> FlightFile:
 
     **Raises:** `InputError` naming file, section and key.
     """
-    file = read_sections(Path(path), SECTIONS, NEEDED)
+    file = read_sections(Path(path), SECTIONS, REQUIRED_FIELDS)
     scanner, times = file.section("scanner"), file.section("times")
     earth = earth_of(scanner)
     period = times.number("period")

@@ -62,7 +62,7 @@ SECTIONS = {
     ),
     "images": (), "sensors": (), "unknowns": (),
 }  # fmt: skip
-NEEDED = ("refine", "images", "unknowns")
+REQUIRED_FIELDS = ("refine", "images", "unknowns")
 WORDS = {"free": math.inf, "held": 0.0}
 TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
 LISTS = ("look_across", "look_along")
@@ -86,7 +86,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
-    file = read_sections(path, SECTIONS, NEEDED)
+    file = read_sections(path, SECTIONS, REQUIRED_FIELDS)
     section = file.section("refine")
     unit = section.text("angle_unit", "deg")
     if unit not in ANGLE_UNITS:

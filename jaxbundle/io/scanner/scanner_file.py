@@ -92,7 +92,7 @@ SECTIONS = {
     "corrections": Corrections._fields,
     "earth_orientation": frames.EarthOrientation._fields,
 }  # fmt: skip
-NEEDED = ("scanner", "times", "position", "attitude", "optics")
+REQUIRED_FIELDS = ("scanner", "times", "position", "attitude", "optics")
 
 
 def scanner_of(file: TomlFile) -> Scanner:
@@ -100,7 +100,7 @@ def scanner_of(file: TomlFile) -> Scanner:
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
-    file.require(NEEDED)
+    file.require(REQUIRED_FIELDS)
     scanner = file.section("scanner")
     lines, pixels = (scanner.integer(key) for key in ("lines", "pixels"))
     check_size(lines, pixels, scanner.where.removesuffix(": "))

@@ -15,7 +15,7 @@ from typing import Any
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
 
-DEEPEST = 32
+DEEPEST_NESTING = 32
 KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s*:(?:\s+(.*))?""")
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
@@ -85,8 +85,8 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
 
 def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
     """The value of the lines of one indentation, and the lines after it."""
-    if depth > DEEPEST:
-        raise lines[0].error(f"nested too deeply: more than {DEEPEST} levels")
+    if depth > DEEPEST_NESTING:
+        raise lines[0].error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
     read = _items if _is_item(lines[0]) else _keys
     return read(lines, indent, depth)
 
@@ -155,7 +155,7 @@ def _value(line: Line, text: str) -> Any:
             stack.pop()
         elif part.strip():
             stack[-1].append(_scalar(part.strip()))
-        if not stack or len(stack) > DEEPEST or (len(stack) == 1 and len(stack[0]) > 1):
+        if not stack or len(stack) > DEEPEST_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
             raise line.error(f"{show(text)}: brackets that do not match")
     return stack[0][0]
 

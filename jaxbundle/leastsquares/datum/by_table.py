@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import present
 
-HERE = "table"
+TABLE_ALONE = "table"
 """The name of a table treated alone."""
 LEAST_ROWS = 128
 """Tables are padded to at least this many rows."""
@@ -28,14 +28,14 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
     """`datum.generators` of all tables: [rows, width, motions]."""
     found, given = {}, present(declared.motions)
     for name, value in values.items():
-        action = tuple((HERE, act) for table, act in given.actions if table == name)
+        action = tuple((TABLE_ALONE, act) for table, act in given.actions if table == name)
         if not action:
             rows = len(jax.tree.leaves(value)[0])
             found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
             continue
         motions = Motions(given.names, action)
-        one = Declared((), ((HERE, declared.spaces[name]),), motions)
-        of_rows = lambda rows, one=one: _generators(one, {HERE: rows})[HERE]
+        one = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
+        of_rows = lambda rows, one=one: _generators(one, {TABLE_ALONE: rows})[TABLE_ALONE]
         found[name] = _of_rows(of_rows, value)
     return found
 

@@ -37,7 +37,7 @@ REACHABLE_RESIDUAL = 1e-10
 """The relative residual that rounding allows in one run: below it the search directions are noise,
 and steps may drift, above all along open motions. Solutions of full precision are refined once
 more, and are NaN if even this was not reached."""
-LEAST = 1e-300
+SMALLEST_DENOMINATOR = 1e-300
 
 
 class ConjugateGradients(eqx.Module):
@@ -62,7 +62,7 @@ class ConjugateGradients(eqx.Module):
         def improved(y, left, tolerance, steps):
             """y refined with the residual `left`, if that decreases it; and the new residual."""
             # lineax annotates a float, but accepts an array
-            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), LEAST)
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), SMALLEST_DENOMINATOR)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
             change = lx.linear_solve(operator, left, method, throw=False).value
             better = jax.tree.map(jnp.add, y, change)

@@ -22,7 +22,7 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.iterations.loop import iterate
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
-DETERMINED = 1e-10
+SMALLEST_EIGENVALUE = 1e-10
 """Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem."""
 MOST_EVALUATIONS = 30
 """Evaluations."""
@@ -43,7 +43,7 @@ class Fit(eqx.Module):
 
     @property
     def determined(self):
-        return self.weakest > DETERMINED
+        return self.weakest > SMALLEST_EIGENVALUE
 
 
 def adjust(
@@ -95,7 +95,7 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
     scaled = N * scale * scale[:, None]
     weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
-    determined = weakest > DETERMINED
+    determined = weakest > SMALLEST_EIGENVALUE
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)

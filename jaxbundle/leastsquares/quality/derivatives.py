@@ -49,7 +49,7 @@ from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, 
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
-ONCE = (
+FIRST_ORDER_ONLY = (
     'sensitivity = "gauss-newton" has first derivatives only: '
     'take second ones with sensitivity = "exact"'
 )
@@ -198,7 +198,7 @@ def _propagate(change: Tangent, at: Linearised, data: Data) -> Tangent:
 @_propagate.def_jvp
 def _(primals, tangents):
     change, at, data = primals
-    data, still = differentiable_once(data, ONCE), zero_tangent(at.plan)
+    data, still = differentiable_once(data, FIRST_ORDER_ONLY), zero_tangent(at.plan)
 
     def right(data):
         # J is constant except for its weights.
