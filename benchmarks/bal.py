@@ -4,26 +4,26 @@
         [--peers NAME ...] [--ceres BINARY] [--solver NAME] [--jaxls PYTHON] [--baseline]
 
 PROBLEM is a file in the BAL format (.txt, .gz, .bz2); `scenes.py` writes --street and --arc. Every
-solver runs in a process of its own, in turn, twice (--rounds), on two cores: Ceres with two
-threads, we with two CPU devices of JAX, or on the GPU. The peers, all that are there unless named:
+solver runs in its own process, in turn, twice (--rounds), on two cores: Ceres with two threads,
+ours with two CPU devices of JAX, or on the GPU. The peers, by default all installed ones:
 
     pycolmap   Ceres as it comes with pycolmap (pip install pycolmap)
     ceres      Ceres' own program `bundle_adjuster`: --ceres BINARY, or BUNDLE_ADJUSTER
     scipy      least_squares with exact derivatives, for a few evaluations
-    jaxls      of github.com/brentyi/jaxls (PyPI's package of this name is another one): in this
+    jaxls      of github.com/brentyi/jaxls (PyPI's package of this name is a different one): in this
                environment, or in that of --jaxls PYTHON
 
-A peer that is not there is named as skipped. Told are the lowest cost ½Σv² in pixels² and whether
-the limit of evaluations ended the search, the time of an iteration (the whole solution divided by
-its iterations, compilation apart), the time from the start values to 1.0001 × the lowest cost of
-all, the same divided by a peer's (ours / peer), compilation with an empty folder of compiled
-programs and in a second process with that folder, and the peak of the memory of the process.
---json has the cost after every evaluation and its time for all, --plot draws them.
+Missing peers are listed as skipped. The output gives the lowest cost ½Σv² in pixels² and whether
+the evaluation limit ended the search, the time of an iteration (the whole solution divided by its
+iterations, without compilation), the time from the start values to 1.0001 × the lowest cost of all,
+its ratio to a peer's (ours / peer), compilation with an empty folder of compiled programs and in a
+second process with that folder, and the peak memory of the process. --json has the cost after every
+evaluation and its time for all, --plot draws them.
 
-The exit status is 1 where our cost is higher than a peer's by 1e-6; where our search has not
-settled, unless a peer that came to its end, or Ceres within the same limit, has no lower cost, or
-`baseline.json` has no lower one; and with --baseline where it does not agree with `baseline.json`
-(see `baseline.py`; --write-baseline makes a new one). A peer that fails is noted.
+The exit status is 1 if our cost is higher than a peer's by 1e-6; if our search has not converged
+and a converged peer, Ceres within the same limit, or `baseline.json` has a lower cost; and with
+--baseline if the result disagrees with `baseline.json` (see `baseline.py`; --write-baseline makes a
+new one). A failing peer is reported.
 """
 
 import json
@@ -42,7 +42,7 @@ import machine
 HERE = Path(__file__).parent
 PEERS = ("pycolmap", "ceres", "scipy", "jaxls")
 FEW = {"scipy": 20, "jaxls": 30}
-"""Evaluations of those that are slow."""
+"""Evaluations of the slow solvers."""
 SEED = 0
 CERES = ("pycolmap", "ceres")
 READ = """
@@ -79,7 +79,7 @@ def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
     if "jaxls" in wanted:
         python = given.jaxls or sys.executable
         if not shutil.which(python):
-            skipped["jaxls"] = f"{python} is no program"
+            skipped["jaxls"] = f"{python} is not a program"
         elif subprocess.run([python, "-c", IS_JAXLS], capture_output=True).returncode == 0:
             found["jaxls"] = [python, "bal_jaxls.py"]
         else:
@@ -91,11 +91,11 @@ def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
 
 
 class Failed(Exception):
-    """A solver that gave no figures, and its last words."""
+    """A solver without figures, and its last line of output."""
 
 
 def run(command: list[str], problem: Path, evaluations: int, repeat: int) -> dict:
-    """Figures of one solver in a process of its own."""
+    """The figures of one solver in its own process."""
     python, program, *options = command
     done = subprocess.run(
         [python, str(HERE / program), str(problem), *options,
@@ -120,12 +120,12 @@ def best_of(runs: list[dict]) -> dict:
 
 
 def time_to(figures: dict, cost: float) -> float | None:
-    """Seconds from the start values until the cost was reached; none if it was not."""
+    """Seconds from the start values until the cost was reached; None if it was not."""
     return next((t for c, t in zip(figures["costs"], figures["at_s"]) if c <= cost), None)
 
 
 def compare(key: str, path: Path, todo: dict, given) -> dict:
-    """All solvers on one problem, taking turns; it begins without compiled programs."""
+    """All solvers on one problem, in turns, beginning without compiled programs."""
     runs, failed = {name: [] for name in todo}, {}
     with tempfile.TemporaryDirectory() as cache:
         todo = todo | {"ours": [*todo["ours"], "--cache", cache]}
@@ -157,7 +157,7 @@ def complaints(found: dict) -> list[str]:
              if not ours["cost"] <= (1 + 1e-6) * peer["cost"]]  # fmt: skip
     vouched = any(name in CERES or not peer["at_limit"] for name, peer in peers.items())
     if not (wrong or ours["settled"] or vouched or baseline.agrees(found)):
-        wrong = [f"{key}: not settled ({ours['ended']}), and nothing to compare with"]
+        wrong = [f"{key}: not converged ({ours['ended']}), and nothing to compare with"]
     return wrong
 
 
@@ -166,7 +166,7 @@ def ratio(ours: float | None, theirs: float | None) -> str:
 
 
 def told(found: dict) -> str:
-    """The figures for people."""
+    """The figures as text."""
     rows = [("", "cost", "evaluations", "ms/iteration", "ratio", "s to 1.0001", "ratio",
              "compile s, cached", "peak MB")]  # fmt: skip
     ours, notes = found["ours"], [f"failed: {text}" for text in found["failed"].values()]
@@ -211,23 +211,23 @@ def problems(given, folder: Path):
     import scenes
 
     for path in given.problems:
-        plain = scenes.unpacked(path, folder)
+        plain = scenes.unpack(path, folder)
         yield baseline.name_of_file(path, plain), plain
     for kind in ("street", "arc"):
         for images, points in getattr(given, kind) or ():
             plain = folder / f"{kind}.txt"
-            # In a process of its own: its memory would count as that of the solvers.
+            # In its own process: its memory would count as that of the solvers.
             name = f"{kind} of {images} images, {points} points, seed {SEED}"
             made = subprocess.run([sys.executable, str(HERE / "scenes.py"), kind, str(images),
                                    str(points), str(SEED), str(plain)],
                                   capture_output=True, text=True)  # fmt: skip
             if made.returncode:
-                sys.exit(f"{name}: cannot be made: {made.stderr.strip().splitlines()[-1]}")
+                sys.exit(f"{name}: cannot be created: {made.stderr.strip().splitlines()[-1]}")
             yield name, plain
 
 
 def arguments():
-    """Of the command line."""
+    """The arguments of the command line."""
     parser = machine.parser_of(__doc__)
     number = {"type": machine.positive}
     size = number | {"nargs": 2, "metavar": ("IMAGES", "POINTS"), "action": "append"}
@@ -260,7 +260,7 @@ def arguments():
     for path in given.problems:
         if not path.is_file():
             parser.error(f"there is no file {path}")
-        # In a process of its own: reading begins to use the device.
+        # In its own process: reading starts to use the device.
         read = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True,
                               text=True)  # fmt: skip
         if read.returncode:

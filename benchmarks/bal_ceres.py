@@ -20,7 +20,7 @@ import machine
 ROW = re.compile(r"^\s*(\d+)\s+([-\d.e+]+).*?([-\d.e+]+)\s+([-\d.e+]+)\s*$")
 SOLVERS = ("dense_schur", "sparse_schur", "iterative_schur")
 PRECONDITIONER = "schur_jacobi"
-"""Of iterative_schur."""
+"""Preconditioner of iterative_schur."""
 
 
 def figures_of(text: str) -> dict:

@@ -2,9 +2,9 @@
 
     PYTHON benchmarks/bal_jaxls.py PROBLEM [--evaluations N] [--repeat N]
 
-Points eliminated (which jaxls does by itself), dense Cholesky of what remains, damping begun with
-1e2 as in the BAL benchmark of jaxls itself, and as many iterations as asked for: it has no
-criterion to stop early here. Compilation is not in the times.
+Points are eliminated (by jaxls itself), the rest is solved by dense Cholesky; the initial damping
+is 1e2 as in the BAL benchmark of jaxls; the given number of iterations is run, without a stopping
+criterion. Times exclude compilation.
 """
 
 import json
@@ -73,7 +73,7 @@ def main() -> None:
     peak_mb = machine.peak_mb()
     seconds = min(timed()[1] for _ in range(given.repeat))
     number = int(summary.iterations)
-    # Its history tells Σv², of steps refused too.
+    # Its history contains Σv², also of rejected steps.
     costs = list(accumulate((0.5 * np.asarray(summary.cost_history)[:number]).tolist(), min))
     json.dump({
         "solver": f"jaxls {jaxls.__version__}, JAX {jax.__version__}",

@@ -1,11 +1,11 @@
-"""Our solver on one BAL problem, in a process of its own; prints one line of JSON for `bal.py`.
+"""Our solver on one BAL problem, in its own process; prints one line of JSON for `bal.py`.
 
     python benchmarks/bal_ours.py PROBLEM [--evaluations N] [--repeat N] [--devices N]
         [--reduction NAME] [--cache FOLDER]
 
-The first call compiles; the difference to the best later one is told as compilation: cold with an
-empty folder of compiled programs or none, cached with a full one. Memory is read after the first
-call, and once before anything but the import of JAX.
+The first call compiles; the difference from the best later one is reported as compilation: cold
+with an empty folder of compiled programs or none, cached with a full one. Memory is read after the
+first call, and once before anything but the import of JAX.
 """
 
 import json

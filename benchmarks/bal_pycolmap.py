@@ -4,16 +4,15 @@
         [--threads N]
 
 COLMAP's camera RADIAL is Snavely's (f, k1, k2) with a principal point, held at 0 here; its camera
-looks along +z with y down, that of a BAL problem along −z with y up: both are turned by 180° about
-x. Every image has its own camera, nothing is robust and no datum is fixed, so that the cost is that
-of the problem. One difference remains: COLMAP leaves out every ray of a point behind its camera,
-for as long as it lies there. Therefore ½Σv² of all rays is formed here too, of the start values
-and of the result; only where both are what Ceres says is the cost that of the same problem
-(`comparable`).
+looks along +z with y down, that of a BAL problem along −z with y up: both are rotated by 180° about
+x. Every image has its own camera, there is no loss function and no fixed datum, so the cost is that
+of the problem. One difference remains: COLMAP drops the rays of points behind the camera while they
+are there. Therefore ½Σv² of all rays is computed here too, for the start values and the result; the
+costs are `comparable` only if both agree with Ceres.
 
-Times are those of Ceres' minimizer, without COLMAP's preparation and Ceres' preprocessor. Pose and
-interior orientation are two blocks of parameters of an image for COLMAP, one block of nine in
-Ceres' own `bundle_adjuster`, whose compiled sizes 2, 3, 9 Ceres therefore cannot use here.
+Times are those of Ceres' minimizer, without COLMAP's preparation and Ceres' preprocessor. In COLMAP
+pose and interior orientation of an image are two parameter blocks, in Ceres' own `bundle_adjuster`
+one block of nine, so Ceres cannot use its compiled sizes 2, 3, 9 here.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ SAME = 1e-6
 
 
 def reconstruction(cameras, points, image, point, xy) -> pycolmap.Reconstruction:
-    """A BAL problem for COLMAP; numbers from 1, as there."""
+    """A BAL problem for COLMAP, numbered from 1 as there."""
     whole = pycolmap.Reconstruction()
     order = np.argsort(image, kind="stable")
     first = np.searchsorted(image[order], np.arange(len(cameras) + 1))
@@ -81,7 +80,7 @@ def values_of(whole: pycolmap.Reconstruction, cameras, points):
 
 
 def options_of(given) -> pycolmap.BundleAdjustmentOptions:
-    """As Ceres' example: its tolerances, no loss function, the solver and threads asked for."""
+    """As in Ceres' example: its tolerances, no loss function; the given solver and threads."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = True
     options.refine_principal_point = options.print_summary = False

@@ -2,10 +2,10 @@
 
     python benchmarks/bal_scipy.py PROBLEM [--evaluations N] [--repeat N]
 
-Trust region reflective with LSMR inside, columns scaled by the Jacobian. So that the solver is
-compared, not its differences, it gets exact derivatives: residuals and the blocks of the sparse
-Jacobian compiled by JAX, forward mode. Compilation is not in the times; an iteration is the whole
-solution divided by its evaluations.
+Trust region reflective with LSMR, columns scaled by the Jacobian. Residuals and the blocks of the
+exact sparse Jacobian are compiled by JAX (forward mode), so that the solver is compared and not
+numerical differences. Times exclude compilation; an iteration is the whole solution divided by its
+evaluations.
 """
 
 import json

@@ -1,10 +1,10 @@
 """Figures of `bal.py` against those committed in `baseline.json`: tight on cost, loose on time.
 
-An entry is found by all that fixes its cost: the problem (kind, images, points and seed of a
-synthetic one; name and digest of a file) and the settings of the solver. Costs agree to 1e-6: a
-higher one is wrong, a lower one says that the baseline is stale. An iteration may take three times
-as long beside pycolmap's as it did there; where pycolmap is missing on either side, four times as
-long on the clock.
+An entry is keyed by everything that determines its cost: the problem (kind, images, points and seed
+of a synthetic one; name and digest of a file) and the settings of the solver. Costs agree to 1e-6:
+a higher one is wrong, a lower one says that the baseline is stale. The ratio of an iteration to
+pycolmap's may grow by a factor of three; if pycolmap is missing on either side, the wall-clock time
+by a factor of four.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from pathlib import Path
 FILE = Path(__file__).parent / "baseline.json"
 TIGHT = 1e-6
 SLOWER, SLOWER_BESIDE = 4.0, 3.0
-"""Beside pycolmap, a factor of 1.9 was seen between two hours of one shared machine."""
+"""Relative to pycolmap, a factor of 1.9 was observed between two hours on one shared machine."""
 PEER = "pycolmap"
 KEPT = ("cost", "at_limit", "evaluations", "reduction", "iteration_s")
 
@@ -26,7 +26,7 @@ def name_of_file(path: Path, plain: Path) -> str:
 
 
 def key_of(problem: str, settings: dict) -> str:
-    """All that fixes a cost, in words."""
+    """Everything that determines a cost, in words."""
     return ", ".join([problem, *(f"{name} {value}" for name, value in settings.items())])
 
 
@@ -48,7 +48,7 @@ def agrees(found: dict) -> bool:
 
 
 def compare(all_found: list[dict]) -> tuple[list[str], list[str]]:
-    """What is wrong, and what only is to be known."""
+    """Errors, and remarks."""
     baseline = json.loads(FILE.read_text()) if FILE.exists() else {}
     wrong, known = [], []
     for found in all_found:

@@ -1,12 +1,12 @@
-"""The bias test of a calibration over many draws: how often it speaks, and of what.
+"""The bias test of a calibration over many draws: how often it rejects, and with which cause.
 
     python benchmarks/bias.py [--draws N] [--json FILE]
 
 Twelve views of a chessboard of 9 × 6 corners, 480 × 360 pixels, σ = 0.05 pixels, OpenCV's model.
-Clean data; a lens with k2 = −0.4 calibrated without k2 and k3; a board bent by 0.1 mm over its
-240 mm. The first draw of a case is calibrated from its corners alone, every other one is adjusted
-again from there. Exit status 1 where clean data are called biased in more than 3 % of the draws, or
-a bias is missed or laid to the wrong cause in more than 5 %.
+Clean data; a lens with k2 = −0.4 calibrated without k2 and k3; a board bent by 0.1 mm over its 240
+mm. The first draw of a case is calibrated from its corners alone, all others are adjusted again
+from there. Exit status 1 if clean data are called biased in more than 3 % of the draws, or a bias
+is missed or attributed to the wrong cause in more than 5 %.
 """
 
 import dataclasses

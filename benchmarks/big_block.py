@@ -5,10 +5,10 @@
 
 An aerial block in two layers is simulated: two thirds of the photographs vertical in strips (40 in
 five), one third in strips across, a quarter higher and tilted by 15°, over broken ground; one
-camera, c, x0, y0, K1, K2, K3, P1, P2 free; inner constraints. It is adjusted, and the time of each
-stage told: compilation apart (the first call less the best of the later ones), and the peak of the
-resident memory after each. On a shared machine the time of the processor says more than the time on
-the clock; both are given.
+camera, c, x0, y0, K1, K2, K3, P1, P2 free; inner constraints. It is adjusted. For each stage the
+output gives the time, compilation separately (the first call minus the best of the later ones), and
+the peak resident memory after it. On a shared machine processor time is more meaningful than
+wall-clock time; both are given.
 
 The answer is checked too: σ0 is 1 within its own standard deviation, and every parameter of the
 camera is within 4 σ of the truth. Otherwise the exit status is 1.
@@ -40,11 +40,11 @@ FORMAT = (92.0, 60.0)
 HEIGHT = 1000.0
 SIGMA = 0.003
 MEMORY_LIMIT_MB = {60: 2000, 1000: 4000}
-"""After the statistics, for blocks of up to so many images."""
+"""Limit of memory after the statistics, MB, for blocks of up to this many images."""
 
 
 def block(images: int, points: int, spacing: float = 1.0) -> Simulation:
-    """About so many images and points; lengths in m, image coordinates in mm.
+    """Approximately this many images and points; lengths in m, image coordinates in mm.
 
     `spacing` of the images: 1 for overlaps of 55 % along and 5 % across the strips; where it is
     closer, points have more rays."""
@@ -74,14 +74,15 @@ def block(images: int, points: int, spacing: float = 1.0) -> Simulation:
 
 
 def timed(function):
-    """The result of a call, and the seconds until its arrays were there: clock, processor."""
+    """The result of a call, and the seconds until its arrays were available: wall clock,
+    processor."""
     begin, begin_cpu = time.perf_counter(), time.process_time()
     result = jax.block_until_ready(function())
     return result, np.array([time.perf_counter() - begin, time.process_time() - begin_cpu])
 
 
 def best(function, repeat: int):
-    """The least clock and processor seconds of some calls."""
+    """The smallest wall-clock and processor seconds of several calls."""
     return np.min([timed(function)[1] for _ in range(repeat)], 0)
 
 
@@ -114,7 +115,7 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
     memory["statistics"] = machine.peak_mb()
     summary = {name: getattr(result, name) for name in ("redundancy", "converged", "termination")}
     summary["sigma0"], parameters = result.sigma0, result.cameras["cam"]["parameters"]
-    del result, _  # else there would be two of them at a time
+    del result, _  # otherwise two of them would exist at a time
     statistics_s = best(statistics, repeat)
 
     evaluations = int(minimum.iterations)
@@ -145,7 +146,7 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
 
 
 def complaints(figures: dict) -> list[str]:
-    """What is wrong with the answer, or with the memory it took."""
+    """Errors of the answer, or excessive memory."""
     found = [] if figures["converged"] else ["not converged"]
     # Corrected coordinates carry their noise times the scale of the correction, up to 0.3 % here.
     if not abs(figures["sigma0"] - 1) <= 4 / np.sqrt(2 * figures["redundancy"]) + 0.003:
@@ -161,7 +162,7 @@ def complaints(figures: dict) -> list[str]:
 
 
 def table(figures: dict) -> str:
-    """The figures for people."""
+    """The figures as text."""
     f = figures
     seconds = {
         stage: f"{clock:.3f} s, processor {cpu:.3f} s"
@@ -177,7 +178,7 @@ def table(figures: dict) -> str:
         ("compilation of the solver", seconds["compile"]),
         (f"solution, {f['evaluations']} evaluations", seconds["solve"]),
         ("  one iteration", seconds["iteration"]),
-        ("  moving it into its datum", seconds["datum"]),
+        ("  datum transformation", seconds["datum"]),
         ("compilation of the statistics", seconds["compile_statistics"]),
         ("statistics", seconds["statistics"]),
         ("peak memory (MB) after", memory),

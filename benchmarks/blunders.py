@@ -2,11 +2,11 @@
 
     python benchmarks/blunders.py [--images N] [--points N] [--share X] [--size X] [--json FILE]
 
-The block of `big_block.py`; a share of its image points (1 %) is moved by half to twice `size` σ
-in a random direction. It is adjusted as it is, with data snooping (Pope's test) and with Tukey's
-estimator, each called once: compilation is in the time. Told are the time on the clock and of the
-processor, and which blunders, and good points, were removed or suspected. The exit status is 1
-where one of both finds less than 90 % of them (some lie where nothing controls them).
+The block of `big_block.py`; a share of its image points (1 %) is moved by half to twice `size` σ in
+a random direction. It is adjusted without treatment, with data snooping (Pope's test) and with
+Tukey's estimator, once each: times include compilation. The output gives wall-clock and processor
+time, and the blunders and good points that were removed or suspected. The exit status is 1 if one
+of the two finds less than 90 % of the blunders (some are uncontrolled).
 """
 
 import dataclasses

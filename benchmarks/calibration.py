@@ -1,15 +1,15 @@
-"""1000 cameras, each calibrated by itself, against OpenCV in two processes in the same run.
+"""1000 cameras, calibrated independently, against OpenCV in two processes in the same run.
 
     python benchmarks/calibration.py [--cameras N] [--repeat N] [--json FILE]
 
 Every camera: 20 views of a board of 11 × 8 corners, 1920 × 1080 pixels, σ = 0.3 pixels, OpenCV's
 model of 5 coefficients. `jaxbundle.calibrate_batch` gives parameters, poses and all their standard
 deviations, `cv2.calibrateCamera` parameters and poses; both find their own start values. The two
-take turns; the best of all turns counts, compilation is told apart.
+take turns; the best of all turns counts, compilation is reported separately.
 
 The answers are checked: every camera has converged, the RMS is that of OpenCV to 1e-6 pixels (or
-lower, where OpenCV has not arrived after its 30 iterations), and the errors of the parameters
-divided by their σ have the standard deviation 1. Otherwise the exit status is 1. Without OpenCV
+lower, if OpenCV has not converged after its 30 iterations), and the errors of the parameters
+divided by their σ have standard deviation 1. Otherwise the exit status is 1. Without OpenCV
 (`opencv-python-headless`) only our side is measured.
 """
 
@@ -72,7 +72,7 @@ def simulate(seed: int):
 
 
 def opencv_start() -> None:
-    """In each process, before anything is timed."""
+    """Warm up each process before timing."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -88,7 +88,7 @@ def opencv_calibrate(views) -> float:
 
 
 def clock(function):
-    """Result, seconds on the clock, seconds of the processor (this process)."""
+    """Result, wall-clock seconds, processor seconds (this process)."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = function()
     return result, time.perf_counter() - wall, time.process_time() - cpu
@@ -109,7 +109,7 @@ def main() -> int:
     except ImportError:
         print("skipped: OpenCV: not installed (pip install opencv-python-headless)",
               file=sys.stderr)  # fmt: skip
-    # Before JAX starts its threads: processes of their own.
+    # Separate processes, before JAX starts its threads.
     pool = multiprocessing.get_context("spawn").Pool(PROCESSES, opencv_start) if peer else None
 
     import jaxbundle
@@ -146,7 +146,7 @@ def main() -> int:
     }
     wrong = [] if batch.converged.all() else ["not every camera has converged"]
     if not (np.abs(error.std(0) - 1) < 5 / np.sqrt(2 * n)).all():
-        wrong.append("errors of the parameters are not as large as their σ say")
+        wrong.append("errors of the parameters do not agree with their σ")
     if pool:
         spent = resource.getrusage(resource.RUSAGE_CHILDREN)
         difference = batch.rms - np.array(theirs)

@@ -2,10 +2,10 @@
 
     python benchmarks/design.py [points] [board]
 
-Four stations in a row, which are to measure points, and eight upright ones before a board, which
-are to calibrate a camera; the textbook's convergent layout of four with rolled cameras (Fraser
-1984; Luhmann et al. 2014, section 3.7), of the best radius and height that the same conditions
-allow. All networks are simulated and adjusted 200 times.
+Four stations in a row that measure points, and eight upright ones in front of a board that
+calibrate a camera; the textbook's convergent layout of four with rolled cameras (Fraser 1984;
+Luhmann et al. 2014, section 3.7), with the best radius and height under the same conditions. All
+networks are simulated and adjusted 200 times.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ CAMERA = jaxbundle.Camera(
     image_size=(6000, 4000), pixel_size=(0.006, 0.006),
 )  # fmt: skip
 SIGMA = 0.0012
-"""Of image coordinates, mm: a fifth of a pixel."""
+"""σ of image coordinates, mm: a fifth of a pixel."""
 ROOM = jaxbundle.Conditions(room=((-4, -4, 0.3), (4, 4, 3.5)), distance=(1.5, 6.0), apart=0.5)
 DRAWS = 200
 
@@ -96,7 +96,8 @@ def placed(start, stations, origin):
 
 
 def show(title: str, designed: jaxbundle.Design, seconds: float, least: float) -> bool:
-    """Print a design and its proof; whether it gains at least so much and is confirmed."""
+    """Print a design and its proof; returns whether it is confirmed and gains at least this
+    much."""
     proof = designed.prove(DRAWS)
     print(f"\n{title} ({seconds:.1f} s)\n{designed}\nproof: {proof}")
     problem = problem_of(designed.before.exact)

@@ -1,5 +1,5 @@
-"""What a focus ring that moves between photographs costs, and what an own principal distance for
-every photograph costs where it does not.
+"""The cost of a focus ring that moves between photographs, and of a separate principal distance for
+every photograph if it does not.
 
     python benchmarks/focus_ring.py [--draws N] [--json FILE]
 
@@ -14,8 +14,8 @@ photograph is off by a normal deviate of τ, a fraction of c. Each draw is adjus
 | tied | one for each, within σ = τ of that of the first (`ties` with σ = √2·τ) |
 
 Figures are over the draws: σ0 over the stated one, RMS error and RMS σ of a coordinate of the other
-targets in µm, RMS of error/σ (1 where the σ are honest), σ of the first c. Exit status 1 where
-`own` or `tied` are not honest to a fifth.
+targets in µm, RMS of error/σ (1 if the σ are realistic), σ of the first c. Exit status 1 if the σ
+of `own` or `tied` are wrong by more than a fifth.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ PHOTOGRAPHS, TARGETS, CONTROL = 12, 60, 4
 C, NOISE = 28.0, 5e-4
 SHARED = ("x0", "y0", "K1", "K2")
 LEAST_TIE = 1e-7
-"""σ of a tie where the ring stands still, mm."""
+"""σ of a tie if the ring does not move, mm."""
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Sets of rendered photographs with what real ones have, and their true projection centres.
+"""Sets of rendered photographs with the defects of real ones, and their true projection centres.
 
     python benchmarks/lifelike_sets.py NAME FOLDER [--width PIXELS]
 
@@ -8,10 +8,10 @@
 | `building` | along a front of columns, windows and ornaments that are alike, a hedge before it |
 | `room` | a room with bare walls, pictures, identical books; some turned at one place |
 
-Every photograph has an exposure, white balance and tone curve of its own, light falling off and
-focus lost towards the edges, noise of photons, halos of sharpening, JPEG of quality 85. People and
-a car stand elsewhere in each; clouds move; panes and bronze mirror the sky, so that what is seen in
-them moves with the camera. EXIF states a principal distance that is 5 % too long (`room`: none).
+Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
+edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places
+in each; clouds move; panes and bronze mirror the sky, so that reflections move with the camera.
+EXIF states a principal distance that is 5 % too long (`room`: none).
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.planning.texture import Texture
 
 WRONG = 1.05
-"""Principal distance that EXIF states, in parts of the true one."""
+"""Principal distance in EXIF, relative to the true one."""
 QUALITY = 85
 CLOUDS = Texture(0.008, seed=77, mean=0.8, contrast=0.05)
 
@@ -45,7 +45,7 @@ class Ellipsoid:
     radii: tuple[float, float, float]
 
     def distances(self, o, d):
-        """Lengths of rays to the surface; inf: it is missed."""
+        """Lengths of rays to the surface; inf if they miss it."""
         r = np.asarray(self.radii)
         o, d = (o - np.asarray(self.centre)) / r, d / r
         a, b, c = (d * d).sum(-1), (o * d).sum(-1), (o * o).sum(-1) - 1
@@ -95,7 +95,7 @@ class Leaves(Rectangle):
 
 @dataclasses.dataclass
 class Stage:
-    """A scene that is put together: surfaces, textures, and which of them mirror how much."""
+    """A scene under construction: surfaces, textures, and their reflectance."""
 
     texel: float
     shapes: list = dataclasses.field(default_factory=list)
@@ -111,7 +111,7 @@ class Stage:
         self.textures.append(Texture(seed=seed, **given))
 
     def box(self, corner, size, seed, **texture) -> None:
-        """Four sides and the top of an upright box, each with a texture of its own."""
+        """Four sides and the top of an upright box, each with its own texture."""
         (x, y, z), (a, b, c) = corner, size
         for k, (at, along, across) in enumerate((
             ((x, y, z), (a, 0, 0), (0, 0, c)), ((x + a, y, z), (0, b, 0), (0, 0, c)),
@@ -129,12 +129,12 @@ class Stage:
                      contrast=0.15)  # fmt: skip
 
     def person(self, x, y, seed) -> None:
-        """Somebody at a place."""
+        """A person at a place."""
         self.add(Ellipsoid((x, y, 0.8), (0.28, 0.2, 0.85)), seed, contrast=0.15, mean=0.3)
         self.add(Ellipsoid((x, y, 1.72), (0.11, 0.11, 0.14)), seed + 1, contrast=0.08, mean=0.6)
 
     def with_others(self) -> "Stage":
-        """A copy, to which what is in one photograph only can be added."""
+        """A copy, to which objects of a single photograph can be added."""
         return dataclasses.replace(self, shapes=[*self.shapes], textures=[*self.textures],
                                    mirrors=dict(self.mirrors))  # fmt: skip
 
@@ -149,7 +149,7 @@ def _sky(direction, moved):
 
 
 def taken(seed: int, mirrors: dict[int, float]) -> Callable[[Rendered, Shot], np.ndarray]:
-    """How a camera of a photographer turns light into a file: RGB."""
+    """The processing of a consumer camera from light to file: RGB."""
 
     def finish(rendered: Rendered, shot: Shot):
         rng = np.random.default_rng(seed)

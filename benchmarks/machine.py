@@ -1,4 +1,4 @@
-"""What a figure was measured on, and what all benchmarks share: arguments, figures as JSON."""
+"""The machine a figure was measured on; shared by all benchmarks: arguments, figures as JSON."""
 
 import argparse
 import importlib.util
@@ -14,14 +14,14 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "pycolmap", "opencv-python-headle
 
 
 def parser_of(description: str) -> argparse.ArgumentParser:
-    """An argument parser whose help is the docstring of the program, as it is written."""
+    """An argument parser whose help is the docstring of the program, unchanged."""
     return argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
 
 
 def solver_parser(description: str, evaluations: int = 200, repeat: int = 2):
-    """For a program that runs one solver on one BAL problem."""
+    """An argument parser for a program that runs one solver on one BAL problem."""
     parser = parser_of(description)
     parser.add_argument("problem")
     parser.add_argument("--evaluations", type=positive, default=evaluations)
@@ -30,21 +30,21 @@ def solver_parser(description: str, evaluations: int = 200, repeat: int = 2):
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 on, of the command line."""
+    """A positive integer of the command line."""
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
     return int(text)
 
 
 def target(text: str) -> str:
-    """A file to be written, of the command line; refused before anything is measured."""
+    """An output file of the command line, checked before anything is measured."""
     if text != "-" and (Path(text).is_dir() or not Path(text).absolute().parent.is_dir()):
         raise argparse.ArgumentTypeError(f"{text} is a folder, or its folder does not exist")
     return text
 
 
 def verdict(wrong: list[str]) -> int:
-    """Exit status; what is wrong is told."""
+    """Print the errors; returns the exit status."""
     for line in wrong:
         print(f"WRONG: {line}", file=sys.stderr)
     return 1 if wrong else 0
@@ -87,7 +87,7 @@ def cores() -> int:
 
 
 def version_of(package: str) -> str | None:
-    """Version of an installed package; none if it is not there."""
+    """Version of an installed package; None if it is missing."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -110,7 +110,7 @@ def peak_mb(who: int = resource.RUSAGE_SELF) -> float:
 
 
 def device_peak_mb() -> float | None:
-    """Largest memory in use so far on an accelerator, in MB; none on processors."""
+    """Largest memory in use so far on an accelerator, in MB; None on CPUs."""
     import jax
 
     found = jax.devices()[0].memory_stats()

@@ -6,8 +6,8 @@ Photographs as in the tests (`tests/measure/render.py`): 480 × 360 pixels, grey
 with a contrast of 204, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
 discs each, their true centres those of the images of the circles (eccentricity taken into account).
 Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, against truth; for
-targets also the RMS of errors over the σ they state, which should be 1. The exit status is 1 where
-an RMS is above 0.05 pixels, or errors are more than twice their σ.
+targets also the RMS of errors over their stated σ, which should be 1. The exit status is 1 if an
+RMS is above 0.05 pixels, or errors are more than twice their σ.
 """
 
 import os
@@ -87,7 +87,7 @@ def corners_of_all():
 
 
 def show(found):
-    """The figures for people."""
+    """The figures as text."""
     print(machine.in_words(found["machine"]))
     print("targets            grey values         ellipse")
     print("radius px  blur    RMS px  error/σ     RMS px  error/σ")
@@ -103,7 +103,7 @@ def show(found):
 
 
 def complaints(found):
-    """What is not as near to the truth as it should be, or said to be."""
+    """Errors above the limit, or above the stated σ."""
     of_targets = [
         (f"targets of {f['radius_px']:.1f} pixels by {method}, blur {f['blur']}", f[method])
         for f in found["targets"] for method in ("grey_values", "ellipse")

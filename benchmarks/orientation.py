@@ -2,13 +2,13 @@
 
     python benchmarks/orientation.py [--number N] [--noise SIGMA] [--json FILE]
 
-Cameras turned at random see points 4 to 12 units away, in images of ±0.8 principal distances;
-pairs have a base of 1 in any direction and are turned by some 0.2 rad about each axis. Every row is
-a table line of: successes, quantiles of the error, names of what failed, microseconds an item
-without compilation. The error is the greatest of a component of X0 (unit: the object's) or of b,
-and of an element of M. It is a success below 1e-6; with noise, if the errors are within the 0.999
-quantile of χ² that their cofactors give (one in a thousand is expected outside). The exit status is
-1 where a row has fewer successes than 0.997 of its number, by more than chance.
+Randomly rotated cameras see points 4 to 12 units away, in images of ±0.8 principal distances; pairs
+have a base of 1 in any direction and are rotated by some 0.2 rad about each axis. Every row of the
+table has the successes, quantiles of the error, names of the failures, and microseconds per item
+without compilation. The error is the largest of the components of X0 (object unit) or of b, and of
+the elements of M. Below 1e-6 it is a success; with noise, if the errors are within the 0.999
+quantile of χ² by their cofactors (one in a thousand is expected outside). The exit status is 1 if a
+row has significantly fewer successes than 0.997 of its number.
 
     resection, 3 points       all solutions; one of them is the truth
     resection, 3 + 1 points   the solution chosen by a fourth point, refined
@@ -94,7 +94,7 @@ def show(f):
 
 
 def nearest(M, t, valid, truth):
-    """Error of that solution which is nearest to the truth."""
+    """Error of the solution nearest to the truth."""
     error = np.abs(M - truth[0][:, None]).max((2, 3))
     error = np.maximum(error, np.abs(t - truth[1][:, None]).max(2))
     return np.where(valid, error, np.inf).min(1)

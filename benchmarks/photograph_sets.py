@@ -1,4 +1,4 @@
-"""Sets of rendered photographs that are hard to orient, with their true projection centres.
+"""Sets of rendered photographs that are difficult to orient, with their true projection centres.
 
     python benchmarks/photograph_sets.py NAME FOLDER [--width PIXELS]
 
@@ -11,12 +11,12 @@
 | `wide` | hills, 27 degrees from one to the next |
 | `depth` | a square seen by pedestrians, objects 3 to 40 m away |
 | `portrait` | a facade, three of the photographs stored upright |
-| `cameras` | two cameras of other sizes and principal distances, told by EXIF |
+| `cameras` | two cameras of different sizes and principal distances, given by EXIF |
 | `parts` | hills and a facade that have nothing in common |
 | `scenes` | hills and the square of `depth`, which have nothing in common |
 | `foreign` | hills, and three photographs of other places |
 
-Unless it is said, nothing tells the principal distance.
+Unless stated otherwise, the principal distance is unknown.
 """
 
 import dataclasses
@@ -41,8 +41,8 @@ WIDTH = 1600
 @dataclasses.dataclass(frozen=True)
 class Shot:
     """A photograph to be rendered: its scene and camera, centre and rotation; how it is stored;
-    `part`: photographs of one number belong together, 0: it belongs to nothing; `finish`: what
-    makes a photograph of what is rendered."""
+    `part`: photographs of one number belong together, 0: none; `finish`: turns the rendered image
+    into a photograph."""
 
     name: str
     scene: Scene
@@ -58,7 +58,7 @@ class Shot:
 
 
 def camera(width: int, focal: float = FOCAL) -> jaxbundle.Camera:
-    """A camera with distortion whose principal point is off the middle."""
+    """A camera with distortion and an off-centre principal point."""
     height, f = 3 * width // 4, focal * width
     parameters = {"fx": f, "fy": f, "cx": 0.503 * width, "cy": 0.498 * height, "k1": K1}
     return jaxbundle.Camera("cam", "opencv", parameters, image_size=(width, height))
@@ -67,7 +67,7 @@ def camera(width: int, focal: float = FOCAL) -> jaxbundle.Camera:
 def shots(
     prefix: str, scenes, X0, at, width: int, roll=0.0, focal: float = FOCAL, gain=None, **stored
 ) -> list[Shot]:
-    """Photographs from X0 towards `at`, of one scene or one each."""
+    """Photographs from X0 towards `at`, of one scene or of one scene each."""
     X0 = np.asarray(X0, float)
     n = len(X0)
     scenes = scenes if isinstance(scenes, list) else [scenes] * n
@@ -244,7 +244,7 @@ SETS: dict[str, Callable[[int], list[Shot]]] = {
 
 
 def write(shots: Sequence[Shot], folder: Path) -> None:
-    """Render the photographs that are not there yet."""
+    """Render the missing photographs."""
     folder.mkdir(parents=True, exist_ok=True)
     for shot in shots:
         path = folder / shot.name

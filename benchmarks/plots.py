@@ -1,4 +1,4 @@
-"""Cost against iteration and against time, one row of pictures a problem."""
+"""Cost against iteration and against time, one row of figures per problem."""
 
 import matplotlib
 

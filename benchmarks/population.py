@@ -1,17 +1,18 @@
-"""Thousands of cameras by `jaxbundle batch`: time and memory by their number, killed and resumed.
+"""Thousands of cameras by `jaxbundle batch`: time and memory by number, and a run killed and
+resumed.
 
     python benchmarks/population.py [--cameras N N ...] [--json FILE]
 
 The cameras are those of `calibration.py` (20 views of 88 corners), 1000 of them, the others the
-same with other noise; three in a hundred are spoilt (no measurements, infinite ones, a corner far
-off in all views). Each number of cameras is one `.npz`, read by `jaxbundle batch` in a process of
-its own, which writes parameters, covariances and poses of all. Before, the smallest number is run
-once to compile, and once killed by SIGKILL when half of its lines are written, and started again:
-its lines must be those of the run that was not.
+same with other noise; three in a hundred are corrupted (no measurements, infinite ones, a corner
+far off in all views). Each number of cameras is one `.npz`, read by `jaxbundle batch` in a separate
+process, which writes parameters, covariances and poses of all. First the smallest number is run
+once to compile, and once killed by SIGKILL when half of its lines are written and started again:
+its lines must equal those of the uninterrupted run.
 
-Exit status 1 where a line is missing or differs, a good camera has not converged, the time per
-further camera grows by more than a third from one number to the next, or the peak of the memory by
-more than 20 kB for each further camera.
+Exit status 1 if a line is missing or differs, a good camera has not converged, the time per
+additional camera grows by more than a third from one number to the next, or the peak memory by more
+than 20 kB per additional camera.
 """
 
 import json
@@ -35,7 +36,7 @@ GROWTH, BYTES = 4 / 3, 20e3
 
 
 def write_cameras(path: Path, images, number: int) -> None:
-    """An `.npz` of so many cameras, three in a hundred spoilt."""
+    """An `.npz` of this many cameras, three in a hundred corrupted."""
     rng = np.random.default_rng(number)
     xy = np.empty((number, *images.shape[1:]), np.float32)
     for first in range(0, number, len(images)):
@@ -57,7 +58,7 @@ def start(cameras: Path, lines: Path) -> subprocess.Popen:
 
 
 def run(cameras: Path, lines: Path) -> tuple[float, float]:
-    """Seconds on the clock, peak of the resident memory in MB."""
+    """Wall-clock seconds, peak resident memory in MB."""
     begin, peak = time.perf_counter(), 0.0
     process = start(cameras, lines)
     status = Path(f"/proc/{process.pid}/status")
@@ -76,12 +77,12 @@ def run(cameras: Path, lines: Path) -> tuple[float, float]:
 def rows_of(lines: Path) -> dict[str, str]:
     found = lines.read_text().splitlines()
     rows = {json.loads(line)["key"]: line for line in found}
-    assert len(rows) == len(found), "a key is there twice"
+    assert len(rows) == len(found), "a key occurs twice"
     return rows
 
 
 def killed(cameras: Path, lines: Path, half: int) -> int:
-    """Lines that are there after SIGKILL, when half of them were."""
+    """The number of lines after SIGKILL, sent when half of them were written."""
     process = start(cameras, lines)
     number = lambda: lines.read_bytes().count(b"\n") if lines.exists() else 0
     while number() < half:

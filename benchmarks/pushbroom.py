@@ -1,12 +1,12 @@
-"""Pushbroom: million pixels a second, from the image to the ground and back.
+"""Pushbroom: million pixels per second, from the image to the ground and back.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/pushbroom.py [--json FILE] [--map]
 
 An image of 10 000 lines of 8000 pixels of 4.7 m from 500 km: positions every second (Lagrange,
 order 7), quaternions at 10 Hz (slerp), a lens with distortion. Blocks of lines are given to two
-threads in turn, as `correct` does; the best of several rounds counts. `--map` also corrects a
-whole image of 10 000 × 8000 random pixels to a GeoTIFF. Every figure stands beside its demand;
-what is computed is checked first, and a wrong answer ends with exit status 1, whatever the time.
+threads in turn, as `correct` does; the best of several rounds counts. `--map` also corrects a whole
+image of 10 000 × 8000 random pixels to a GeoTIFF. Every figure is printed next to its required
+value; results are checked first, and a wrong answer ends with exit status 1, regardless of time.
 
     ellipsoid      X, Y, Z on the ellipsoid           geodetic     the same to λ, φ, h
     terrain        first hit with a rough model       jacobian     ∂(X, Y, Z)/∂(3 angles, 3 shifts)
@@ -86,12 +86,12 @@ def rough_terrain(scan):
 
 
 def six_parameters(scan, p):
-    """The image with small turns p[:3], in radians, and shifts p[3:], in metres."""
+    """The image with small rotations p[:3], in radians, and shifts p[3:], in metres."""
     return eqx.tree_at(lambda i: (i.offsets.attitude, i.offsets.position), scan, (p[:3], p[3:]))
 
 
 def rate(work, blocks, size, rounds):
-    """Best million pixels a second of blocks given to two threads."""
+    """Best million pixels per second of blocks given to two threads."""
     run = lambda block: jax.block_until_ready(work(block))
     run(blocks[0])
     best = np.inf

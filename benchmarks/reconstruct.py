@@ -4,13 +4,12 @@
                                      [--json FILE] [--folder FOLDER] [--colmap]
 
 Photographs of a set (`photograph_sets.py`, `lifelike_sets.py`) are rendered into FOLDER/NAME (kept
-there for the next run), by a camera whose principal distance and distortion the reconstruction is
-not told.
-`--photographs` is of the set `convergent`. Errors of the projection centres are those after a
-similarity, in parts of the distance from their middle; c in σ. With --colmap the incremental mapper
-of pycolmap runs on the same folder in the same process, where it is installed. The exit status is 1
-where a photograph is left out that belongs to a scene, or placed in one it does not belong to, c or
-a centre is more than 4 σ off, or σ0 is not 1 to 2 %.
+there for the next run), by a camera whose principal distance and distortion are unknown to the
+reconstruction. `--photographs` applies to the set `convergent`. Errors of the projection centres
+are given after a similarity, relative to the distance from their centroid; c in σ. With --colmap
+the incremental mapper of pycolmap, if installed, runs on the same folder in the same process. The
+exit status is 1 if a photograph of a scene is left out or placed in another one, c or a centre is
+more than 4 σ off, or σ0 differs from 1 by more than 2 %.
 """
 
 import json
@@ -64,7 +63,7 @@ def error_over_sigma(result, truth, ids, A, e) -> float:
 
 
 def in_parts(truth, ids, e) -> float:
-    """The root of the mean square of errors in parts of the extent of the true centres."""
+    """The root mean square of errors relative to the extent of the true centres."""
     X = np.array([truth[id].X0 for id in ids])
     extent = np.sqrt(((X - X.mean(0)) ** 2).sum(1).mean())
     return float(np.sqrt((e**2).sum(1).mean()) / extent)
@@ -93,7 +92,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
 
 
 def of_part(part: Part, truth: dict[str, Shot]) -> dict:
-    """The accuracy of a part; of centres that belong elsewhere there is none."""
+    """The accuracy of a part; none for centres that belong elsewhere."""
     result = part.adjustment
     network, ids = result.network, result.network.images.id
     A, e = centre_errors(truth, ids, result.image_values[:, :3])
@@ -142,7 +141,7 @@ def colmap(folder: Path, truth: dict[str, Shot]) -> dict | None:
 
 
 def run(name: str, shots: Sequence[Shot], folder: Path, beside: bool) -> tuple[dict, list[str]]:
-    """The figures of a set, and what is wrong with them."""
+    """The figures of a set, and their errors."""
     write(shots, folder)
     truth = {shot.name: shot for shot in shots}
     figures = {"ours": ours(folder, truth)}

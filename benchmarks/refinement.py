@@ -3,8 +3,8 @@
     python benchmarks/refinement.py [--points N] [--repeat N] [--json FILE]
 
 One scanner image (attitude, its rate, jitter by splines) and one photograph see the same points, of
-which one in ten is a control point. The scene is that of `tests/refinement` beside the package that
-is imported: with PYTHONPATH the same command measures an earlier state.
+which one in ten is a control point. The scene is that of `tests/refinement` next to the imported
+package: with PYTHONPATH the same command measures an earlier version.
 
 σ0 must be 1 within 4 of its σ; otherwise the exit status is 1.
 """

@@ -60,7 +60,7 @@ def _problem(rng, X, centre, target, image, point, disturbance):
                     0.005 * rng.normal(size=len(M))]  # fmt: skip
     xy, in_front = _project(cameras, M, X, image, point)
     keep = in_front & (np.abs(xy).max(1) < HALF_FORMAT)
-    # At most so many rays a point as a point of a photograph usually has.
+    # At most as many rays as a point usually has.
     order = rng.permutation(np.flatnonzero(keep))
     order = order[np.argsort(point[order], kind="stable")]
     first = np.searchsorted(point[order], point[order])
@@ -107,7 +107,7 @@ def matrices(vectors):
 
 
 def _project(cameras, M, X, image, point):
-    """Image coordinates, and whether the point lies in front."""
+    """Image coordinates, and whether the point is in front of the camera."""
     xy, front = np.empty((len(image), 2)), np.empty(len(image), bool)
     for rows in np.array_split(np.arange(len(image)), max(1, len(image) // 1_000_000)):
         camera = cameras[image[rows]]
@@ -128,7 +128,7 @@ def write_bal(path: Path, cameras, points, image, point, xy) -> None:
 
 
 def read_bal(path: str | Path):
-    """What `write_bal` wrote, in its order."""
+    """The contents written by `write_bal`, in its order."""
     with open(path, encoding="ascii") as file:
         images, points, rays = map(int, file.readline().split())
         numbers = np.array(file.read().split(), float)
@@ -144,7 +144,7 @@ def half_square(cameras, points, image, point, xy) -> float:
     return 0.5 * float(np.square(computed - xy).sum())
 
 
-def unpacked(path: Path, folder: Path) -> Path:
+def unpack(path: Path, folder: Path) -> Path:
     """The file itself, or its unpacked copy in the folder."""
     opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower())
     if opener is None:

@@ -1,10 +1,11 @@
-"""Snavely's camera in JAX as other programs take it: rotation vector, shift, f, k1, k2 in a row."""
+"""Snavely's camera in JAX, in the form of other programs: rotation vector, shift, f, k1, k2 in a
+row."""
 
 import jax.numpy as jnp
 
 
 def residual(camera, X, xy):
-    """Computed less measured image point, pixels; camera [9], object point [3], image point [2].
+    """Computed minus measured image point, pixels; camera [9], object point [3], image point [2].
 
     The formula of a BAL problem (Agarwal et al. 2010): P = R X + t, p = −(P₁, P₂)/P₃,
     f·(1 + k1·p² + k2·p⁴)·p; the rotation by Rodrigues' formula.

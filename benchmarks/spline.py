@@ -3,9 +3,10 @@
     python benchmarks/spline.py [--columns N] [--rows N] [--images N] [--json FILE]
 
 Images of a board of 40 × 25 points, known exactly, by a camera of COLUMNS × ROWS knots over 90°,
-every knot with its prior. Seconds to compile and to compute the normal equations once, peak memory
-after each, and the largest difference of the two, relative to the largest number of a block. Exit
-status 1 where they differ by more than 1e-11, or the dense ones are faster.
+every knot with its prior. The output gives the seconds to compile and to compute the normal
+equations once, peak memory after each, and the largest difference of the two relative to the
+largest element of a block. Exit status 1 if they differ by more than 1e-11, or the dense ones are
+faster.
 """
 
 import dataclasses

@@ -1,5 +1,5 @@
-"""Throughput of matching for surfaces: correlation along segments beside cv2.matchTemplate, in one
-run; and of the whole way from pixels to points with covariance.
+"""Throughput of matching for surfaces: correlation along segments compared with cv2.matchTemplate,
+in one run; and the whole chain from pixels to points with covariance.
 
     python benchmarks/surface.py [--points 4000]
 

@@ -1,10 +1,10 @@
-"""How true the points of surfaces are: rendered photographs of a known surface, two and four,
+"""The accuracy of surface points: rendered photographs of a known surface, two and four,
 sparse and dense, with little and strong noise, occlusion, repeated texture, little overlap, none.
 
     python benchmarks/surface_accuracy.py [SCENE …] [--dense] [--sparse]
 
-Of every point: the largest miss in pixels of any image, and the error of the height over its σ.
-Wanted: 95 % within 0.2 pixel, RMS of the errors over σ 0.9 to 1.1, 99 % within 3 σ, under 1 %
+For every point: the largest error in any image, pixels, and the error of the height over its σ.
+Required: 95 % within 0.2 pixel, RMS of the errors over σ 0.9 to 1.1, 99 % within 3 σ, under 1 %
 farther off than a pixel.
 """
 
@@ -80,7 +80,7 @@ SCENES = {
 
 
 def figures(views, truth, cloud):
-    """Misses [pixels], the largest in any image, and normalised errors of heights."""
+    """The largest errors in any image, pixels, and normalised errors of heights."""
     v, u = cloud.uv.astype(int).T[::-1]
     true = truth[v, u]
     seen = np.isfinite(true).all(1)

@@ -1,11 +1,12 @@
 """Dense matching of a rendered stereo pair of a room: a large range of disparities, thin objects, a
-wall of weak texture; beside OpenCV's semi-global matching of the same pair as it stands.
+wall of weak texture; compared with OpenCV's semi-global matching of the same pair.
 
     python benchmarks/surface_indoor.py [--megapixels 6] [--gain 1] [--shade 0] [--sparse]
 
 The right photograph is taken with another exposure (`--gain`), and darker towards one side by a
-part of `--shade`. Says how many pixels have a point, of those that both photographs see as well,
-how many of the points are off by more than 0.5, 1 and 2 pixels, errors over σ, and the time.
+fraction `--shade`. The output gives the fraction of pixels with a point, of all and of those that
+both photographs see, the fraction of points off by more than 0.5, 1 and 2 pixels, errors over σ,
+and the time.
 """
 
 import argparse
@@ -82,7 +83,7 @@ def semi_global(views, low, high):
 
 
 def say(name, error, seen):
-    """How many pixels have a disparity, and how true these are."""
+    """The fraction of pixels with a disparity, and the errors of these."""
     known = np.isfinite(error)
     bad = [100 * np.mean(np.abs(error[known]) > limit) for limit in (0.5, 1, 2)]
     print(f"{name}: {100 * known.mean():.1f} % of all pixels have a point, "

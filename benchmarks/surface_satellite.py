@@ -3,10 +3,10 @@ scanner, flat roofs of strong and weak texture, another exposure and a cloud in 
 
     python benchmarks/surface_satellite.py [--pixels 900] [--sparse]
 
-The images are simulated along two orbits, half a metre a pixel, ratio of base and height 0.5; the
-coefficients are fitted to the scanner. Says how many cells of all have a height and one within 1 m
-of the truth, RMSE and median of the errors, how many are off by more than 3 m, how many points of
-the cloud are under the cloud, and the time.
+The images are simulated along two orbits, half a metre per pixel, base-to-height ratio 0.5; the
+coefficients are fitted to the scanner. The output gives the fraction of cells with a height and
+with one within 1 m of the truth, RMSE and median of the errors, the fraction off by more than 3 m,
+the number of points under the cloud, and the time.
 """
 
 import argparse
@@ -93,7 +93,7 @@ def passes(pixels):
 
 
 def photograph(view, scene, sensor):
-    """What a view sees of a scene."""
+    """The image of a scene in a view."""
     columns, rows = view.size
     v, u = np.indices((rows + 1, columns + 1)).reshape(2, -1)
     uv = np.stack([u, v], 1).astype(float)

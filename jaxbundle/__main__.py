@@ -11,7 +11,7 @@ import warnings
 
 from jaxbundle.system.interrupts import handle_interrupts, set_status
 
-SELDOM = 50_000, 20, 100
+GC_THRESHOLDS = 50_000, 20, 100
 """Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
 permanent: with the default thresholds the collector takes a sixth of the tracing time."""
 
@@ -19,7 +19,7 @@ permanent: with the default thresholds the collector takes a sixth of the tracin
 def main() -> None:
     """Run the command line, as the whole of this process."""
     handle_interrupts()
-    gc.set_threshold(*SELDOM)
+    gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from jaxbundle.cli import main
 

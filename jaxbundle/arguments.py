@@ -17,17 +17,17 @@ from jax.core import Tracer
 
 from jaxbundle.errors import InputError
 
-MOST = 10**9
+LARGEST_INTEGER = 10**9
 """Largest integer."""
 
 
-def shown(value: Any) -> str:
+def show(value: Any) -> str:
     """A value for a message; long ones are cut."""
     text = " ".join(repr(value.item() if isinstance(value, np.generic) else value).split())
     return text if len(text) <= 60 else f"{text[:58]}…"
 
 
-def whole(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
+def integer(name: str, value: Any, least: int = 1, most: int = LARGEST_INTEGER) -> int:
     """A whole number from `least` to `most`.
 
     **Raises:** `InputError`."""
@@ -37,9 +37,9 @@ def whole(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
     except TypeError:
         number = least - 1
     if not least <= number <= most:
-        last = "10⁹" if most == MOST else most
+        last = "10⁹" if most == LARGEST_INTEGER else most
         raise InputError(f"{name} must be a whole number from {least} to {last}, but is "
-                         f"{shown(value)}")  # fmt: skip
+                         f"{show(value)}")  # fmt: skip
     return number
 
 
@@ -55,7 +55,7 @@ def number(name: str, value: Any, expected: str = "a number", good=math.isfinite
             return float(value)
     except OverflowError:
         pass
-    raise InputError(f"{name} must be {expected}, but is {shown(value)}")
+    raise InputError(f"{name} must be {expected}, but is {show(value)}")
 
 
 def positive(name: str, value: Any) -> float:
@@ -79,7 +79,7 @@ def one_of(name: str, value: Any, choices: Sequence[str], none: bool = False) ->
     if (value is None and none) or (isinstance(value, str) and value in choices):
         return value
     expected = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
-    raise InputError(f"{name} must be {expected}{' or None' * none}, not {shown(value)}")
+    raise InputError(f"{name} must be {expected}{' or None' * none}, not {show(value)}")
 
 
 def truth(name: str, value: Any) -> bool:
@@ -87,7 +87,7 @@ def truth(name: str, value: Any) -> bool:
 
     **Raises:** `InputError`."""
     if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, but is {shown(value)}")
+        raise InputError(f"{name} must be True or False, but is {show(value)}")
     return bool(value)
 
 
@@ -96,7 +96,7 @@ def text(name: str, value: Any) -> str:
 
     **Raises:** `InputError`."""
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{name} must be a text, but is {shown(value)}")
+        raise InputError(f"{name} must be a text, but is {show(value)}")
     return value
 
 
@@ -105,7 +105,7 @@ def path(name: str, value: Any) -> str:
 
     **Raises:** `InputError`."""
     if not isinstance(value, str | os.PathLike):
-        raise InputError(f"{name} must be the path of a file or folder, but is {shown(value)}")
+        raise InputError(f"{name} must be the path of a file or folder, but is {show(value)}")
     return os.fspath(value)
 
 
@@ -137,7 +137,7 @@ def vector(name: str, value: Any, size: int, expected: str) -> np.ndarray:
     **Raises:** `InputError`."""
     array = numeric_array(name, value, expected).astype(float)
     if array.shape not in ((), (size,)) or not np.isfinite(array).all():
-        raise InputError(f"{name} must be {expected}, but is {shown(array.tolist())}")
+        raise InputError(f"{name} must be {expected}, but is {show(array.tolist())}")
     return np.broadcast_to(array, size)
 
 
@@ -168,6 +168,6 @@ def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
 
 def _found(array: np.ndarray) -> str:
     if array.shape == ():
-        return f"is {shown(array.item())}"
+        return f"is {show(array.item())}"
     kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}
     return f"contains {kinds.get(array.dtype.kind, f'values of type {array.dtype}')}"

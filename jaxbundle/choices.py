@@ -25,7 +25,7 @@ MODEL_FAMILIES = {
     "radial-spline-N-FOV": rf"radial-spline-(\d+)-{_DEGREES}",
     "spline-NXxNY-FOV": rf"spline-(\d+)x(\d+)-{_DEGREES}",
 }
-"""Camera models whose names say numbers, and how they read."""
+"""Camera models whose names contain numbers, and the form of these names."""
 
 FORMATS = (
     "project", "photo-list", "bal", "column-map", "colmap", "bingo", "metashape", "photomodeler",

@@ -1,4 +1,4 @@
-"""How results show themselves: in one screen, and as gridded data of xarray where it is installed.
+"""Display of results: in one screen, and as gridded data of xarray where it is installed.
 
 Arrays are shown by type and shape, long lists by their first entries; nothing is computed for it.
 """
@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 LINES, WIDTH = 24, 100
-FEW = 4
+SHOWN_ENTRIES = 4
 """Numbers of an array, or entries of a list, that are shown."""
 T = TypeVar("T", bound=type)
 
 
-def shows_itself(cls: T) -> T:
+def print_in_one_screen(cls: T) -> T:
     """A dataclass of results whose `repr` is one screen: what `str` says, else its fields."""
     setattr(cls, "__repr__", describe)  # noqa: B010
     return cls
@@ -28,21 +28,21 @@ def describe(value: Any) -> str:
                  for line in str(value).splitlines()]  # fmt: skip
     else:
         fields = [f for f in dataclasses.fields(value) if f.repr]
-        lines = [f"  {f.name}={in_short(getattr(value, f.name))}," for f in fields]
+        lines = [f"  {f.name}={abbreviate(getattr(value, f.name))}," for f in fields]
         lines = [f"{type(value).__name__}(", *lines, ")"]
     return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "…"])
 
 
-def in_short(value: Any, depth: int = 0) -> str:
+def abbreviate(value: Any, depth: int = 0) -> str:
     """A value in less than a line."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        few = value.size <= FEW and isinstance(value, np.ndarray | np.generic)
+        few = value.size <= SHOWN_ENTRIES and isinstance(value, np.ndarray | np.generic)
         text = " ".join(str(value).split()) if few else f"{value.dtype}{[*value.shape]}"
     elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
-        parts = [f"{k!r}: {in_short(value[k], depth + 1)}" for k in [*value][:FEW]]
+        parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:SHOWN_ENTRIES]]
         text = f"{{{', '.join(_more(parts, len(value), depth))}}}"
     elif isinstance(value, tuple | list):
-        parts = [in_short(one, depth + 1) for one in value[:FEW]]
+        parts = [abbreviate(one, depth + 1) for one in value[:SHOWN_ENTRIES]]
         text = "({})" if isinstance(value, tuple) else "[{}]"
         text = text.format(", ".join(_more(parts, len(value), depth)))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -55,10 +55,10 @@ def in_short(value: Any, depth: int = 0) -> str:
 
 
 def _more(parts: list[str], number: int, depth: int) -> list[str]:
-    """With how many there are, if they are not all; deep inside only that."""
+    """The parts, and the number of all if some are omitted; at depth only the number."""
     if depth > 1 and number:
         return [f"{number} entries"]
-    return parts if number <= FEW else [*parts, f"… {number} in all"]
+    return parts if number <= SHOWN_ENTRIES else [*parts, f"… {number} in all"]
 
 
 def data_set(

@@ -35,12 +35,12 @@ install_import_hook(modules_with_shapes(ROOT / "jaxbundle"), "type_checker.check
 
 import jaxbundle  # noqa: E402
 from jaxbundle import cli  # noqa: E402
-from jaxbundle.__main__ import SELDOM  # noqa: E402
+from jaxbundle.__main__ import GC_THRESHOLDS  # noqa: E402
 
 jaxbundle.enable_x64()
 
 gc.freeze()
-gc.set_threshold(*SELDOM)
+gc.set_threshold(*GC_THRESHOLDS)
 
 
 # Where signals are ignored (in the background, under nohup), the programs that tests start would
@@ -55,8 +55,8 @@ TOGETHER, APART = ("tests/calibration/", "tests/refinement/"), ("tests/test_note
 
 
 def work_unit(nodeid: str) -> str:
-    """What goes to one worker: a file, so that its fixtures are made once, and the programs it
-    compiles are at hand; a folder that shares more; a notebook, which is long."""
+    """The unit given to one worker: a file, so that its fixtures are made once and its programs
+    compiled once; a folder that shares more; a notebook, which is long."""
     path = nodeid.split("::")[0]
     if path in APART:
         return nodeid
@@ -131,13 +131,13 @@ def drop_after_file():
 
 @pytest.fixture
 def wrong_types():
-    """For tests that hand over what annotations forbid, to see what the package says of it."""
+    """For tests that pass values which annotations forbid, to check the message of the package."""
     with unchecked():
         yield
 
 
 class Told(NamedTuple):
-    """What a command line said, and how it ended."""
+    """Output and exit status of a command line."""
 
     status: int
     out: str
@@ -146,7 +146,7 @@ class Told(NamedTuple):
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    """A command line in this process: importing JAX costs more than most of what is asked."""
+    """A command line in this process: importing JAX costs more than most commands."""
     monkeypatch.setattr(jaxbundle, "use_cores", lambda *_: None)  # JAX runs here already
 
     def run(*arguments) -> Told:

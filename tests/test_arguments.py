@@ -1,5 +1,5 @@
-"""What no function of the public API can use is refused in one line, which names the argument and
-what is expected; masks are honoured, complex and traced numbers refused."""
+"""Unusable arguments of the public API are refused in one line, which names the argument and what
+is expected; masks are honoured, complex and traced numbers refused."""
 
 from pathlib import Path
 

@@ -94,7 +94,7 @@ def test_baarda_finds_them_too(network):
 
 
 def test_what_agrees_comes_back(network):
-    """Removed observations pass that agree with an adjustment they took no part in."""
+    """Removed observations that agree with an adjustment without them are restored."""
     spoilt, bad, _ = with_blunders(network, 1)
     whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt)).system
     wrong, right = np.flatnonzero(bad), np.flatnonzero(~bad)[::97]
@@ -180,7 +180,7 @@ def test_efficiency_in_the_plane(weight, k, efficiency):
 
 
 def test_either_of_two_rays(network):
-    """A point with two rays that contradict each other: nothing tells which is wrong, both go."""
+    """A point with two rays that contradict each other: either may be wrong, both are removed."""
     rays = network.observations
     keep = rays.point != 62
     pair = np.flatnonzero(~keep)[[0, 3]]
@@ -194,7 +194,7 @@ def test_either_of_two_rays(network):
     assert removed.name.startswith("either of ") and len(removed.rows) == 2
     assert all(f"point {point} in image {image}" in removed.name for image in images)
     assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
-    assert "either of" in text(found) and "does not tell which" in text(found)
+    assert "either of" in text(found) and "does not show which" in text(found)
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 
@@ -250,8 +250,8 @@ def test_baardas_test_with_wrong_sigma_says_so(network):
 
 @pytest.mark.parametrize("part, said", [(0.01, False), (0.2, True)])
 def test_baardas_test_does_not_take_blunders_for_wrong_sigma(network, part, said):
-    """A fifth of blunders makes the scale before their removal 3.8: too many are said to be gone,
-    not that σ are wrong."""
+    """A fifth of blunders makes the scale before their removal 3.8: the message is about too many
+    removals, not about wrong σ."""
     spoilt, _, _ = with_blunders(network, 1, part)
     found = adjust(spoilt, snooping="baarda")
     assert any("Baarda's test has removed many" in doubt for doubt in found.doubts) == said

@@ -13,7 +13,7 @@ from jaxbundle.explore.server import Server
 
 OWN = re.compile(
     r"PHOTOS|^PROJECT\.toml|DIR\b|INDEX|EXPORT|--budget|left=|image\.tif|\b(a|b)\.(tif|toml)"
-    r"|^(project|refine)\.toml|^(planned|points\.csv)$|^(cameras|rigs)[./]"
+    r"|^(project|refine)\.toml|^(planned|points\.csv)$|^(cameras|rigs|phones|surveyed)[./]"
     r"|^(spring|export|control|problem|calibration|epoch\d)\b"
 )
 """Words of a command that stand for a reader's own files."""

@@ -19,7 +19,7 @@ def blocks_of(path: Path) -> list[str]:
 
 
 def run_page(name: str, **given) -> dict:
-    """The names that the Python blocks of a page leave behind; `given`: the reader's own."""
+    """The names defined by the Python blocks of a page; `given`: the reader's own."""
     names: dict = dict(given)
     blocks = blocks_of(ROOT / "docs" / f"{name}.md")
     assert blocks

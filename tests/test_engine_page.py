@@ -11,7 +11,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "engine.md").read_text(encoding="ut
 
 @pytest.fixture(scope="module")
 def page():
-    """What the page's code leaves behind."""
+    """The names defined by the page's code."""
     names = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE, re.S):
         assert len(code.strip().splitlines()) <= 30

@@ -1,4 +1,4 @@
-"""One rule for 64-bit floats: who refuses without them, and who brings them along."""
+"""One rule for 64-bit floats: which functions refuse without them, and which switch them on."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras
 from jaxbundle.cameras.distortion_table import distortion_table
-from jaxbundle.cli.small_inputs import SMALL, is_small
+from jaxbundle.cli.small_inputs import SMALL_INPUT, is_small
 from jaxbundle.float64 import LITTLE_OPTIMISATION
 from jaxbundle.network import Camera
 from jaxbundle.network.reprojection import point_errors
@@ -107,7 +107,7 @@ for _ in range(100):
 
 
 def test_batched_factorisations_at_once_come_to_an_end():
-    """jaxlib 0.10 blocks for ever where as many of them as XLA has threads are in work."""
+    """jaxlib 0.10 deadlocks if as many of them as XLA has threads are running."""
     here = {k: v for k, v in os.environ.items() if k != "NPROC"}
     program = [sys.executable, "-c", FACTORISATIONS_AT_ONCE]
     subprocess.run(program, env=here, check=True, timeout=120)
@@ -116,7 +116,7 @@ def test_batched_factorisations_at_once_come_to_an_end():
 def test_small_inputs_are_compiled_quickly(tmp_path, monkeypatch):
     project = PACKAGE.parent / "examples" / "convergent4" / "project.toml"
     assert is_small(project) and is_small(project.parent)
-    (tmp_path / "points.csv").write_text("x" * (SMALL + 1))
+    (tmp_path / "points.csv").write_text("x" * (SMALL_INPUT + 1))
     assert not is_small(tmp_path) and not is_small(tmp_path / "points.csv")
     assert not is_small(tmp_path / "missing.csv")
     for quickly, given, expected in ((True, "", 0), (False, "", None), (True, "3", 3)):

@@ -1,4 +1,4 @@
-"""`check_gradients` passes what is right and finds what is wrong."""
+"""`check_gradients` passes correct derivatives and finds wrong ones."""
 
 import jax
 import jax.numpy as jnp

@@ -105,7 +105,8 @@ def test_imports_go_up(imported):
 
 
 def test_rooms_of_the_engine_go_up(imported):
-    """Among themselves; declarations, spaces, problems and solutions stand beside them."""
+    """Modules of the engine import only upwards; declarations, spaces, problems and solutions are
+    exempt."""
     rooms = ("indexing", "equations", "iterations", "datum", "quality")
     engine = PACKAGE / "leastsquares"
     assert {p.name for p in engine.iterdir() if (p / "__init__.py").exists()} == set(rooms)

@@ -1,4 +1,4 @@
-"""Typical mistakes: what is said is what docs/howto/mistakes.md says, one line each.
+"""Typical mistakes: the messages are those of docs/howto/mistakes.md, one line each.
 
 Words of a message may change a little; `WRITE=1 pytest tests/test_mistakes.py` writes those of
 today into the page.

@@ -44,7 +44,7 @@ def test_opens_with_a_question(path):
 
 @each_notebook
 def test_is_stored_with_clean_outputs(path):
-    """Run to the end, in order, with pictures; no warnings and nothing of the machine it ran on."""
+    """Run to the end, in order, with figures; no warnings and no traces of the machine."""
     notebook = nbformat.read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))

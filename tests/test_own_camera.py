@@ -14,7 +14,7 @@ import jaxbundle
 from jaxbundle import Camera, CameraModel, InputError, adjust, plotting, simulate_with_truth
 from jaxbundle.adjustment import design_matrix, make_problem, residuals
 from jaxbundle.adjustment.unknowns import Name
-from jaxbundle.bundle.repeated import _without_parameter
+from jaxbundle.bundle.readjust import _without_parameter
 from jaxbundle.cameras import brown, get_model
 from jaxbundle.io import read_cameras
 from jaxbundle.io.cameras.camera_files import write_cameras
@@ -26,7 +26,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "own_camera.md").read_text(encoding
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """What the page's code leaves behind."""
+    """The names defined by the page's code."""
     names, codes = {}, re.findall(r"```python\n(.*?)```", PAGE, re.S)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("page"))

@@ -1,4 +1,4 @@
-"""What the distribution tells and carries: licence, metadata, types, and extras that are used."""
+"""Contents of the distribution: licence, metadata, types, and extras that are used."""
 
 import hashlib
 import re

@@ -1,4 +1,5 @@
-"""The page of a result: well-formed, closed to the outside, and with the values of the result."""
+"""The page of a result: well-formed, without external content, and with the values of the
+result."""
 
 import base64
 import dataclasses

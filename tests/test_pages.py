@@ -1,4 +1,5 @@
-"""The pages of batches, reconstructions and several cameras: what they say is in the result."""
+"""The pages of batches, reconstructions and several cameras: their contents agree with the
+result."""
 
 import json
 

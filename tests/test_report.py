@@ -1,4 +1,4 @@
-"""The protocol says what was computed, to the digits it deserves, and nothing where nothing is."""
+"""The report gives the computed values, to significant digits, and nothing else."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ def text(convergent4):
 
 
 def again(adjustment, network=None, problem=None, minimum=None, **changes):
-    """The same result with something changed."""
+    """The same result with modifications."""
     problem = problem or adjustment.problem
     if network is not None:
         problem = dataclasses.replace(problem, network=network)

@@ -1,5 +1,5 @@
-"""Projects with the answer of an independent adjustment, where the folder of cases stands beside
-the checkout (the data of most belong to others and are not in the repository)."""
+"""Projects with the answer of an independent adjustment, if the folder of cases is next to the
+checkout (most data belong to others and are not in the repository)."""
 
 import dataclasses
 import json

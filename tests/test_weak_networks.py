@@ -1,4 +1,4 @@
-"""Networks that determine something in name only say so: what is weak, and how to mend it.
+"""Weak networks are reported: what is weakly determined, and the remedy.
 
 Four images of 25 targets; of the first two shapes (with and without control) all share one solver.
 """
@@ -16,7 +16,7 @@ from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
 from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.weakness import VAGUE, Weakness, weakness, weakness_of_unsolved
+from jaxbundle.statistics.weakness import VAGUE_RATIO, Weakness, weakness, weakness_of_unsolved
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -129,7 +129,7 @@ def test_images_from_one_place_are_named_where_there_is_no_solution():
 def test_images_from_one_place_solved_by_control_have_no_depth():
     result = jaxbundle.adjust(network(ONE_PLACE, **CONTROL))
     assert result.converged
-    assert "the images stand at one place, or nearly" in said(result)
+    assert "images taken from one place, or nearly" in said(result)
     sigma = np.stack([result.points[f"s{axis}"] for axis in "XYZ"], 1)
     rows = [result.points["id"].tolist().index(id) for id in result.weakness.points]
     assert (np.linalg.norm(sigma[rows], axis=1) > 0.3).all()  # of about 3.9 m
@@ -183,7 +183,7 @@ def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
 
 
 def test_c_in_pixels_is_the_first_cause_of_a_far_off_chi_square():
-    """A long lens cannot be told from it; it is asked of misfits only."""
+    """It cannot be distinguished from a long lens; only misfits are checked for it."""
     lens = Camera("cam", "brown", {"c": 400.0}, free=("c",))
     given = network(RING, lens, TARGETS / 20, **CONTROL)
     sigma = given.observations.sigma / 10
@@ -211,10 +211,10 @@ def test_vertical_images_name_the_principal_distance(monkeypatch):
     assert "c needs depth or convergent images" in said(result)
     assert result.converged
     c = result.cameras["cam"]["parameters"]["c"]
-    assert VAGUE * c["sigma"] > c["value"]
+    assert VAGUE_RATIO * c["sigma"] > c["value"]
     # The directions of a factor give what the cofactors give.
     given = result.weakness
-    monkeypatch.setattr("jaxbundle.leastsquares.quality.weakness.SMALL", 0)
+    monkeypatch.setattr("jaxbundle.leastsquares.quality.weakness.SMALL_SYSTEM", 0)
     found = weakness(Inspection(result.problem, result.values), result.sigma0)
     assert found.unknowns == given.unknowns
     assert found.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-3)

@@ -1,4 +1,4 @@
-"""What checks types and shapes of the package while the tests run (`conftest.py`)."""
+"""Checks of types and shapes of the package while the tests run (`conftest.py`)."""
 
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +24,7 @@ def modules_with_shapes(package: Path) -> list[str]:
 
 @contextmanager
 def unchecked():
-    """Without these checks: to see what the package itself says of what is of a wrong type."""
+    """Disables these checks, to test the package's own messages about wrong types."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield

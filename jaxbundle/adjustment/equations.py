@@ -7,7 +7,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.leastsquares.indexing.rows import in_given_order, lay_out_data
+from jaxbundle.leastsquares.indexing.rows import lay_out_data, restore_order
 from jaxbundle.leastsquares.indexing.rows import residuals as residuals_of_parts
 from jaxbundle.leastsquares.problem import pad_data, pad_values
 from jaxbundle.leastsquares.quality.names import Name
@@ -59,5 +59,5 @@ def _by_set(problem: Problem, tables, data: Data):
     given = pad_data(system, problem.layout.data(data))
     laid = lay_out_data(system.plan, given)
     parts = residuals_of_parts(system.declared, system.plan, pad_values(system, tables), laid)
-    rows = in_given_order(system.plan, parts)
+    rows = restore_order(system.plan, parts)
     return {o: rows[o][: given.number] for o, given in enumerate(system.observations)}

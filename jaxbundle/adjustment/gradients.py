@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import solve
-from jaxbundle.arguments import positive, shown, whole
+from jaxbundle.arguments import integer, positive, show
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
@@ -63,9 +63,9 @@ def check_gradients(
     """
     if not callable(function) and not isinstance(function, CameraModel | Problem):
         raise InputError(
-            f"function must be a function, a CameraModel or a Problem, but is {shown(function)}"
+            f"function must be a function, a CameraModel or a Problem, but is {show(function)}"
         )
-    directions = whole("directions", directions)
+    directions = integer("directions", directions)
     step, tolerance = positive("step", step), positive("tolerance", tolerance)
     if isinstance(function, CameraModel):
         model = function
@@ -92,7 +92,7 @@ def check_gradients(
         return y, forward(d), jax.linear_transpose(forward, x)(c)[0]
 
     outputs = jax.eval_shape(f, x).shape
-    random = np.random.default_rng(whole("seed", seed, 0))
+    random = np.random.default_rng(integer("seed", seed, 0))
     worst, transposed = 0.0, 0.0
     for _ in range(directions):
         d = jnp.asarray(random.normal(size=x.shape)) * sizes

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import REDUCTIONS
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
@@ -52,7 +52,7 @@ class Counts:
         return self.observations + self.pseudo_observations + self.datum - self.unknowns
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """The input of `jaxbundle.solve`: a network as the engine sees it.
@@ -140,7 +140,7 @@ def make_problem(
     also: Sequence[Table | Observations] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> Problem:
-    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
+    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check.check_network`).
 
     Check points and their rays are excluded.
 

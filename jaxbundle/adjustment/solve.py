@@ -1,7 +1,7 @@
 """`solve`: arrays in, adjusted arrays out, differentiable, under jit and vmap."""
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.arguments import one_of, shown
+from jaxbundle.arguments import one_of, show
 from jaxbundle.choices import METHODS
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.iterations.search import SEARCHES
@@ -55,7 +55,7 @@ def check_given(problem: Problem, data: Data | None) -> None:
     **Raises:** `InputError`."""
     if not isinstance(problem, Problem):
         raise InputError(
-            f"problem must be a result of jaxbundle.make_problem, but is {shown(problem)}"
+            f"problem must be a result of jaxbundle.make_problem, but is {show(problem)}"
         )
     if data is not None and not isinstance(data, Data):
-        raise InputError(f"data must be a Data like problem.data, but is {shown(data)}")
+        raise InputError(f"data must be a Data like problem.data, but is {show(data)}")

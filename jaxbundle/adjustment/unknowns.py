@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
@@ -21,18 +21,18 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 
 
-def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
+def find_unknowns(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
     """Unknowns by name, e.g. `("camera", "cam", "c")`, `("image", "12", "kappa")`,
     `("point", "7", "Z")`.
 
     **Raises:** `InputError` without names, or for a name that does not have three parts; `KeyError`
     for an unknown name."""
     if not isinstance(names, list | tuple):
-        raise InputError(f"covariance: a list of names is expected, but it is {shown(names)}")
+        raise InputError(f"covariance: a list of names is expected, but it is {show(names)}")
     given: Sequence[Any] = names or (None,)
     for name in given:
         if name is None or isinstance(name, str) or np.shape(name) != (3,):
-            said = "none is given" if name is None else f"one is {shown(name)}"
+            said = "none is given" if name is None else f"one is {show(name)}"
             raise InputError(
                 'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
                 f'("point", "7", "Z"), but {said}'

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.camera import (
     CONVERGED,
     LIMIT,
@@ -39,7 +39,7 @@ from jaxbundle.batch.result import BatchCalibration as BatchCalibration
 from jaxbundle.batch.snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.batch.start import start_values
 from jaxbundle.batch.test_values import point_tests
-from jaxbundle.batch.weakness import vague, vanishing
+from jaxbundle.batch.weakness import is_vague, vanishing
 from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import (
@@ -106,10 +106,10 @@ def calibrate_batch(
     in its status.
     """
     require_x64()
-    max_iterations = whole("max_iterations", max_iterations)
+    max_iterations = integer("max_iterations", max_iterations)
     one_of("snooping", snooping, TESTS, none=True)
     check_test(snooping, significance)
-    threads = available_cores() if threads is None else whole("threads", threads)
+    threads = available_cores() if threads is None else integer("threads", threads)
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     if snooping is not None:
@@ -176,7 +176,7 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
     null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
     # At the limit the last σ say why, if the equations can be solved.
     told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
-    return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
+    return np.where(told[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
 
 
 def _snoop(

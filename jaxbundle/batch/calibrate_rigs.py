@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.arguments import numeric_array, one_of, positive, shown, vector, whole
+from jaxbundle.arguments import integer, numeric_array, one_of, positive, show, vector
 from jaxbundle.batch.camera import SOLVED
 from jaxbundle.batch.input import any_model, free_parameters
 from jaxbundle.batch.population import Population
@@ -15,7 +15,7 @@ from jaxbundle.batch.rigs import SIGMA, Rig, RigSettings, solve_rigs, with_free
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.quality.snooping import check_test
@@ -26,7 +26,7 @@ SECTIONS = ("rolling_shutter", "rig")
 """Sections of a project that the rigs of a batch may have."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class RigBatch:
     """The rigs of a batch.
@@ -58,7 +58,7 @@ class RigBatch:
         **Raises:** `InputError` where there are not as many ids as rigs."""
         ids = range(len(self)) if ids is None else ids
         if np.shape(ids) != (len(self),):
-            raise InputError(f"ids must be {len(self)}, one a rig, but are {shown(ids)}")
+            raise InputError(f"ids must be {len(self)}, one a rig, but are {show(ids)}")
         return Population({"key": str(id)} | row for id, row in zip(ids, self.rows))
 
 
@@ -98,7 +98,7 @@ def calibrate_rigs(
     - `sigma_image`: a priori σ of an image coordinate, pixels; it matters beside the priors of
       velocities and splines, whose σ are multiplied by σ0 as all others.
     - `snooping`: `"pope"`: exclude epochs that contradict the mounting, then blunders, rig by rig.
-    - `progress(part)`: so much is done.
+    - `progress(part)`: the fraction done.
 
     **Returns:** a `RigBatch`; check `status` first.
 
@@ -136,7 +136,7 @@ def rig_settings(
         if name not in SECTIONS:
             raise InputError(f"unknown section {name!r}{did_you_mean(name, SECTIONS)}")
         if not isinstance(given, Mapping):
-            raise InputError(f"{name} is {shown(given)}; a table of settings is expected")
+            raise InputError(f"{name} is {show(given)}; a table of settings is expected")
     if moves := sections.get("rolling_shutter"):
         positive("rolling_shutter: line_time", moves.get("line_time"))
         make_further({"velocities": {"image": ["1"]}, "rolling_shutter": with_free(moves)}, 1.0)
@@ -154,7 +154,7 @@ def rig_settings(
     return RigSettings(
         found, free_parameters(found, free), size, dict(sections),
         positive("sigma_image", sigma_image),
-        whole("max_iterations", max_iterations), snooping, significance,
+        integer("max_iterations", max_iterations), snooping, significance,
     )  # fmt: skip
 
 
@@ -198,11 +198,11 @@ def check_rigs(
     if size.shape not in ((2,), (number, 2)) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(
             f"image_size must be columns and rows in pixels, for all cameras or each of {number}, "
-            f"but is {shown(size.tolist())}"
+            f"but is {show(size.tolist())}"
         )
     sizes = tuple((int(w), int(h)) for w, h in np.broadcast_to(size, (number, 2)))
     given = [f"cam{c + 1}" if number > 1 else "cam" for c in range(number)]
     names = tuple(map(str, given if cameras is None else cameras))
     if len({*names}) != number:
-        raise InputError(f"cameras must be {number} different names, but are {shown(cameras)}")
+        raise InputError(f"cameras must be {number} different names, but are {show(cameras)}")
     return names, sizes

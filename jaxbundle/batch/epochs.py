@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 
 FEWEST = 3
 """Minimum number of epochs shared by two cameras."""
 CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
 """An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
 pixels."""
-WORST = 0.5
+WORST_SHARE = 0.5
 """One round excludes epochs with an RMS above this fraction of the largest: the worst affect
 others."""
 
@@ -34,7 +34,7 @@ def contradicting(
         return np.zeros(0, int)
     limit = max(CONTRADICTS * float(np.median(rms[seen])), LEAST_CONTRADICTION)
     rms = np.where(shared, rms, 0.0)
-    return np.flatnonzero(rms > max(limit, WORST * rms.max()))
+    return np.flatnonzero(rms > max(limit, WORST_SHARE * rms.max()))
 
 
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
@@ -56,10 +56,10 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
             return keys
         if once and len(keys) > 2 and _connected(keys):
             return keys
-    shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
+    shown = "; ".join(f"{camera}: {list_some(given, 2)}" for camera, given in names.items())
     raise InputError(
-        f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
-        "one moment alike, or give them the same last number"
+        f"the photographs of the cameras cannot be paired by their names ({shown}): name "
+        "simultaneous ones alike, or give them the same last number"
     )
 
 

@@ -12,10 +12,10 @@ from jaxbundle.batch.normal import Sightings
 from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_model, is_own
 from jaxbundle.errors import InputError
 
-FLAT = 0.02
+FLAT_THICKNESS = 0.02
 """Objects with a smaller thickness, relative to the second extent, start as flat."""
 
-LARGEST = 1e100
+LARGEST_NUMBER = 1e100
 """Larger numbers count as infinite, because their products overflow."""
 
 ON_CPU, ON_ACCELERATOR = 32, 512
@@ -47,7 +47,7 @@ class Portion:
     middle: np.ndarray
 
 
-def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def single_list(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Object points listed for every view, as for OpenCV, reduced to one list if all are equal."""
     if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
         return X
@@ -123,7 +123,7 @@ class Batch:
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
         xy = numeric_array("image_points", image_points, "numbers [cameras, views, points, 2]")
-        X = once(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
+        X = single_list(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
         size = numeric_array("image_size", image_size, "width and height in pixels")
         if visible is None:
             visible = np.ones(xy.shape[:3], bool)
@@ -201,7 +201,7 @@ class Batch:
 
 def _usable(numbers: np.ndarray) -> np.ndarray:
     """Finite, and so are sums of their squares."""
-    return np.abs(numbers) < LARGEST
+    return np.abs(numbers) < LARGEST_NUMBER
 
 
 def any_model(name: str | CameraModel) -> CameraModel:
@@ -307,5 +307,5 @@ def _principal_axes(X, seen):
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
     axes = vectors[:, :, ::-1].swapaxes(1, 2)
     axes = axes * np.linalg.det(axes)[:, None, None]
-    flat = values[:, 0] <= np.maximum(FLAT**2 * values[:, 1], 1e-12 * values[:, 2])
+    flat = values[:, 0] <= np.maximum(FLAT_THICKNESS**2 * values[:, 1], 1e-12 * values[:, 2])
     return centred @ axes.swapaxes(1, 2), middle, axes, flat

@@ -29,11 +29,11 @@ FEWEST = 5
 """Minimum number of solved cameras for a population."""
 NEGLIGIBLE = 0.01
 """A smaller RMS is never a misfit, pixels."""
-FAR = 1.0
+FAR_OUTSIDE = 1.0
 """Points farther outside the image, in image sizes, are not measurements."""
-TINY = 0.05
+SMALLEST_EXTENT = 0.05
 """If the image points span less of the image, they are probably no pixels."""
-OUTSIDE = 0.5
+LARGEST_OUTSIDE = 0.5
 """If a larger fraction of image points is outside the image, their axes are probably wrong."""
 
 
@@ -87,8 +87,8 @@ def far_outside(
 ) -> Bool[np.ndarray, "cameras views points"]:
     """Which visible points are so far outside the image that they cannot be measurements; none for
     a camera with most points outside, since then the axes or the size are wrong."""
-    far = visible & _beyond(xy, size, down, FAR)
-    most = far.sum((1, 2)) > OUTSIDE * visible.sum((1, 2))
+    far = visible & _beyond(xy, size, down, FAR_OUTSIDE)
+    most = far.sum((1, 2)) > LARGEST_OUTSIDE * visible.sum((1, 2))
     return far & ~most[:, None, None]
 
 
@@ -114,14 +114,14 @@ def axes_remark(
     """
     low = _corner(size, down)
     part = _beyond(xy, size, down, 0).mean() if len(xy) else 0.0
-    if len(xy) and np.ptp(xy, axis=0).max() < TINY * size.max():
+    if len(xy) and np.ptp(xy, axis=0).max() < SMALLEST_EXTENT * size.max():
         wide, high = np.ptp(xy, axis=0)
         return (
             f"the image points of all views span {wide:.3g} × {high:.3g} of {size[0]:g} × "
             f"{size[1]:g} pixels: are they in pixels, and is image_size right?"
         )
-    if part <= OUTSIDE:
-        far = int(_beyond(xy, size, down, FAR).sum())
+    if part <= LARGEST_OUTSIDE:
+        far = int(_beyond(xy, size, down, FAR_OUTSIDE).sum())
         points = "image point is" if far == 1 else "image points are"
         return f"{far} {points} far outside the image: data snooping removes them" * (far > 0)
     if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from jaxbundle.batch.population import APART, FEWEST, LEVEL, Population
+from jaxbundle.batch.population import FEWEST, LEVEL, OUTLIER_LIMIT, Population
 from jaxbundle.network.columns import count
 from jaxbundle.report.layout import fixed, significant
 from jaxbundle.report.page import (
@@ -55,10 +55,10 @@ def _judge(found: Population) -> list[Finding]:
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
     words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
-    far = int((np.nan_to_num(found.farthest) > APART).sum())
+    far = int((np.nan_to_num(found.farthest) > OUTLIER_LIMIT).sum())
     if np.isfinite(found.farthest).any():
-        words = (f"{far} with a parameter more than {APART:g} robust standard deviations from the "
-                 "median")  # fmt: skip
+        words = (f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
+                 "deviations from the median")  # fmt: skip
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
 
@@ -105,7 +105,8 @@ def _parameters(found: Population) -> list[Section]:
     if not rows:
         return []
     note = paragraph("Converged cameras. Robust σ: 1.4826 times the median absolute deviation. A "
-                     "spread far above the median σ is of the cameras, not of the measurements.")
+                     "spread far above the median σ comes from the cameras, not from the "
+                     "measurements.")
     header = ("parameter", "cameras", "median", "robust σ", "median σ", "least", "greatest")
     shown = grid(header, rows) + note + "".join(_histograms(found))
     return [Section("population", "Parameters of the population", shown, "Population")]
@@ -132,12 +133,12 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
         for one in told
     ]  # fmt: skip
     note = paragraph(
-        "Rank correlation (Spearman) over the converged cameras, and the probability of as large a "
-        f"one by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
+        "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
+        f"large by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
         "the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
-    return [Section("correlations", "What parameters go with", grid(header, rows) + note,
+    return [Section("correlations", "What parameters correlate with", grid(header, rows) + note,
                     "Correlations")]  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """Cameras of a batch from folders of photographs of a board, one folder a camera.
 
-The board is sought by processes of their own, a photograph each at a time: an image that OpenCV
-dies of spoils itself alone. What is found is kept (`io.boards.kept_corners`), so that no photograph
-is searched twice. Cameras of one image size are then calibrated together (`calibrate_batch`).
+The board is searched in separate processes, one photograph at a time: an image that crashes OpenCV
+affects only itself. Results are kept (`io.boards.kept_corners`), so that no photograph is searched
+twice. Cameras of one image size are then calibrated together (`calibrate_batch`).
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxbundle.batch.result import BatchCalibration
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
-from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.writing.fingerprints import of_words
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import (
@@ -30,13 +30,13 @@ from jaxbundle.measure.views import (
     name_photographs,
     photographs,
 )
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.system.workers import Failed, Workers
 
 
 def is_photograph_folder(path: str | Path) -> bool:
     """Whether an input is a folder, and none that holds a network."""
-    return os.path.isdir(path) and recognised_format(Path(path)) is None
+    return os.path.isdir(path) and recognise_format(Path(path)) is None
 
 
 def has_photographs(path: str | Path) -> bool:
@@ -65,7 +65,7 @@ class PhotographFolders:
     workers: Workers
 
     def fingerprint(self, folder: int) -> str:
-        """Of the content of the photographs."""
+        """The fingerprint of the content of the photographs of a folder."""
         files = self._files(folder)
         return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
 
@@ -74,7 +74,7 @@ class PhotographFolders:
     ) -> dict[int, BoardViews | str]:
         """The views of some of the folders, or why there are none.
 
-        `tell(part)`: of the photographs that were to be searched, so many are."""
+        `tell(part)`: the fraction of the photographs searched."""
         files = {folder: self._files(folder) for folder in chosen}
         contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
         tasks = {
@@ -120,8 +120,8 @@ def _why_empty(folder) -> str:
     inside = [one.name for one in camera_folders(folder)]
     if not inside:
         return "no photographs in this folder"
-    return (f"no photographs in this folder, but in {some(inside, 3, str)} in it: give --rig for "
-            "cameras on one mounting, or these folders")  # fmt: skip
+    return (f"no photographs in this folder, but in {list_some(inside, 3, str)} in it: give --rig "
+            "for cameras on one mounting, or these folders")  # fmt: skip
 
 
 def calibrate_views(
@@ -142,7 +142,7 @@ def calibrate_views(
 
 
 def of_photographs(views: BoardViews, brief: bool) -> dict:
-    """What a line says of the photographs of a camera."""
+    """The entries of a line about the photographs of a camera."""
     row: dict[str, Any] = {"image_size": list(views.image_size)}
     if not brief:
         row["photographs"] = list(views.names)

@@ -1,6 +1,6 @@
 """The population of a batch: distribution of its cameras, outliers, correlations of parameters.
 
-A parameter of a camera is outlying if it is more than `APART` robust standard deviations
+A parameter of a camera is outlying if it is more than `OUTLIER_LIMIT` robust standard deviations
 from the median of the converged cameras; likewise a high RMS. The robust standard deviation s is
 1.4826 times the median absolute deviation; for a camera known worse than most it is
 √(s² + σ² − σ_m²), with its σ and their median σ_m: it may be as far off by its measurements.
@@ -29,11 +29,11 @@ from jaxbundle.report.page.columns import numbers
 
 FEWEST = 8
 """Minimum number of cameras of a population."""
-APART = 5.0
+OUTLIER_LIMIT = 5.0
 """Outliers are more than this number of robust standard deviations from the median."""
 LEVEL = 0.01
 """Joint level of all correlations of a batch."""
-CLASSES, WIDE = 24, 4.0
+CLASSES, HALF_WIDTH = 24, 4.0
 """Number of classes of a histogram, and its half width in robust standard deviations."""
 NUMBERS = ("rms", "sigma0", "redundancy", "iterations", "views", "removed")
 ID = "id"
@@ -113,8 +113,8 @@ class Population:
         said = [] if self.fit[i] else [self.status[i]]
         said += [self.remark[i]] if self.remark[i] else []
         said += [f"{name} {significant(far[i], 2)} robust σ from the median"
-                 for name, far in self.apart.items() if far[i] > APART]  # fmt: skip
-        if self.fit[i] and self.rms_apart[i] > APART:
+                 for name, far in self.apart.items() if far[i] > OUTLIER_LIMIT]  # fmt: skip
+        if self.fit[i] and self.rms_apart[i] > OUTLIER_LIMIT:
             said.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
         return "; ".join(said)
 
@@ -136,8 +136,8 @@ class Population:
         middle, deviation = self.spread(values)
         least, greatest = float(found.min()), float(found.max())
         if deviation > 0:
-            least = max(least, middle - WIDE * deviation)
-            greatest = min(greatest, middle + WIDE * deviation)
+            least = max(least, middle - HALF_WIDTH * deviation)
+            greatest = min(greatest, middle + HALF_WIDTH * deviation)
         if not greatest > least:
             least, greatest = least - 0.5, greatest + 0.5
         edges = np.linspace(least, greatest, CLASSES + 1)
@@ -239,10 +239,10 @@ def _ranks(values: np.ndarray) -> np.ndarray:
 
 def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.ndarray]:
     """The columns of a table (numbers, or dates as 2026-05-01: days) for these keys, by its column
-    `id`: the key of an input, or of a camera what stands after # in it.
+    `id`: the key of an input, or of a camera its part after #.
 
-    **Raises:** `InputError` for a table without `id`, or without another column, for an id twice,
-    for what is neither number nor date, and where no key is in it."""
+    **Raises:** `InputError` for a table without `id`, or without another column, for a repeated id,
+    a cell that is neither number nor date, and no matching key."""
     given: Columns = as_columns(table, name)
     others = [column for column in given.values if column != ID]
     if ID not in given.values or not others:
@@ -251,7 +251,7 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     rows: dict[str, int] = {}
     for row, id in enumerate(given.ids(ID)):
         if id in rows:
-            raise InputError(f"{given.source(row)}: id {id!r} is there twice")
+            raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]

@@ -7,11 +7,11 @@ from html import escape
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxbundle.arguments import shown as quoted
+from jaxbundle.arguments import show as quoted
 from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
 from jaxbundle.batch.population import Population
 from jaxbundle.cameras import CameraModel
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import data_frame
 
@@ -21,7 +21,7 @@ MOST_REMARKS = 10
 """Remarks that differ, in the text."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class BatchCalibration:
     """The cameras of a batch; all values of a camera without a solution are NaN.
@@ -103,8 +103,8 @@ class BatchCalibration:
 
     def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
         """The result of camera i as plain dicts and numbers (angles in radians), as a line of
-        `jaxbundle batch`; `brief`: without covariance and poses; `views`: how many it has, without
-        those it was filled up with; all if not given."""
+        `jaxbundle batch`; `brief`: without covariance and poses; `views`: their number without
+        padding; default: all."""
         row = {
             "status": str(self.status[i]),
             "model": str(self.model),
@@ -138,7 +138,7 @@ class BatchCalibration:
         return row
 
     def population(self, ids: Sequence | None = None) -> Population:
-        """How the cameras are distributed, which are outlying, what their parameters go with.
+        """The distribution of the cameras, the outlying ones, and correlations of their parameters.
 
         **Arguments:** `ids` of the cameras; 0, 1, 2, … if not given.
 

@@ -1,6 +1,6 @@
 """Rigs of a batch from folders of photographs: a folder a rig, in it a folder a camera.
 
-Photographs of one moment have equal names, or equal last numbers in them (`epochs`). The first
+Simultaneous photographs have equal names, or equal last numbers in them (`epochs`). The first
 camera in the order of their names is the reference.
 """
 
@@ -33,7 +33,7 @@ class RigFolders:
     workers: Workers
 
     def fingerprint(self, rig: int) -> str:
-        """Of the content of the photographs of all cameras."""
+        """The fingerprint of the content of the photographs of all cameras."""
         cameras = camera_folders(self.folders[rig])
         found = self._of([str(path) for path in cameras])
         return of_words(f"{path.name} {found.fingerprint(c)}" for c, path in enumerate(cameras))

@@ -19,9 +19,9 @@ from jaxtyping import Float
 from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
 from jaxbundle.batch.epochs import contradicting
 from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
-from jaxbundle.batch.input import LARGEST
+from jaxbundle.batch.input import LARGEST_NUMBER
 from jaxbundle.batch.misfit import misfits
-from jaxbundle.batch.weakness import vague
+from jaxbundle.batch.weakness import is_vague
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel, key_of
@@ -75,7 +75,7 @@ def solve_rigs(
 ) -> list[tuple[dict, Adjustment | None]]:
     """The row of every rig, as a line of `jaxbundle batch`, and its adjustment, if any.
 
-    `tell(part)`: so much is done."""
+    `tell(part)`: the fraction done."""
     firsts, solved = _first_cameras(rigs, settings), []
     for number, (rig, first) in enumerate(zip(rigs, firsts), 1):
         solved.append(_solve(rig, first, settings))
@@ -97,7 +97,7 @@ def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[Firs
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
         for c, size in enumerate(rig.sizes):
-            if not (np.abs(rig.xy[c]) > LARGEST).any() and np.isfinite(rig.xy[c]).any():
+            if not (np.abs(rig.xy[c]) > LARGEST_NUMBER).any() and np.isfinite(rig.xy[c]).any():
                 places.setdefault((size, len(rig.points)), []).append((i, c))
     for (size, points), of in places.items():
         xy = np.full((len(of), max(len(rigs[i].epochs) for i, _ in of), points, 2), np.nan)
@@ -145,7 +145,7 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
         return result, excluded
     while result.converged and (bad := _contradicting(rig, result, settings)):
         excluded |= {rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                     "not of the same moment?" for e, rms in bad.items()}  # fmt: skip
+                     "not simultaneous?" for e, rms in bad.items()}  # fmt: skip
         xy = rig.xy.copy()
         xy[:, list(bad)] = np.nan
         rig = dataclasses.replace(rig, xy=xy)
@@ -176,7 +176,7 @@ def _contradicting(
 def _residual_lengths(
     result: Adjustment | None, settings: RigSettings
 ) -> Float[np.ndarray, " n"]:
-    """Of the image points that were used, pixels."""
+    """Residual lengths of the image points used, pixels."""
     if result is None:
         return np.zeros(0)
     used = (np.asarray(result.problem.data.image_weight) > 0).all(1)
@@ -192,7 +192,7 @@ def _undetermined(result: Adjustment, settings: RigSettings) -> list[str]:
         of = camera["parameters"]
         values = np.array([[of[name]["value"] for name in model.parameters]])
         sigma = np.array([[of[name]["sigma"] for name in settings.free]])
-        weak = vague(model, free, values, sigma)[0]
+        weak = is_vague(model, free, values, sigma)[0]
         prefix = f"{id} " if len(result.cameras) > 1 else ""
         found += [f"{prefix}{settings.free[k]}" for k in np.flatnonzero(weak)]
     return found

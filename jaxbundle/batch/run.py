@@ -18,12 +18,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import integer
 from jaxbundle.batch.camera import LIMIT, SOLVED, STATUS
 from jaxbundle.batch.work import WHERE_GIVEN, BatchSettings, Tell, Work, plan_works
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
-from jaxbundle.io.writing.locks import locked
+from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.measure.boards import Board
 
 CAMERAS_A_WRITE = 256
@@ -64,7 +64,7 @@ def run_batch(
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
     - `board`: the board in the photographs; every folder without a network is then one of
       photographs of one camera. Found corners are stored in `FILE.corners` beside the file.
-    - `rig`: such a folder has a folder for every camera of a rig; photographs of one moment have
+    - `rig`: such a folder has a folder for every camera of a rig; simultaneous photographs have
       equal names or last numbers.
     - `pixel_size`: mm, for a model in mm.
     - `settings`: KEY=VALUE, of a project as with `jaxbundle adjust`; of cameras and rigs
@@ -87,7 +87,7 @@ def run_batch(
     is writing. A network that cannot be read or solved gets a line with the reason; the run
     continues.
     """
-    portion = whole("portion", portion)
+    portion = integer("portion", portion)
     check_part(part)
     asked = BatchSettings.of(
         model, free, board, rig, pixel_size, settings, max_iterations, snooping, significance, brief
@@ -96,7 +96,7 @@ def run_batch(
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
     with ExitStack() as held:
-        held.enter_context(locked(file))
+        held.enter_context(hold_lock(file))
         works = plan_works({key_of(path, file): str(path) for path in inputs}, file, asked, held)
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
@@ -131,7 +131,7 @@ def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict
     """The lines of these inputs in a file of results, in its order, as `run_batch` wrote them."""
     names = {key_of(path, file) for path in inputs}
     ours = lambda key: key in names or any(key.startswith(f"{name}#") for name in names)
-    with locked(file):
+    with hold_lock(file):
         lines = JsonLines(file)
         yield from lines.rows(filter(ours, lines.heads))
 
@@ -151,7 +151,7 @@ def check_part(part: Sequence[int]) -> None:
     """Refuse invalid (I, N), 1 ≤ I ≤ N.
 
     **Raises:** `InputError`."""
-    if len(part) != 2 or not 1 <= whole("part", part[0]) <= whole("part", part[1]):
+    if len(part) != 2 or not 1 <= integer("part", part[0]) <= integer("part", part[1]):
         raise InputError(f"part {part}: (I, N) is expected, the I-th of N parts, I from 1 to N")
 
 
@@ -163,7 +163,7 @@ def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
 
 
 def _tell(progress, done: int, number: int, total: int, part: float) -> None:
-    """Of so many that are being computed a part is done."""
+    """Report that a fraction `part` of `number` inputs is done."""
     progress(done + int(part * number), total)
 
 
@@ -206,15 +206,15 @@ def _difference(head: dict, work: Work, i: int) -> str:
     """Differences in settings or data of a line, in words; empty if none."""
     old = head.get("settings")
     if not isinstance(old, dict) or "data" not in head:
-        return "its line does not say what it was made of (an earlier version wrote it)"
+        return "its line does not say what it was computed from (written by an earlier version)"
     for name in {**work.settings, **dict.fromkeys(WHERE_GIVEN)}:
         value = work.settings.get(name)
         # A minimum does not depend on the iteration limit.
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
         if matters and old.get(name) != value:
-            return f"{name} was {_shown(old.get(name))}, is {_shown(value)}"
+            return f"{name} was {_show_value(old.get(name))}, is {_show_value(value)}"
     return "" if head["data"] == work.data(i) else f"{work.made_of} were others"
 
 
-def _shown(value) -> str:
+def _show_value(value) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import critical_w
-from jaxbundle.leastsquares.quality.snooping import TOGETHER
+from jaxbundle.leastsquares.quality.snooping import REMOVED_TOGETHER
 
 TESTS = ("pope",)
 MEDIAN = 1.0518
@@ -49,7 +49,7 @@ class Snooping:
         own = np.where(self.used, tests, 0.0)
         if own.max(initial=0.0) > critical:
             worst = own.argmax(1)
-            rows = np.flatnonzero(own.max(1) > max(critical, TOGETHER * own.max()))
+            rows = np.flatnonzero(own.max(1) > max(critical, REMOVED_TOGETHER * own.max()))
             self.used[rows, worst[rows]] = False
             return True
         back = self.seen & ~self.used & ~self.returned & (tests < critical) & (tests > 0)

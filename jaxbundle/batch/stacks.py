@@ -25,11 +25,11 @@ import numpy as np
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.batch.calibrate_rigs import check_rigs, rigs_of_arrays
-from jaxbundle.batch.input import check_shapes, once
+from jaxbundle.batch.input import check_shapes, single_list
 from jaxbundle.batch.rigs import Rig
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
-from jaxbundle.io.text.unpacking import most_unpacked
+from jaxbundle.io.text.unpacking import largest_unpacked_size
 from jaxbundle.io.writing.fingerprints import of_arrays
 
 UNREADABLE = (
@@ -38,8 +38,8 @@ UNREADABLE = (
 )  # fmt: skip
 """Errors of numpy and zipfile for truncated, damaged or oversized archives."""
 
-NEEDED = ("object_points", "image_points", "image_size")
-KNOWN = (*NEEDED, "visible", "ids", "cameras")
+REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
+KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
 BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
 """Numbers of axes of arrays with one row per camera, or per rig."""
 
@@ -106,20 +106,20 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     try:
         with open(path, "rb") as stream:
             if not zipfile.is_zipfile(stream):
-                raise zipfile.BadZipFile("it is no archive")
+                raise zipfile.BadZipFile("it is not an archive")
             _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: _rows(path, name, file) for name in KNOWN if name in file}
+                arrays = {name: _rows(path, name, file) for name in KNOWN_ARRAYS if name in file}
     except UNREADABLE as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
-    missing = [name for name in NEEDED if name not in arrays]
+    missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
     if missing:
         raise InputError(
-            f"{path}: no array {missing[0]!r}; expected {', '.join(NEEDED)} and, if needed, "
-            "visible and ids"
+            f"{path}: no array {missing[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, if "
+            "needed, visible and ids"
         )
-    X, xy, size = (arrays[name] for name in NEEDED)
+    X, xy, size = (arrays[name] for name in REQUIRED_ARRAYS)
     visible, cameras = arrays.get("visible"), _names(path, arrays, "cameras")
     try:
         for name in [n for n, array in arrays.items() if isinstance(array, np.ndarray)]:
@@ -132,7 +132,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
         if xy.ndim == 5:
             cameras, _ = check_rigs(X, xy, size, visible, cameras)
         else:
-            X = X if isinstance(X, StoredRows) else once(X, xy)
+            X = X if isinstance(X, StoredRows) else single_list(X, xy)
             every = np.broadcast_to(np.True_, xy.shape[:3])
             check_shapes(X, xy, size, every if visible is None else visible)
     except InputError as error:
@@ -147,7 +147,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
 
 
 def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str):
-    """An array of names, if it is there.
+    """An array of names, if there is one.
 
     **Raises:** `InputError` for another one."""
     found = arrays.get(name)
@@ -177,9 +177,9 @@ def _check_size(stream: BinaryIO) -> None:
     with zipfile.ZipFile(stream) as archive:
         unpacked = sum(
             member.file_size for member in archive.infolist()
-            if member.filename.removesuffix(".npy") in KNOWN
+            if member.filename.removesuffix(".npy") in KNOWN_ARRAYS
         )  # fmt: skip
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
-    if unpacked > most_unpacked(size):
+    if unpacked > largest_unpacked_size(size):
         raise ValueError(f"{size} bytes that claim to unpack to {unpacked}")

@@ -23,11 +23,11 @@ from jaxbundle.batch.small_cholesky import backward, cholesky, forward, rows_of
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import cross
 
-FLAT, SOLID = 4, 6
+FEWEST_POINTS, SOLID = 4, 6
 """A view with fewer points is excluded."""
 LEAST_PIVOT = 1e-10
 """Views with a smaller scaled pivot, with points on a line (in a plane), are excluded."""
-THIN = 1e-7
+SMALLEST_WIDTH = 1e-7
 """An extent across below this fraction of that along is rounding: the points lie on the line."""
 ORDINARY = 1.2
 """Focal length, in lengths of the image, where the views determine none."""
@@ -45,7 +45,7 @@ def start_values(model, flat, known, seen: Sightings, interior, size):
     """
     x, y, front = _ideal(model, known, seen, interior)
     fitted = Sightings(seen.point, seen.xy, seen.weight * front)
-    columns, usable = _fit(fitted, x, y, 2, FLAT) if flat else _fit(fitted, x, y, 3, SOLID)
+    columns, usable = _fit(fitted, x, y, 2, FEWEST_POINTS) if flat else _fit(fitted, x, y, 3, SOLID)
     weight = seen.weight * usable[:, None]
     seen = Sightings(seen.point, seen.xy, weight)
     if known:
@@ -85,7 +85,7 @@ def _ideal(model, known, seen: Sightings, interior):
 def _fit(seen, x, y, axes, least_points):
     """Columns (arrays of a view each) of H (2 axes) or P (3), w > 0 at the points; usable views."""
     X, middle, (size,) = _normalise(seen.weight, _of_views(seen, axes))
-    X = [jnp.where(jnp.max(jnp.abs(c), 1, keepdims=True) > THIN, c, 0.0) for c in X]
+    X = [jnp.where(jnp.max(jnp.abs(c), 1, keepdims=True) > SMALLEST_WIDTH, c, 0.0) for c in X]
     (x, y), (mx, my), (k,) = _normalise(seen.weight, (x, y))
     solution, usable = _direct_linear(seen.weight, X, x, y)
     h = [*solution, jnp.ones_like(mx)]
@@ -113,7 +113,7 @@ def _normalise(weight, axes):
 
 
 def _direct_linear(weight, X, x, y):
-    """Rows of H or P, without the last element, which is 1, row after row; views of use."""
+    """Rows of H or P, without the last element, which is 1, row after row; usable views."""
     nil = jnp.zeros_like(weight)
     own, none = [*X, weight], [nil] * (len(X) + 1)
     rows_x = [*own, *none, *(-x * c for c in X), x]

@@ -1,7 +1,7 @@
 """Test values of the image points of one camera of a batch, as data snooping needs them.
 
-    |v|/√(1 − h)    a point that took part, 1 − h its redundancy number
-    |v|/√(1 + h)    one that did not: its predicted residual
+    |v|/√(1 − h)    an included point, 1 − h its redundancy number
+    |v|/√(1 + h)    an excluded one: its predicted residual
 
 with the leverage h = a·Q·aᵀ, for the rows a = [aₑ aᵢ] of x and of y, the larger of the two. With
 the factor of the normal equations, N = L·Lᵀ in the order views, interior orientation,
@@ -29,7 +29,7 @@ LEAST_REDUNDANCY = 1e-6
 def point_tests(model, free, seen: Sightings, used, at: Calibration):
     """Test values of all points seen [views, points], in pixels; NaN where there is none.
 
-    **Arguments:** `seen`: the points of the views that take part; `used` [views, points]: 1 for
+    **Arguments:** `seen`: the points of the included views; `used` [views, points]: 1 for
     those the camera `at` was adjusted from, 0 for those that were removed.
     """
     columns_x, columns_y = design(model, free, seen, at)

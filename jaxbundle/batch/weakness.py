@@ -1,10 +1,10 @@
 """What the views of a camera do not determine: parameters that a status alone does not name.
 
 A singular camera has directions of its interior orientation in which the normal equations, scaled
-by their diagonal before the elimination of the views, vanish; the parameters that have part in them
-are named. Where the equations can be solved all the same, by the noise of the measurements, what
-comes out says so by its σ: views of a board all parallel to the image determine neither principal
-distance nor distances, and the σ of fx is as large as fx.
+by their diagonal before the elimination of the views, vanish; the parameters involved are named. If
+the noise of the measurements makes the equations solvable, the σ of the result show it: views of a
+board all parallel to the image determine neither principal distance nor distances, and the σ of fx
+is as large as fx.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.batch.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
-from jaxbundle.leastsquares.quality.weakness import VAGUE
+from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
-PART = 0.05
+SMALLEST_PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""
 
 
-def vague(
+def is_vague(
     model: CameraModel,
     free: tuple[int, ...],
     interior: Float[np.ndarray, "cameras parameters"],
@@ -26,12 +26,12 @@ def vague(
 ) -> Bool[np.ndarray, "cameras k"]:
     """Principal distances and points with a σ above a fiftieth of the principal distance.
 
-    Distortion never is: the σ of a coefficient of no significance is larger than itself.
+    Distortion coefficients never count: an insignificant one has a σ larger than itself.
     """
     columns = [model.parameters.index(name) for name in model.principal_distance]
     shortest = np.abs(interior[:, columns]).min(1)
     of_these = {model.parameters.index(name) for name in model.core}
-    return ~(VAGUE * sigma <= shortest[:, None]) & [column in of_these for column in free]
+    return ~(VAGUE_RATIO * sigma <= shortest[:, None]) & [column in of_these for column in free]
 
 
 def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "cameras k"]:
@@ -40,4 +40,4 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
-    return finite[:, None] & (share > PART)
+    return finite[:, None] & (share > SMALLEST_PART)

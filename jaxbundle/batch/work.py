@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import SECTIONS, rig_settings
 from jaxbundle.batch.input import any_model, free_parameters, is_plain
@@ -48,9 +48,9 @@ Tell = Callable[[float], None]
 class Work:
     """The work for an input, or for all folders of photographs.
 
-    **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`,
-    the rows of some, from their numbers, telling what part of them is done; `made_of`: what the
-    fingerprint is of, in words; `portion`: the most that are computed between two writes.
+    **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`
+    computes the rows of some inputs by number and reports the fraction done; `made_of`: the
+    fingerprinted data in words; `portion`: maximum number computed between two writes.
     """
 
     keys: tuple[str, ...]
@@ -81,7 +81,7 @@ class BatchSettings:
         cls, model, free, board, rig, pixel_size, overrides, max_iterations, snooping, significance,
         brief,
     ) -> "BatchSettings":  # fmt: skip
-        """Of the arguments of `run_batch`.
+        """The settings from the arguments of `run_batch`.
 
         **Raises:** `InputError`."""
         one_of("snooping", snooping, TESTS, none=True)
@@ -91,7 +91,7 @@ class BatchSettings:
             need_opencv()
         elif rig:
             raise InputError("rig: give the board that is in the photographs (--board)")
-        adjusting = {"max_iterations": whole("max_iterations", max_iterations)}
+        adjusting = {"max_iterations": integer("max_iterations", max_iterations)}
         if snooping is not None:
             adjusting |= dict(snooping=snooping, significance=significance)
         return cls(any_model(model), str(model), free, board, rig, pixel_size, tuple(overrides),
@@ -111,7 +111,7 @@ class BatchSettings:
         return {name: document[name] for name in (*SECTIONS, SIGMA_IMAGE) if name in document}
 
     def as_rigs(self) -> RigSettings:
-        """Those of cameras and rigs that are networks."""
+        """The settings of cameras and rigs that are adjusted as networks."""
         sections = self.sections()
         sigma = sections.pop(SIGMA_IMAGE, SIGMA)
         return rig_settings(self.model, self.free, sections, self.pixel_size, sigma,

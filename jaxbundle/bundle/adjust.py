@@ -9,19 +9,24 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, make_problem
-from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
+from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_infinity
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
-    misjudged,
+    inspect_solution,
+    is_misjudged,
     name_inseparable,
     names_of_defects,
-    solved,
     start_with,
     weakness_without_solution,
 )
 from jaxbundle.bundle.orient import orient, orient_again, screen
-from jaxbundle.bundle.repeated import eliminate_parameters, robustly, snoop_network, with_components
+from jaxbundle.bundle.readjust import (
+    adjust_robustly,
+    eliminate_parameters,
+    snoop_network,
+    with_components,
+)
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
@@ -31,12 +36,12 @@ from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.check import check_network
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Camera, Network, require_network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation.angle_units import name_angle_unit
-from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
@@ -82,8 +87,8 @@ def adjust(
     - `reduction`: solver of the reduced system of images and cameras: `"dense"`, `"banded"` or
       `"iterative"`; by default chosen by size and fill.
     - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly are downweighted by
-      the a posteriori scale of the residuals (`jaxbundle.statistics.robust_scale`, a MAD). The
-      result uses the last weights; its σ are a few per cent too small.
+      the a posteriori scale of the residuals (`leastsquares.quality.robust.robust_scale`, a MAD).
+      The result uses the last weights; its σ are a few per cent too small.
     - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: for `"pope"`
       the probability of removing anything from a network without blunders, for `"baarda"` that of
       removing a single observation; also the probability that `robust` suspects anything. If
@@ -139,14 +144,14 @@ class _First:
         """Adjust from the start values of `network`, a part of `given` that may contain
         `outliers`."""
         found = self._minimise(network)
-        while len(network.observations) < len(given.observations) and misjudged(*found[:2]):
+        while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
             # Observations excluded by a wrong principal distance may agree with the adjusted one.
             cameras, fewer = adjusted_cameras(found[0], found[1].values), network
             network = orient_again(given, fewer, cameras)
             if network is fewer:
                 break
             found = self._minimise(network, cameras)
-        if outliers and not solved(found[0].with_factor(), found[1]):
+        if outliers and not inspect_solution(found[0].with_factor(), found[1]):
             screened = screen(network)
             if len(screened.observations) < len(network.observations):
                 found = self._minimise(screened)
@@ -183,12 +188,12 @@ class _Found:
         """The solution, if there is one; evaluated once until a step changes it."""
         seen = self.inspected
         if seen is None or seen[0] is not self.problem or seen[1] is not self.minimum:
-            seen = self.problem, self.minimum, solved(self.problem, self.minimum)
+            seen = self.problem, self.minimum, inspect_solution(self.problem, self.minimum)
             self.inspected = seen
         return seen[2]
 
     def weight_robustly(self, again, robust: str, significance: float) -> None:
-        found, self.minimum = robustly(self.problem, self.minimum, again, robust)
+        found, self.minimum = adjust_robustly(self.problem, self.minimum, again, robust)
         suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
         self.problem = self.problem.with_system(found.found.problem)
         doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
@@ -245,7 +250,7 @@ def check_options(
     **Raises:** `InputError`, naming the option and what is expected."""
     one_of("method", method, METHODS)
     one_of("reduction", reduction, REDUCTIONS, none=True)
-    whole("max_iterations", max_iterations)
+    integer("max_iterations", max_iterations)
     one_of("robust", robust, ESTIMATORS, none=True)
     check_test(snooping, significance)
     if robust and snooping:
@@ -254,7 +259,7 @@ def check_options(
     at_least_zero("critical_t", critical_t)
     truth("estimate_components", estimate_components)
     if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function, but is {shown(progress)}")
+        raise InputError(f"progress must be a function, but is {show(progress)}")
 
 
 def _likely_causes(
@@ -267,7 +272,7 @@ def _likely_causes(
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
         return ()
-    told = any(CONTRADICTION in line for line in network.warnings)
+    told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     causes = (
         name_pixels(network), name_angle_unit(network),
         "" if told else name_contradiction(network),
@@ -294,7 +299,7 @@ def _place(found: Oriented) -> Network:
         ("image", found.images, len(network.images)), ("point", found.points, len(network.points))
     ):  # fmt: skip
         if len(reasons) >= left:
-            said = some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+            said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
             cause = name_pixels(network)
             raise NotSolvedError(
                 f"not solved: no start values for {len(reasons)} of "

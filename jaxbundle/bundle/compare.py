@@ -1,4 +1,4 @@
-r"""`compare`: what two adjustments have in common, and which of it differs by more than its σ.
+r"""`compare`: the common unknowns of two adjustments, and those that differ significantly.
 
 The unknowns x of the same names are brought into one datum and subtracted,
 
@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.adjustment.problem import HELD, Problem
 from jaxbundle.adjustment.unknowns import angles_near
-from jaxbundle.arguments import number, shown
+from jaxbundle.arguments import number, show
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -40,18 +40,18 @@ from jaxbundle.geometry.similarity import compose, helmert_point
 from jaxbundle.leastsquares.datum.motions import SEVEN
 from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import count, data_frame, some
+from jaxbundle.network.columns import count, data_frame, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.system.programs import compile_once
 
 MOST_TOGETHER = 1500
-"""Coordinates of points whose joint covariance is formed; of more, portions of so many are."""
+"""Number of point coordinates whose joint covariance is formed at once; more are divided."""
 NULL = 1e-9
 """Eigenvalues of a correlation matrix below this part of the largest are 0."""
 SCALE = SEVEN.index("scale")
 ROUNDS = 10
-SHOWN = 12
+SHOWN_ROWS = 12
 """Rows of a comparison on the screen."""
 
 
@@ -129,14 +129,14 @@ class AdjustmentComparison:
                          f": scale {np.exp(self.similarity[6]):.8g}")  # fmt: skip
         if self.shared:
             lines.append(f"{count(self.shared, 'image point')} of both are the same measurements: "
-                         "σ of differences are too large, and nothing is tested")  # fmt: skip
+                         "the σ of differences are too large; nothing is tested")  # fmt: skip
         lines += [f"{name}: {test}" for name, test in self.tests.items()]
         if not self.shared:
             lines.append(f"{int(self.differs.sum())} of {len(self)} differ significantly "
                          f"({self.significance:g} for all together)")  # fmt: skip
         sigma = np.where(self.sigma > 0, self.sigma, np.nan)
         ratio = np.nan_to_num(np.abs(self.difference / sigma))
-        rows = np.argsort(-ratio, kind="stable")[:SHOWN]
+        rows = np.argsort(-ratio, kind="stable")[:SHOWN_ROWS]
         lines.append(f"{'':24}{'a':>16}{'b':>16}{'b − a':>12}{'σ':>11}{'b − a in σ':>11}")
         for k in rows:
             name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"
@@ -170,21 +170,21 @@ def compare(
     **Arguments:**
 
     - `similarity`: whether coordinates are compared after a similarity (of seven parameters, or six
-      where both networks have a scale of their own). If not given: where observations of one of
-      them leave its datum open.
-    - `held_by`: ids of the points it is found on, such as those that are known to be stable; if not
-      given all that both have.
+      if both networks have their own scale). Default: if the observations of one of them leave its
+      datum open.
+    - `held_by`: ids of the points it is found on, such as those known to be stable; default: all
+      common points.
     - `significance`: the probability that any row is called different by chance.
 
-    **Raises:** `InputError` where they have nothing in common, other units, or too few points for a
-    similarity; `NotSolvedError` where one has no result.
+    **Raises:** `InputError` if they have nothing in common, different units, or too few points for
+    a similarity; `NotSolvedError` if one has no result.
     """
     for name, one in (("a", a), ("b", b)):
         if not isinstance(one, Adjustment):
-            raise InputError(f"{name} must be an Adjustment, but is {shown(one)}: jaxbundle.adjust "
+            raise InputError(f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
                              "or jaxbundle.load_adjustment gives one")  # fmt: skip
     if similarity not in (None, True, False):
-        raise InputError(f"similarity must be True, False or None, but is {shown(similarity)}")
+        raise InputError(f"similarity must be True, False or None, but is {show(similarity)}")
     significance = number("significance", significance, "between 0 and 1", lambda x: 0 < x < 1)
     _require_units(a, b)
     rows = _common_rows(a, b)
@@ -195,7 +195,7 @@ def compare(
         held = _held(rows.points, held_by)
         frames, tau = _frames(a, b, held)
     elif held_by:
-        raise InputError("held_by: no similarity is found that could be held by points")
+        raise InputError("held_by: no similarity is estimated, so no points hold one")
     one, other = (_In(r, f, r.problem, b.problem) for r, f in zip((a, b), frames))
     return _compare(a, b, one, other, rows, tau, held, significance)
 
@@ -244,7 +244,7 @@ def _held(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
         raise InputError("held_by must be a list of ids of points, but is a text")
     missing = [id for id in map(str, wanted) if id not in set(points)]
     if missing:
-        raise InputError(f"held_by: points {some(missing)} are not in both adjustments")
+        raise InputError(f"held_by: points {list_some(missing)} are not in both adjustments")
     held = tuple(map(str, wanted)) or tuple(points)
     if len(held) < 3:
         raise InputError(f"a similarity needs three points in common, but there are {len(held)}; "
@@ -335,7 +335,7 @@ class _In:
     problem: Problem
     like: Problem
 
-    def chosen(self, rows: _Common, angles) -> _Chosen:
+    def choose_rows(self, rows: _Common, angles) -> _Chosen:
         network = self.problem.network
         of = lambda ids, table: np.array([{id: k for k, id in enumerate(table)}[id] for id in ids],
                                          int)  # fmt: skip
@@ -350,7 +350,7 @@ class _In:
 
     def estimate(self, rows: _Common, angles) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns and their covariance."""
-        chosen = self.chosen(rows, angles)
+        chosen = self.choose_rows(rows, angles)
         return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
 
 
@@ -375,7 +375,7 @@ def _compare(
     value, variance = lambda x, C: x, lambda x, C: np.diagonal(C)
     x_a, x_b = join(0, value), join(1, value)
     v_a, v_b = (np.clip(join(side, variance), 0, None) for side in (0, 1))
-    shared = _shared(a, b)
+    shared = _count_shared(a, b)
     tests = {}
     if not shared:
         freedom = partial(_freedom, r=(a.redundancy, b.redundancy))
@@ -444,8 +444,8 @@ def _rows_of(a: Adjustment, b: Adjustment, rows: _Common, x_a, x_b, v_a, v_b) ->
 
 
 def _congruency(d, C_a, C_b, at, freedom, lost: int = 0) -> Congruency | None:
-    """The test that these differences are 0 together; None where nothing is free. `lost`: what a
-    similarity has taken off their rank."""
+    """The test that these differences are 0 together; None where nothing is free. `lost`: the rank
+    removed by a similarity."""
     C_a, C_b = C_a[np.ix_(at, at)], C_b[np.ix_(at, at)]
     diagonal = np.diagonal(C_a + C_b)
     free = diagonal > 0
@@ -463,11 +463,11 @@ def _congruency(d, C_a, C_b, at, freedom, lost: int = 0) -> Congruency | None:
 
 
 def _freedom(part: float, r: tuple[int, int]) -> float:
-    """Welch's degrees of freedom of a variance of which `part` is that of the first."""
+    """Welch's degrees of freedom of a sum of two variances, the first of which is `part`."""
     return 1 / (part**2 / r[0] + (1 - part) ** 2 / r[1])
 
 
-def _shared(a: Adjustment, b: Adjustment) -> int:
+def _count_shared(a: Adjustment, b: Adjustment) -> int:
     """Image points that both adjustments have with the same coordinates."""
 
     def measured(r: Adjustment):

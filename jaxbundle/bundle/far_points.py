@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.minimum import adjusted_cameras, minimise, solved
+from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution, minimise
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.any_distance import FARTHEST, is_at_infinity
+from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.network.arrays import Values
@@ -29,13 +29,13 @@ NARROW, PARALLEL = 0.03, 1e-3
 """Largest angle between the rays, in radians, of a point that may be at any distance; and of one
 that is so from the start, unless half of the tie points are: then all images have nearly the same
 projection centre."""
-PATIENCE = 30
+EVALUATIONS_BEFORE_RELEASE = 30
 """Evaluations before narrow points are put at any distance; twice as many if half of the tie points
 are narrow."""
-ROUND = 4
+EVALUATIONS_BETWEEN_CHECKS = 4
 """Evaluations between checks of points pulled beyond infinity, or back; doubled whenever no point
 changed."""
-RELEASES = 10
+MOST_RELEASES = 10
 """A point released this often stays at infinity."""
 
 
@@ -52,9 +52,9 @@ def minimise_at_any_distance(
     legs, parallel = [], angle < PARALLEL
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
-            patience = PATIENCE * (2 if mostly(angle < NARROW) else 1)
+            patience = EVALUATIONS_BEFORE_RELEASE * (2 if mostly(angle < NARROW) else 1)
             plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
-            if solved(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
+            if inspect_solution(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
             legs, start = [plain], plain.values
             chosen = angle_of_rays(problem, start) < NARROW
@@ -62,7 +62,7 @@ def minimise_at_any_distance(
         far = _with_far_points(problem, start, chosen, make)
         if far is not None:
             found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
-            if solved(found.with_factor(), minimum):
+            if inspect_solution(found.with_factor(), minimum):
                 return found, _join([*legs, minimum])
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]
@@ -77,7 +77,7 @@ def minimise_with_infinity(
     if problem.layout.lengths is None:
         return problem, minimise(problem, start, max_steps=max_steps, **options)
     held = _held(problem)
-    legs, released, steps = [], np.zeros(len(held), int), ROUND
+    legs, released, steps = [], np.zeros(len(held), int), EVALUATIONS_BETWEEN_CHECKS
     problem = _hold_at_infinity(problem, held, start)  # One program for all rounds.
     while True:
         left = max_steps - sum(int(leg.iterations) for leg in legs)
@@ -85,13 +85,13 @@ def minimise_with_infinity(
         start = legs[-1].values
         there = at_infinity(problem, start)
         if there.any():
-            outward = _pulled_outward(problem, start)
-            there &= np.where(held, outward | (released >= RELEASES), outward)
+            outward = _are_pulled_outward(problem, start)
+            there &= np.where(held, outward | (released >= MOST_RELEASES), outward)
         released += held & ~there
         changed = (there != held).any()
         if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
             return problem, _join(legs)
-        steps = ROUND if changed else 2 * steps
+        steps = EVALUATIONS_BETWEEN_CHECKS if changed else 2 * steps
         if changed:
             held = there
             problem = _hold_at_infinity(problem, held, start)
@@ -142,7 +142,7 @@ def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]
     depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = FARTHEST * present(problem.layout.lengths)
+    most = LARGEST_DISTANCE * present(problem.layout.lengths)
     move = (most > 0) & ((sides < 0) | (length > most))
     factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
     return X * factor[:, None]
@@ -172,7 +172,7 @@ def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
     return problem.with_free("point", free)
 
 
-def _pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+def _are_pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
     """Whether vᵀPv decreases with the distance of a point."""
     free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
     solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))

@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.bundle.sensitivity import looked_at
+from jaxbundle.bundle.sensitivity import inspection_of
 from jaxbundle.bundle.tables import observations
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.response import pull_back
 from jaxbundle.network.columns import data_frame
@@ -27,7 +27,7 @@ MOST_ROWS = 20
 """Number of printed measurements per result."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Influence:
     """The influence of measurements on results.
@@ -86,7 +86,7 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     **Raises:** `InputError` for an unknown name, and for results that are means over images or
     points; `NotSolvedError` without a solution.
     """
-    inspection, sigma0, _ = looked_at(given)
+    inspection, sigma0, _ = inspection_of(given)
     results = ask(inspection, of)
     if any(not _is_single(one) for one in results.asked):
         raise InputError("influence: name single results, such as point:7:Z; a mean over all has "
@@ -125,4 +125,4 @@ COLUMNS = {
     "point": lambda kind, image, point, axes: np.repeat(point, len(axes)),
     "axis": lambda kind, image, point, axes: np.tile(np.array(axes, object), len(image)),
 }
-"""What names a measurement."""
+"""The columns that identify a measurement."""

@@ -11,17 +11,17 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.bundle.stored import CLASSES, FORMAT, State, Stored, with_own_models
+from jaxbundle.bundle.storage import CLASSES, FORMAT, State, Stored, with_own_models
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 
 SAME_SIGMA0 = 1e-6
-"""σ0 of a loaded adjustment that differs by more, relatively, is not that of the saved one."""
+"""Largest relative difference of σ0 between a loaded and the saved adjustment."""
 WHAT = "a saved adjustment (Adjustment.save, jaxbundle adjust --save)"
 
 
@@ -33,12 +33,12 @@ def load_adjustment(
 ) -> Adjustment:
     """Load what `Adjustment.save` has written: the whole result, without iterating again.
 
-    **Arguments:** `models`: camera models of one's own that its cameras have; `also`: what `adjust`
-    was given under this name. Both are functions, which no file holds.
+    **Arguments:** `models`: user-defined models of its cameras; `also`: what `adjust`
+    was given under this name. Both are functions, which a file cannot hold.
 
     **Returns:** an `Adjustment` with everything that the saved one has, every covariance included.
 
-    **Raises:** `InputError` for a file that is none, and where `models` or `also` are missing;
+    **Raises:** `InputError` for another kind of file, and if `models` or `also` are missing;
     `RuntimeError` without 64-bit floats.
     """
     given_path("path", path)
@@ -47,8 +47,8 @@ def load_adjustment(
         raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
     missing = sorted(set(found.own_models) - {model.name for model in models})
     if missing:
-        raise InputError(f"{path}: the camera models {some(missing)} are not built in; give them "
-                         "as models=[…]")  # fmt: skip
+        raise InputError(f"{path}: the camera models {list_some(missing)} are not built in; give "
+                         "them as models=[…]")  # fmt: skip
     found = dataclasses.replace(found, network=with_own_models(found.network, models))
     try:
         result = _restore(found, _problem(found, also, path))
@@ -75,8 +75,8 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
     kinds = tuple(o.kind.name for o in problem.system.observations)
     if (tables, kinds) != (state.tables, state.kinds):
         other = set(state.tables + state.kinds) ^ set(tables + kinds)
-        raise InputError(f"{path}: was adjusted with other tables and observations of one's own "
-                         f"({some(sorted(other))}); give the same as also=[…]")  # fmt: skip
+        raise InputError(f"{path}: was adjusted with other user-defined tables and observations "
+                         f"({list_some(sorted(other))}); give the same as also=[…]")  # fmt: skip
     start = _tree(problem.data.start, state.start)
     problem = problem.with_data(dataclasses.replace(problem.data, start=start))
     for table, free in zip(problem.system.tables, state.free):

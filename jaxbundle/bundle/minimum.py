@@ -15,21 +15,22 @@ from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINAT
 from jaxbundle.leastsquares.quality.names import undetermined
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
 
-MISJUDGED = 1.03
+MISJUDGED_RATIO = 1.03
 """If a principal distance changed by more than this factor, start values are computed again."""
 
 INSEPARABLE = 1e-7
 """Scaled eigenvalues of the normal matrix below this: a change of the unknowns by many σ hardly
-changes an observation, and iterations go on for long."""
+changes an observation, and the iterations take long."""
 EIGENVECTORS = 3000
-"""Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
+"""Reduced systems with more unknowns are not searched for null vectors, which would take
+minutes."""
 
-RUNAWAY = 20.0
+LARGEST_FACTOR = 20.0
 """A principal distance that changed by more than this factor is implausible."""
 
 
@@ -40,10 +41,10 @@ def minimise(problem: Problem, start: Values, **options) -> Minimum[Values]:
     return Minimum(values, found.termination, found.iterations, found.history)
 
 
-def solved(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
+def inspect_solution(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
     """The solution if it converged, no camera collapsed and all unknowns are determined; else
     None."""
-    if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
+    if not bool(converged(int(minimum.termination))) or _find_collapsed(problem, minimum.values):
         return None
     inspection = Inspection(problem, minimum.values)
     return inspection if inspection.determined else None
@@ -53,8 +54,8 @@ def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
     """The undetermined unknowns where the iterations ended; for a large network, where eigenvectors
     take too long, the weak ones if it is singular."""
     values = minimum.values
-    if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
-        return _collapsed(problem, values)
+    if bool(converged(int(minimum.termination))) and _find_collapsed(problem, values):
+        return _find_collapsed(problem, values)
     system = problem.system
     if system.plan.reduction == "dense" and system.reduced_size <= EIGENVECTORS:
         return undetermined(system, problem.layout.tables(_last(problem, minimum)))
@@ -77,8 +78,8 @@ def name_inseparable(problem: Problem, minimum: Minimum[Values]) -> str:
     if not names:
         return ""
     return (
-        f"hardly separated where the iterations ended: {some(names, 8, str)}; hold some of them, "
-        "give them a prior σ, or raise the limit of iterations"
+        f"hardly separated where the iterations ended: {list_some(names, 8, str)}; hold some of "
+        "them, give them a prior σ, or raise the limit of iterations"
     )
 
 
@@ -98,34 +99,34 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
     """The solution of a repeated adjustment; refused if it was not solved.
 
     **Raises:** `NotSolvedError`."""
-    found = solved(problem, minimum)
+    found = inspect_solution(problem, minimum)
     if not found:
         names = names_of_defects(problem, minimum)
         reason = int(minimum.termination)
         why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
         if names:
-            why = f"the network is no longer determined: {some(names, 8, str)}"
+            why = f"the network is no longer determined: {list_some(names, 8, str)}"
         raise NotSolvedError(f"not solved {when}: {why}", names)
     return found
 
 
-def _collapsed(problem: Problem, values: Values) -> list[str]:
-    """Principal distances that diverged from their start values by a factor of `RUNAWAY`.
+def _find_collapsed(problem: Problem, values: Values) -> list[str]:
+    """Principal distances that diverged from their start values by a factor of `LARGEST_FACTOR`.
 
     If c and an image scale are both free, c = 0 makes all corrected residuals zero.
     """
     return [
         f"{parameter} of camera {camera.id} (it diverged from its start value)"
         for camera, parameter, ratio in _principal_distances(problem, values)
-        if not 1 / RUNAWAY < ratio < RUNAWAY
+        if not 1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR
     ]
 
 
-def misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
+def is_misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
     """Whether an adjusted principal distance differs from the given one, but plausibly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
-    sane = all(1 / RUNAWAY < ratio < RUNAWAY for ratio in ratios)
-    return sane and any(not 1 / MISJUDGED < ratio < MISJUDGED for ratio in ratios)
+    sane = all(1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR for ratio in ratios)
+    return sane and any(not 1 / MISJUDGED_RATIO < ratio < MISJUDGED_RATIO for ratio in ratios)
 
 
 def adjusted_cameras(problem: Problem, values: Values) -> dict[str, Camera]:

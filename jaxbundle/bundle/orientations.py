@@ -6,7 +6,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
 from jaxbundle.network.tables import EXTERIOR
 
-LARGEST = 20_000_000
+LARGEST_PRODUCT = 20_000_000
 """Largest product of orientation unknowns and point coordinates for which it is computed."""
 
 
@@ -29,7 +29,7 @@ def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
                 places.append((table.name, row, j))
     if len(places) == free.size and not free.any():
         return None
-    if len(places) * 3 * len(network.points) > LARGEST:
+    if len(places) * 3 * len(network.points) > LARGEST_PRODUCT:
         return None
     rows = {t.name: np.zeros((len(places), t.rows, t.space.width)) for t in problem.system.tables}
     for n, (name, row, column) in enumerate(places):

@@ -18,19 +18,19 @@ from jaxbundle import plotting, report
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.unknowns import (
     angles_near,
-    named,
+    find_unknowns,
     place_of,
     value_of,
 )
 from jaxbundle.arguments import at_least_zero
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle import tables as result_tables
-from jaxbundle.bundle.stored import network_fingerprint, store
+from jaxbundle.bundle.storage import network_fingerprint, store
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
@@ -39,12 +39,12 @@ from jaxbundle.leastsquares.quality.components import Component, variance_compon
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import data_frame, some
+from jaxbundle.network.columns import data_frame, list_some
 from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.orientation.exchanges import CONTRADICTION
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
 from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints, intersect_check_points
 from jaxbundle.statistics.components import groups
@@ -164,7 +164,8 @@ class Adjustment:
         if self._weakness is not None or not self.converged:
             return self._weakness or Weakness()
         scale = self._scale
-        if any(CONTRADICTION in line for line in (*self.problem.network.warnings, *self.findings)):
+        lines = (*self.problem.network.warnings, *self.findings)
+        if any(CONTRADICTORY_CONTROL in line for line in lines):
             scale = min(scale, 1.0)
         return weakness(self.inspection, min(self.sigma0, scale))
 
@@ -208,7 +209,7 @@ class Adjustment:
 
     def _require_solved(self) -> None:
         if not self.converged:
-            names = some(self.undetermined, 8, str)
+            names = list_some(self.undetermined, 8, str)
             what = f"; not determined: {names}" if names else ""
             what += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
             raise NotSolvedError(
@@ -296,7 +297,7 @@ class Adjustment:
         """ω, φ, κ of all images, nearest to the given angles, and their Jacobians by δθ; small
         networks share the program."""
         given = self.problem.network.images.angles
-        rows = max(rounded(len(given)), LEAST_IMAGES)
+        rows = max(round_up(len(given)), LEAST_IMAGES)
         wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
         return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
 
@@ -378,7 +379,7 @@ class Adjustment:
 
         **Raises:** `InputError` without names, or for a name that does not have three parts;
         `KeyError` for an unknown name."""
-        wanted = named(self.problem, names)
+        wanted = find_unknowns(self.problem, names)
 
         def pick(values: Values):
             return jnp.stack([value_of(self.problem, name, values) for name in wanted])
@@ -461,8 +462,9 @@ class Adjustment:
 
     def save(self, path: str | PathLike) -> None:
         """Write the whole result into a file, which `jaxbundle.load_adjustment` reads; a file of
-        this name is replaced when the new one is complete. Camera models and observations of one's
-        own (`also`) are functions: they are named in it, and have to be given when it is loaded.
+        this name is replaced when the new one is complete. User-defined camera models and
+        observations (`also`) are functions: the file names them, and they must be given when it is
+        loaded.
 
         **Raises:** `NotSolvedError` where there is no result; `InputError` where the file cannot
         be written."""

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.quality.response import follow
@@ -28,13 +28,13 @@ from jaxbundle.report.budget import HEADER
 from jaxbundle.report.layout import significant, table
 from jaxbundle.statistics.held import Cause, find_causes
 from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.precision import predicted
+from jaxbundle.statistics.precision import predict
 from jaxbundle.statistics.results import WORDS, Asked, ask, effects_on
 
 MEASUREMENTS, TOTAL = "measurements", "total"
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Budget:
     """Effects of errors of held quantities on results.
@@ -123,7 +123,7 @@ def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = 
     **Raises:** `InputError` for an unknown name, an estimated quantity in `held`, or a σ that is
     not positive; `NotSolvedError` without a solution.
     """
-    inspection, sigma0, unit = looked_at(given)
+    inspection, sigma0, unit = inspection_of(given)
     problem = inspection.problem
     found = inspection.solution
     causes = find_causes(problem, found.values, held)
@@ -135,18 +135,18 @@ def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = 
     effects = np.concatenate(parts)
     ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])
     by_cause = np.array([
-        [_together(asked.of(effects[a:b])) for asked in results.asked]
+        [root_sum_of_squares(asked.of(effects[a:b])) for asked in results.asked]
         for a, b in zip(ends, ends[1:])
     ])  # fmt: skip
     return Budget(results.asked, tuple(causes), sigma0 * results.sigma, by_cause, unit)
 
 
-def _together(effects: Float[np.ndarray, " k"]) -> float:
+def root_sum_of_squares(effects: Float[np.ndarray, " k"]) -> float:
     """The root sum of squares of independent errors; a single one keeps its sign."""
     return float(effects[0]) if len(effects) == 1 else float(np.sqrt((effects**2).sum()))
 
 
-def looked_at(given: Any) -> tuple[Inspection, float, float]:
+def inspection_of(given: Any) -> tuple[Inspection, float, float]:
     """The inspection of an adjustment or a design, its σ0, and the factor from radians to its unit
     of angles.
 
@@ -154,13 +154,13 @@ def looked_at(given: Any) -> tuple[Inspection, float, float]:
     if isinstance(given, Problem):
         given = given.with_factor()
         if given.reduction not in FACTORS:
-            raise InputError("the network is too large for its covariance; take part of it")
-        given = given.with_data(predicted(given, given.data))
+            raise InputError("the network is too large for its covariance; use a part of it")
+        given = given.with_data(predict(given, given.data))
         return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
     if not isinstance(given, Adjustment):
         raise InputError(
             f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not "
-            f"{shown(given)}"
+            f"{show(given)}"
         )
     return given.cofactors, given.sigma0, given.angle_scale
 

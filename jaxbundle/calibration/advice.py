@@ -7,21 +7,21 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
-from jaxbundle.leastsquares.quality.weakness import VAGUE
+from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
 FEW_VIEWS = 8
-TURNED = 60.0
+SMALLEST_ROLL = 60.0
 """Minimum difference of roll between two photographs, degrees; 90 is best."""
-TILTED = 15.0
+SMALLEST_TILT = 15.0
 """Minimum angle between line of sight and board normal, degrees."""
 FEW_TILTED = 3
 RANGE = 1.3
 """Minimum ratio of farthest to nearest distance of the board."""
 REACH, PART = 0.85, 0.6
-LARGE = 1.0
+LARGEST_RMS = 1.0
 """A larger RMS, in pixels, is not caused by corner detection."""
-CONTRADICTION = 3.0
-WEAK = 1.0
+LARGEST_TEST = 3.0
+SMALLEST_T = 1.0
 """A distortion coefficient with smaller |value|/σ is insignificant."""
 
 
@@ -45,21 +45,21 @@ def advice(
     found = [
         f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "
         "determine the principal distance; they need varied tilts and distances"
-        for name in model.principal_distance if t.get(name, np.inf) < VAGUE
+        for name in model.principal_distance if t.get(name, np.inf) < VAGUE_RATIO
     ]  # fmt: skip
     found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
-    if rms > LARGE:
+    if rms > LARGEST_RMS:
         found.append(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
             "board (--board-sigma), or free more parameters"
         )
-    if validation is not None and validation.test > CONTRADICTION:
+    if validation is not None and validation.test > LARGEST_TEST:
         found.append(
             f"the two halves of the photographs contradict each other (test {validation.test:.1f}, "
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
             "model or the board does not fit (--model, --board-sigma)"
         )
-    weak = [name for name, value in t.items() if value < WEAK and name not in model.core]
+    weak = [name for name, value in t.items() if value < SMALLEST_T and name not in model.core]
     if weak and not model.prior:
         found.append(
             f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "
@@ -86,17 +86,17 @@ def _geometry(position, rotation, middle, unit) -> Iterator[str]:
             f"only {number} photographs show the board: take {FEW_VIEWS} to 20, from different "
             "directions"
         )
-    steep = (tilts(rotation) > TILTED).sum()
+    steep = (tilts(rotation) > SMALLEST_TILT).sum()
     if steep < FEW_TILTED:
         yield (
-            f"only {steep} of {number} photographs look at the board from more than {TILTED:.0f}° "
-            f"aside, fewer than {FEW_TILTED}: the principal distance is hard to tell from the "
-            "distance of the board; take some tilted by 20° to 45°, to the left, to the right, up "
-            "and down"
+            f"only {steep} of {number} photographs look at the board from more than "
+            f"{SMALLEST_TILT:.0f}° aside, fewer than {FEW_TILTED}: the principal distance "
+            "can hardly be separated from the distance of the board; take some tilted by 20° to "
+            "45°, to the left, to the right, up and down"
         )
     turn = turns(rotation)
     apart = np.abs(turn[:, None] - turn) % 180
-    if np.minimum(apart, 180 - apart).max() < TURNED:
+    if np.minimum(apart, 180 - apart).max() < SMALLEST_ROLL:
         yield (
             "no photograph is rolled by 90° about the line of sight: only the tilts determine the "
             "principal point; take some with the camera rolled"

@@ -22,8 +22,8 @@ all t), Ω' with r'. Without a bias
     F = ((Ω − Ω')/(r − r')) / (Ω'/r')   ~   F(r − r', r')
 
 **Smooth biases.** The cell test has little power because it is unspecific. Two more tests add a
-smooth field with q free coefficients b to the calibration (`linearised.lagrange_multipliers`, no
-second adjustment),
+smooth field with q free coefficients b to the calibration
+(`observation_equations.lagrange_multipliers`, no second adjustment),
 
     F = (bᵀSb/q) / ((Ω − bᵀSb)/(r − q))   ~   F(q, r − q)
 
@@ -43,7 +43,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
+from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import f_tail
@@ -58,7 +58,7 @@ FEWEST = 10
 
 DEGREES = {"camera": 5, "heights": 4, "plane": 2}
 """Degrees of the polynomials of a smooth bias."""
-ABSORBED = 0.01
+SMALLEST_REMAINDER = 0.01
 """Smallest fraction of the square of a field that the unknowns must leave."""
 
 
@@ -111,7 +111,7 @@ class Bias:
                   "the board (--board-free)"}  # fmt: skip
         what = f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
         part = f", {100 * self.ratio:.0f} % of the residual variance" if self.ratio > 0 else ""
-        return f"the residuals hold a bias{part}, {what}"
+        return f"the residuals contain a bias{part}, {what}"
 
 
 def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
@@ -160,7 +160,7 @@ def _gain(adjustment, found, B) -> tuple[float, int]:
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
     score, S = lagrange_multipliers(adjustment, found, B)
     size, V = np.linalg.eigh(S)
-    new = size > ABSORBED
+    new = size > SMALLEST_REMAINDER
     return float(((V[:, new].T @ score) ** 2 / size[new]).sum()), int(new.sum())
 
 

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.arguments import number, positive, shown, text, vector
+from jaxbundle.arguments import number, positive, show, text, vector
 from jaxbundle.bundle.adjust import adjust, check_options
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
@@ -137,7 +137,7 @@ def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
     if not isinstance(files, Sequence):
         raise InputError(
             "photographs must be a list of files, patterns or folders, or BoardViews, but is "
-            f"{shown(files)}"
+            f"{show(files)}"
         )
     return measure_boards(files, board, progress)
 
@@ -251,7 +251,7 @@ def _check_given(model: CameraModel, given) -> None:
     if given is None:
         return
     if not isinstance(given, Mapping):
-        raise InputError(f"given must be like {{'fx': 900.0}}, but is {shown(given)}")
+        raise InputError(f"given must be like {{'fx': 900.0}}, but is {show(given)}")
     for name, value in given.items():
         if name not in model.parameters:
             raise InputError(

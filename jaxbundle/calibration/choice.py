@@ -30,14 +30,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle import plotting
-from jaxbundle.arguments import shown, whole
+from jaxbundle.arguments import integer, show
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import at_result, kept_rays, part, residuals_in_pixels
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.cameras import CameraModel, Comparison, compare_cameras, get_model
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
@@ -49,7 +49,7 @@ FEWEST = 4
 """Minimum number of photographs for the camera of a fold."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """A model, calibrated from the common observations.
@@ -77,7 +77,7 @@ class Candidate:
         return get_model(self.calibration.camera.model), self.calibration.parameters
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Difference:
     """The image difference of a model from the best: the map, its lengths in pixels, and the RMS of
@@ -184,9 +184,9 @@ def compare_models(
     if isinstance(models, str) or not isinstance(models, Iterable) or len({*models}) < 2:
         raise InputError(
             "models: give at least two different ones, such as ['opencv', 'kannala-brandt'], not "
-            f"{shown(models)}"
+            f"{show(models)}"
         )
-    folds = whole("folds", folds, 2)
+    folds = integer("folds", folds, 2)
     names = [check_model(model).name for model in models]
     views = views_of(photographs, board, progress)
     found, failed = {}, {}
@@ -212,7 +212,7 @@ def compare_models(
             f"{len(common)} photographs can be used by all models; {folds} folds need "
             f"{folds + FEWEST} at least: give more, or fewer folds"
         )
-    gross = set.intersection(*(_removed(one) for one in found.values()))
+    gross = set.intersection(*(_removed_points(one) for one in found.values()))
     candidates = []
     for name, one in found.items():
         candidate = _candidate(name, one, common, gross, folds)
@@ -225,7 +225,7 @@ def compare_models(
     return ModelComparison(candidates, failed, folds, common, sorted(gross))
 
 
-def _removed(calibration: Calibration) -> set[tuple[str, str]]:
+def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
     """Image and point of removed gross errors."""
     adjustment = calibration.adjustment
     ids = _ids(adjustment.problem.network)

@@ -32,7 +32,7 @@ from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
@@ -45,7 +45,7 @@ REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
-"""Of a comparison of models."""
+"""Files of a comparison of models."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -88,7 +88,7 @@ def write_calibration(
     """
     if plots:
         need_matplotlib()
-    with replaced_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
+    with replace_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
         _fill(calibration, new, plots, UNKNOWN)
 
 
@@ -136,14 +136,14 @@ def write_calibrations(
     """
     if plots:
         need_matplotlib()
-    with replaced_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
+    with replace_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
         fill_calibrations(found, new, plots)
 
 
 def fill_calibrations(
     found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
 ) -> None:
-    """Write the same into an existing folder; `origin` and `choice` are for the page."""
+    """Write a calibration into an existing folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
         return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
     for name, one in found.cameras.items():

@@ -1,10 +1,10 @@
 r"""Test for a missing affinity of the camera model.
 
-`brown` and `brown-projected` have one principal distance; non-square pixels and shear
-are modelled by b1 and b2, which are not estimated by default. Whether the residuals v
-(over their σ) require them is tested by one step from the adjusted values, with all other unknowns
-adapting, S·b = −Bᵀ·v (`linearised.lagrange_multipliers`); the cofactors of b are S⁻¹. This is the
-score (Lagrange multiplier) test: no second adjustment is needed.
+`brown` and `brown-projected` have one principal distance; non-square pixels and shear are modelled
+by b1 and b2, which are not estimated by default. Whether the residuals v (over their σ) require
+them is tested by one step from the adjusted values, with all other unknowns adapting, S·b = −Bᵀ·v
+(`observation_equations.lagrange_multipliers`); the cofactors of b are S⁻¹. This is the score
+(Lagrange multiplier) test: no second adjustment is needed.
 """
 
 import dataclasses
@@ -12,16 +12,16 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
+from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 
 AFFINE = ("b1", "b2")
 CRITICAL = 4.0
 """|b|/σ above which a parameter is missing."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
     """Parameters that were held at 0: their estimates, σ, and the largest image displacement they

@@ -25,14 +25,14 @@ from jaxbundle.calibration.quality import grid_of
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
 from jaxbundle.cameras.pixel_frame import in_model_units
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.statistics.projection import slopes_of_images
 
 DRAWS = 20_000
 """Samples of K for its quantile, accurate to 1 %."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class MappingError:
     """`weights`: λ, pixels²; their sum `expected` is the expected mapping error."""

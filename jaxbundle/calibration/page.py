@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxbundle.calibration.advice import CONTRADICTION, PART, REACH
+from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
@@ -70,10 +70,10 @@ def _describe_one(calibration, choice=None) -> Addition:
     if choice is not None:
         sections.append(_models(choice))
     if not calibration.converged:
-        return Addition("", overview=overview, sections=(*sections, *_failed(views)))
+        return Addition("", overview=overview, sections=(*sections, *_list_failed(views)))
     sections += [
         _quality(calibration.coverage, calibration.reported_maps, _unit(calibration)),
-        _validation(calibration), *_failed(views),
+        _validation(calibration), *_list_failed(views),
     ]  # fmt: skip
     findings = (_coverage(calibration.coverage), *_halves(calibration))
     return Addition(
@@ -94,7 +94,7 @@ def _halves(calibration) -> list[Finding]:
     checked = calibration.cross_validation
     if checked is None:
         return []
-    state = DOUBTFUL if checked.test > CONTRADICTION else GOOD
+    state = DOUBTFUL if checked.test > LARGEST_TEST else GOOD
     return [Finding("Cross-validation", state, " ".join(cross_validation_in_words(calibration)))]
 
 
@@ -131,7 +131,7 @@ def _validation(calibration) -> Section:
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
 
 
-def _failed(views) -> list[Section]:
+def _list_failed(views) -> list[Section]:
     if not views.failed:
         return []
     rows = grid(("photograph", "reason"), views.failed, "words")

@@ -12,7 +12,7 @@ from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
 from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
-from jaxbundle.display import data_set, shows_itself
+from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.projection import (
@@ -31,7 +31,7 @@ HELD_OUT_FEWEST = 4
 """Minimum number of photographs for calibrations from halves."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class UncertaintyMap:
     """Standard deviations of a projected point over the image.
@@ -142,7 +142,7 @@ def over_distance(
     return of(middle), np.nanmax(of(variance.T), axis=0, initial=0.0)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Coverage:
     """Coverage of the image by measured points.

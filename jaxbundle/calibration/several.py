@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.calibrate import calibrate_rig
@@ -56,7 +56,7 @@ def calibrate_cameras(
     if not isinstance(photographs, Mapping) or not photographs:
         raise InputError(
             "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
-            f"is {shown(photographs)}"
+            f"is {show(photographs)}"
         )
     if rig and len(photographs) < 2:
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")

@@ -1,4 +1,4 @@
-"""Views of a board as a camera would have them: to try a calibration before it is photographed."""
+"""Simulated views of a board, to test a calibration before taking photographs."""
 
 import numpy as np
 
@@ -28,11 +28,11 @@ def simulate_views(
     **Arguments:** `camera`, with its true parameters and an `image_size`; `noise`: σ of an image
     coordinate, pixels; `seed` of the noise.
 
-    **Returns:** `BoardViews`, a view each station, named "1", "2", …; points outside the image are
-    not there (NaN).
+    **Returns:** `BoardViews`, one view per station, named "1", "2", …; points outside the image are
+    NaN.
 
-    **Raises:** `InputError` for a camera without image size, for a station behind the board, and
-    where no point is imaged.
+    **Raises:** `InputError` for a camera without image size, for a station behind the board, and if
+    no point is imaged.
     """
     require_board(board)
     noise = at_least_zero("noise", noise)

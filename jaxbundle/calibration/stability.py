@@ -19,7 +19,7 @@ below a tenth (a shift of the principal point is nearly a rotation) are excluded
 **Between epochs.** For each parameter τ², a variance on top of its σᵢ², by Paule and Mandel:
 Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. Against a temperature or a date the
 same with a straight line a + b·xᵢ in place of m, and n − 2: its slope b has its own τ, about the
-line, for a trend is no scatter. In the image, rotation removed, the
+line, since a trend is not scatter. In the image, rotation removed, the
 variance between epochs is that of the differences less what is expected by chance,
 
     Σ (pᵢ − p̄ₐ)ᵀ·H·(pᵢ − p̄ₐ)/(n − 1) − mean of tr(H·Cᵢ),        p̄ₐ the arithmetic mean
@@ -36,7 +36,7 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
@@ -44,7 +44,7 @@ from jaxbundle.statistics.difference import Covariance
 
 ROTATION = 0.1
 """μ below this: nearly a rotation."""
-SEEN = 1e-12
+SMALLEST_EFFECT = 1e-12
 """Relative limit below which parameter changes that move no image are dropped."""
 
 
@@ -63,15 +63,15 @@ class Homogeneity:
         return f"χ² = {self.chi2:.1f} ({self.degrees}), p = {self.probability:.2g}"
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Stability:
     """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,
     `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
     `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
     over the image of an epoch against the mean, pixels; `at`, `slope`, `slope_sigma`,
-    `slope_probability` (of as large a slope by chance), `about_slope` (τ about the line): with what
-    the epochs were at (temperatures), else None."""
+    `slope_probability` (of as large a slope by chance), `about_slope` (τ about the line): if
+    numbers of the epochs (temperatures) are given, else None."""
 
     names: tuple[str, ...]
     values: Float[np.ndarray, "epochs k"]
@@ -92,7 +92,7 @@ class Stability:
     about_slope: Float[np.ndarray, " k"] | None = None
 
     def to_dict(self) -> dict:
-        """As in JSON."""
+        """The result as plain dicts and numbers, as in JSON."""
         test = lambda one: {"chi2": one.chi2, "degrees": one.degrees,
                             "probability": one.probability}  # fmt: skip
         rows = {}
@@ -197,7 +197,7 @@ def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
     """Functions F·p of the parameters that are invariant to rotation-like changes."""
     unit = np.outer(scale, scale)
     size, U = np.linalg.eigh(G * unit)
-    seen = size > SEEN * size[-1]
+    seen = size > SMALLEST_EFFECT * size[-1]
     root = U[:, seen] / np.sqrt(size[seen])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
     vectors = (root @ V)[:, mu > ROTATION]

@@ -20,7 +20,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
 
-GROSS = 12.0
+GROSS_LIMIT = 12.0
 """Residuals above this multiple of their typical size (1.4826·median) are gross."""
 LEAST_GROSS = 3.0
 """And above this many pixels."""
@@ -98,7 +98,7 @@ def _gross_views(views, solved):
     """Views with more than a third of gross residuals."""
     v = _residuals(views, solved)
     typical = 1.4826 * np.nanmedian(v)
-    gross = v > max(GROSS * typical, LEAST_GROSS)
+    gross = v > max(GROSS_LIMIT * typical, LEAST_GROSS)
     return gross.sum(1) > PART * views.visible.sum(1)
 
 

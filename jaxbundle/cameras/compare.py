@@ -26,7 +26,7 @@ from jaxbundle.cameras.convert_fit import GRID, image_grid, images_of, rays_of
 from jaxbundle.cameras.model import CameraModel, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
-from jaxbundle.display import data_set, shows_itself
+from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.iterations.small import minimise
@@ -37,7 +37,7 @@ SAME_RAY = 1e-6
 """Directions that differ by less, radians, are the same."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Comparison:
     """A difference map, in the unit and axes of the first calibration.
@@ -115,7 +115,7 @@ def compare_cameras(
     shift, step = between_frames(other, source, image_size, pixel_size)
     rays = rays_of(source, values, xy)
     back = np.abs(images_of(source, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
-    seen = back & _unfolded(other, others, rays)
+    seen = back & _are_one_to_one(other, others, rays)
     if seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
     near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
@@ -170,7 +170,7 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     }  # fmt: skip
 
 
-def _unfolded(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
+def _are_one_to_one(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
     """Which rays have an image that belongs to no other ray: a polynomial turns back, and beyond
     that radius its images are those of rays nearer to the axis."""
     images = images_of(model, values, rays)

@@ -88,7 +88,8 @@ def convert_camera(
     - `area`: the corners of the image (low, high) in the source's coordinates; by default the whole
       image.
     - `r0`: of the target, mm, if it has one.
-    - `free`: parameters of a fit (`convert_fit.fitted` if empty); others have their defaults.
+    - `free`: parameters of a fit (`convert_fit.fitted_parameters` if empty); others have their
+      defaults.
 
     **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """
@@ -120,7 +121,7 @@ def convert_camera(
     if not np.isfinite(length).all():
         raise ValueError(
             f"model {target.name!r} has no image of {100 * np.isnan(length).mean():.0f} % of the "
-            "image: its field of view ends before; convert a smaller area, or to another model"
+            "image: its field of view is narrower; convert a smaller area, or to another model"
         )
     worst = int(np.argmax(length))
     return Conversion(

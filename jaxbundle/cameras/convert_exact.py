@@ -186,7 +186,7 @@ def normalised_correction(values: Values) -> dict[str, float]:
     return {**k, "p1": -c * values["P2"], "p2": c * values["P1"]}
 
 
-def inverted_radial(q: Numbers) -> tuple[float, float, float]:
+def invert_radial(q: Numbers) -> tuple[float, float, float]:
     """The first terms of the inverse of r·(1 + q1·r² + q2·r⁴ + q3·r⁶): a start, never the answer.
 
         k1 = −q1     k2 = 3·q1² − q2     k3 = −12·q1³ + 8·q1·q2 − q3

@@ -21,7 +21,7 @@ from jaxbundle.cameras.convert_exact import (
     Sizes,
     Values,
     distortion,
-    inverted_radial,
+    invert_radial,
     normalised_correction,
 )
 from jaxbundle.cameras.convert_wide import as_stereographic
@@ -41,7 +41,7 @@ INSIDE = 1e-3
 """Margin of a fit inside the range of a parameter, relative to the range."""
 
 
-def fitted(model: CameraModel) -> tuple[str, ...]:
+def fitted_parameters(model: CameraModel) -> tuple[str, ...]:
     """The parameters of a model fitted by default; all of them are separable."""
     return (*model.free, *MORE_FITTED.get(model.name, ()))
 
@@ -76,13 +76,13 @@ def fit_parameters(
     Parameters with a limited range (`CameraModel.ranges`) stay in it.
 
     **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
-    best of them is used; `free` fitted parameters (`fitted` of the model if empty).
+    best of them is used; `free` fitted parameters (`fitted_parameters` of the model if empty).
 
     **Raises:** `ValueError` if no start has an image of every ray, or the fit fails numerically.
     """
     from scipy.optimize import least_squares
 
-    chosen = [model.parameters.index(name) for name in free or fitted(model)]
+    chosen = [model.parameters.index(name) for name in free or fitted_parameters(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with local_x64():
         start = min((_order(model, values) for values in starts), key=lambda p: _finite(cost(p)))
@@ -141,7 +141,7 @@ def start_values(
     k, p1, p2 = _first_orders(source, values)
     backward = (source.name in CORRECTIONS) != (target.name in CORRECTIONS)
     if backward:
-        k, p1, p2 = inverted_radial(k), -p1, -p2
+        k, p1, p2 = invert_radial(k), -p1, -p2
     c = focal.mean()
     if target.name in ("opencv", "snavely"):
         terms = {"k1": k[0], "k2": k[1], "k3": k[2], "p1": p1, "p2": p2}

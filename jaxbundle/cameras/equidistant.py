@@ -35,7 +35,7 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 
 
 # The three functions below are even in the angle, so they are smooth in its square, but √ is not at
-# 0: near 0 their series stands in, exact to rounding. The inner `where` keeps the derivative of the
+# 0: near 0 a series replaces them, exact to rounding. The inner `where` keeps the derivative of the
 # branch not taken finite.
 
 _NEAR = 1e-3

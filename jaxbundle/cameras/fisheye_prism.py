@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxbundle.cameras.equidistant import equidistant
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.model import CameraModel
-from jaxbundle.cameras.radial import radial, rising
+from jaxbundle.cameras.radial import is_increasing, radial
 from jaxbundle.cameras.scalars import Formula, Parameters, Scalar
 
 CORE = ("fx", "fy", "cx", "cy")
@@ -79,7 +79,7 @@ def _fisheye(
 
     def project(p, r, s, q):
         a, b = _angle(one, r, s, q)
-        there = rising(coefficients(p), a * a + b * b)
+        there = is_increasing(coefficients(p), a * a + b * b)
         a, b = distort(p, a, b)
         u, v = p[2] + p[0] * a, p[3] + p[1] * b
         return jnp.where(there, u, jnp.nan), jnp.where(there, v, jnp.nan)

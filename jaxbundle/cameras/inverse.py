@@ -75,7 +75,7 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     return with_floats
 
 
-def limited(
+def limit_region(
     formula: Formula, inside: Callable[[Parameters, Scalar, Scalar], Scalar], start: Formula,
     iterations: int,
 ) -> tuple[Formula, Formula]:  # fmt: skip

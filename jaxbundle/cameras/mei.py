@@ -26,7 +26,7 @@ import jax.numpy as jnp
 
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.model import CameraModel
-from jaxbundle.cameras.radial import radial, rising
+from jaxbundle.cameras.radial import is_increasing, radial
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
@@ -53,7 +53,7 @@ def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     N = jnp.where(front, Z + xi * R, jnp.nan)
     x, y = X / N, Y / N
     xd, yd = distort(p, x, y)
-    there = rising((k1, k2), x * x + y * y)
+    there = is_increasing((k1, k2), x * x + y * y)
     return cx + fx * jnp.where(there, xd, jnp.nan), cy + fy * jnp.where(there, yd, jnp.nan)
 
 

@@ -27,14 +27,14 @@ IMAGES = {
     "perspective": perspective, "equidistant": equidistant, "stereographic": stereographic,
     "equisolid": equisolid, "orthographic": orthographic,
 }  # fmt: skip
-NARROW = ("perspective", "orthographic")
+NARROW_PROJECTIONS = ("perspective", "orthographic")
 """Ideal images of rays less than 90° from the axis."""
 FORMULAS = ("correct", "distort", "project", "unproject")
 Image = Literal["perspective", "equidistant", "stereographic", "equisolid", "orthographic"]
 PRINCIPAL_DISTANCES = ("c",), ("fx", "fy"), ("f",)
 PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
 """Default names."""
-TAKEN = ("id", "model", "image_size", "pixel_size", "free", "sigma")
+RESERVED_NAMES = ("id", "model", "image_size", "pixel_size", "free", "sigma")
 """Further fields of a camera; a parameter cannot have one of these names."""
 
 
@@ -156,11 +156,11 @@ class CameraModel:
     @property
     def wide(self) -> bool:
         """Whether rays may be 90° and more from the axis."""
-        return self.image not in NARROW
+        return self.image not in NARROW_PROJECTIONS
 
     @property
     def core(self) -> tuple[str, ...]:
-        """Principal distance and principal point: what is no additional parameter."""
+        """Principal distance and principal point: the parameters that are not additional ones."""
         return (*self.principal_distance, *self.principal_point)
 
     def __str__(self) -> str:
@@ -177,11 +177,12 @@ def _complete(model: CameraModel) -> dict:
     where = f"Camera model {model.name!r}: "
     text = isinstance(model.parameters, str)
     parameters = () if text else tuple(model.parameters)
-    odd = [n for n in parameters if not (isinstance(n, str) and n.isidentifier()) or n in TAKEN]
+    valid = lambda n: isinstance(n, str) and n.isidentifier() and n not in RESERVED_NAMES
+    odd = [n for n in parameters if not valid(n)]
     if odd or not parameters or len({*parameters}) < len(parameters):
         raise ValueError(
             f"{where}parameters must be different names such as ('c', 'x0', 'y0', 'K1'), none of "
-            f"them {', '.join(TAKEN)}, but are {model.parameters!r:.200}."
+            f"them {', '.join(RESERVED_NAMES)}, but are {model.parameters!r:.200}."
         )
     given = [name for name in FORMULAS if getattr(model, name) is not None]
     if len(given) != 1 and given != ["project", "unproject"]:

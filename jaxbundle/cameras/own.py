@@ -41,14 +41,14 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
         )
     if not a * d - b * c > 0 or not a + d > 0:
         raise ValueError(
-            f"{where}measured and ideal image are mirrored or turned against each other; are axes "
-            f"{model.axes!r} (x right, y {model.axes}) right, and the signs of the formula?"
+            f"{where}measured and ideal image are mirrored or rotated relative to each other; are "
+            f"axes {model.axes!r} (x right, y {model.axes}) right, and the signs of the formula?"
         )
     size = max(abs(values[name]) for name in model.principal_distance)
     if model.inverse is not None and not missed <= ROUND_TRIP * size:
         raise ValueError(
             f"{where}inverse is not the inverse of its formula: a point comes back {missed:.3g} "
-            f"{model.unit} beside itself; leave inverse out, and it is found by itself"
+            f"{model.unit} beside itself; omit inverse, and it is computed"
         )
 
 
@@ -78,8 +78,8 @@ def _check_form(model: CameraModel) -> None:
 
 @partial(compile_once, static=0)
 def _near_the_axis(model: CameraModel, p):
-    """Image of the axis, derivative of the formula there, and by how much a point near it misses
-    itself through formula and inverse."""
+    """Image of the axis, derivative of the formula there, and the error of a point near it after
+    formula and inverse."""
     p = tuple(p)
     zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
     size = p[model.parameters.index(model.principal_distance[0])]

@@ -1,7 +1,8 @@
 """Radial polynomials r·(1 + k1·r² + k2·r⁴ + …), and their valid range.
 
 Beyond the radius where such a polynomial turns back it silently gives a wrong image, and farther
-out, where it rises again, another one. `rising` tests whether it rises all the way to a point.
+out, where it rises again, another one. `is_increasing` tests whether it rises all the way to a
+point.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ def radial(k: Sequence[Scalar], square: Scalar) -> Scalar:
     return 1 + value
 
 
-def rising(k: Sequence[Scalar], square: Scalar) -> Scalar:
+def is_increasing(k: Sequence[Scalar], square: Scalar) -> Scalar:
     """Whether the slope 1 + 3·k1·r² + 5·k2·r⁴ + … is positive from the axis to r, sampled."""
     slopes = [(2 * i + 3) * coefficient for i, coefficient in enumerate(k)]
     good = jnp.ones_like(square, bool)

@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxbundle.cameras import opencv
 from jaxbundle.cameras.cubic_splines import basis, through_values
-from jaxbundle.cameras.inverse import limited
+from jaxbundle.cameras.inverse import limit_region
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
@@ -60,7 +60,7 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
         factor = 1 + sum(weights[..., i] * s for i, s in enumerate(values))
         return cx + xi * factor, cy + yi * factor
 
-    distort, inverse = limited(radial, inside, opencv.reduce, 12)
+    distort, inverse = limit_region(radial, inside, opencv.reduce, 12)
     return CameraModel(
         f"radial-spline-{number}-{degrees:g}",
         ("fx", "fy", "cx", "cy", *(f"s{i}" for i in range(1, number + 1))),

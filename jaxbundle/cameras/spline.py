@@ -30,7 +30,7 @@ import numpy as np
 
 from jaxbundle.cameras import opencv
 from jaxbundle.cameras.cubic_splines import basis
-from jaxbundle.cameras.inverse import limited
+from jaxbundle.cameras.inverse import limit_region
 from jaxbundle.cameras.model import CameraModel, LocalFormula
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
@@ -95,7 +95,7 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
         grid = grid.reshape(*grid.shape[:-1], 4, 4, 2)
         return bent(p, grid, (s - first % columns, t - first // columns), xi, yi)
 
-    distort, inverse = limited(grid_of_splines, inside, opencv.reduce, 12)
+    distort, inverse = limit_region(grid_of_splines, inside, opencv.reduce, 12)
     knots = tuple(f"d{k}_{i}_{j}" for i in range(rows) for j in range(columns) for k in "xy")
     return CameraModel(
         f"spline-{columns}x{rows}-{degrees:g}", (*CORE, *knots), distort=distort,

@@ -22,7 +22,7 @@ from jaxbundle.system.configuration import leave
 
 BAD_INPUT, NOT_SOLVED = 2, 3
 NO_READER = 128 + 13
-"""As of a Unix tool whose reader has gone: ended by SIGPIPE, number 13."""
+"""Exit status of a Unix tool ended by SIGPIPE (13): the reader has closed the pipe."""
 
 EXIT_STATUS = (
     "0 done; 2 bad input: one line, nothing written; 3 not solved, with the reason; "
@@ -73,7 +73,7 @@ class Application(typer.Typer):
         self, name: str | None = None, *, example: str, computes: bool = True, once: bool = False,
         **options: Any,
     ):  # fmt: skip
-        """As of typer, with --quiet and --verbose. `example`: the arguments of a line that calls
+        """Like typer's, with --quiet and --verbose. `example`: the arguments of a line that calls
         it, for its help; `computes`: whether it works with JAX; `once`: whether its time depends on
         its input, so that programs of a small input are compiled quickly."""
         fields = {"example": example, "computes": computes, "once": once}

@@ -106,14 +106,14 @@ def batch(
     refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
     status. Only one run at a time may write the file.
     """
-    from jaxbundle.batch.joined import add_parts, run_joined
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
+    from jaxbundle.batch.processes import add_parts, run_joined
     from jaxbundle.batch.run import result_rows, run_batch
     from jaxbundle.batch.stacks import is_camera_stack
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
-    from jaxbundle.cli.board_given import board_given
+    from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting
@@ -130,7 +130,7 @@ def batch(
     asked = {"--html": html, "--table": table, "--summary": summary}
     asked = [name for name, value in asked.items() if value]
     if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
-        raise InputError(f"{asked[0]}: is made of the lines in --json-lines, and {json_lines} "
+        raise InputError(f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} "
                          "is no file")  # fmt: skip
     columns = None if against is None else read_csv(against)
     if columns is not None:
@@ -152,7 +152,7 @@ def batch(
         if not first:
             html, table, summary, asked, quiet = "", None, None, [], True
     elif not part:
-        add_parts(json_lines)  # of joined processes that were ended
+        add_parts(json_lines)  # left by joined processes that were ended
     advise("run the same command again to resume")
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)

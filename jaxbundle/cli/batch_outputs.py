@@ -52,5 +52,5 @@ def write_outputs(
 
 
 def _plain(row: tuple) -> tuple:
-    """What does not exist is empty."""
+    """Missing values are empty."""
     return tuple("" if isinstance(x, float) and np.isnan(x) else x for x in row)

@@ -88,13 +88,13 @@ def calibrate(
         json_text,
     )
     from jaxbundle.calibration.page import KIND, compose_calibrations
-    from jaxbundle.cli.board_given import board_given
+    from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import (
         can_plot,
         check_writable,
         name_inside,
         trace_files,
-        written,
+        write_result,
     )
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.results.result_json import unsolved_text
@@ -157,7 +157,7 @@ def calibrate(
         except NotSolvedError as error:
             place = out if name_inside(json, out) or name_inside(html, out) else None
             page = partial(compose_failure, error, origin, KIND)
-            with written(json, unsolved_text(error), place, COMMAND, names, force, html, page):
+            with write_result(json, unsolved_text(error), place, COMMAND, names, force, html, page):
                 pass
             raise
         bar.update(task, description="assessing accuracy")
@@ -168,7 +168,7 @@ def calibrate(
         report = "" if quiet or json == "-" else (choice or found).report()
         bar.update(task, description="writing")
         page = partial(compose_calibrations, found, origin, choice)
-        with written(json, text, out, COMMAND, names, force, html, page) as new:
+        with write_result(json, text, out, COMMAND, names, force, html, page) as new:
             if new is not None:
                 fill_calibrations(found, new, plots and can_plot(), origin, choice)
                 if choice is not None:

@@ -33,8 +33,8 @@ def camera(
     import numpy as np
 
     from jaxbundle.cameras import get_model
+    from jaxbundle.cli.camera_inputs import camera_given, pair, write_png
     from jaxbundle.cli.camera_table import print_camera, sizes_of, table_of
-    from jaxbundle.cli.cameras_given import camera_given, pair, write_png
     from jaxbundle.io.text.csv_tables import write_csv
 
     sizes = pair("--image-size", image_size), pair("--pixel-size", pixel_size)

@@ -32,7 +32,7 @@ def sizes_of(file: str, given: Camera, size, pitch):
 def table_of(given: Camera, reach: float, step: float, about_origin: bool):
     """Distortion by radius.
 
-    **Raises:** `InputError` for a step that makes no table.
+    **Raises:** `InputError` for an impossible step.
     """
     about = "origin" if about_origin else "principal point"
     try:

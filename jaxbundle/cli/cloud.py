@@ -41,7 +41,7 @@ def cloud(
     from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
     from jaxbundle.surface.compare import compare
     from jaxbundle.surface.dsm import make_dsm, write_dsm
-    from jaxbundle.surface.filtering import drop_lonely, drop_weak, thin
+    from jaxbundle.surface.filtering import drop_isolated, drop_weak, thin
     from jaxbundle.surface.point_files import read_cloud, write_cloud
 
     check_json(json)
@@ -56,7 +56,7 @@ def cloud(
     other = None if against is None else read_cloud(against)
     found = drop_weak(found, max_sigma, min_rays)
     if statistical is not None:
-        found = drop_lonely(found, limit=statistical)
+        found = drop_isolated(found, limit=statistical)
     if cube is not None:
         found = thin(found, cube, least, place)
     report = {"points_read": len(given), "points": len(found), "accuracy": accuracy_of(found)}

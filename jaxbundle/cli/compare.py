@@ -12,7 +12,7 @@ from jaxbundle.errors import InputError
 
 RINGS = 10
 SAVED = b"PK\x03\x04"
-"""How a saved adjustment begins, which no file of cameras does."""
+"""The first bytes of a saved adjustment; no camera file begins with them."""
 
 
 PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"
@@ -58,7 +58,7 @@ def compare(
 
     from jaxbundle.cameras import get_model
     from jaxbundle.cameras.compare import compare_cameras, difference_rings
-    from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
+    from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
     from jaxbundle.io.networks.assemble import all_parameters
     from jaxbundle.io.text.csv_tables import write_csv
     from jaxbundle.statistics.difference import expected_difference

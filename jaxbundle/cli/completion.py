@@ -20,7 +20,7 @@ class Place(NamedTuple):
     words: tuple[str, ...]
     below: tuple[str, ...]
     options: dict[str, tuple[str, ...]]
-    """By name what it is one of; nothing: a flag, or any value."""
+    """By name the allowed words; empty: a flag, or any value."""
     flags: frozenset[str]
     helps: dict[str, str]
 
@@ -62,7 +62,7 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
 
 
 def for_bash(places: list[Place], zsh: bool = False) -> str:
-    """Of zsh by its own emulation."""
+    """For zsh by its emulation of bash."""
     ways = [" ".join(place.words) for place in places if len(place.words) > 1]
     lines = ["autoload -U +X bashcompinit && bashcompinit"] if zsh else []
     lines += [

@@ -37,7 +37,7 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
-    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.cli.camera_inputs import pair
     from jaxbundle.io.exchange import convert as convert_file
 
     overrides = tuple(set or ())

@@ -66,10 +66,10 @@ def design(
     """Design a network: optimal stations, or a selection of photographs."""
     import numpy as np
 
-    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.cli.camera_inputs import pair
     from jaxbundle.cli.design_files import FILES, fill_design
-    from jaxbundle.cli.design_given import aimed_at, box_of, normals_of, sigma_of, words_of
-    from jaxbundle.cli.outputs import can_plot, check_writable, network_files, written
+    from jaxbundle.cli.design_options import box_of, normals_of, parse_aim, sigma_of, words_of
+    from jaxbundle.cli.outputs import can_plot, check_writable, network_files, write_result
     from jaxbundle.io.formats import read_oriented
     from jaxbundle.io.results.design_json import design_text
     from jaxbundle.network_design.aims import Aim
@@ -88,7 +88,7 @@ def design(
         targets=box_of("--targets", targets),
     )  # fmt: skip
     designed = design_network(
-        network, Aim(aim, aimed_at(of)), order=order, conditions=conditions, free=words_of(free),
+        network, Aim(aim, parse_aim(of)), order=order, conditions=conditions, free=words_of(free),
         stations=words_of(stations) if stations else None, photographs=photographs,
         sigma_image=sigma_of(project, network) if sigma_image is None else sigma_image,
         starts=starts, max_iterations=iterations, seed=seed,
@@ -96,7 +96,7 @@ def design(
     proof = designed.prove(draws, seed) if draws else None
     report = f"{designed}\n" + (f"proof: {proof}\n" if proof else "")
     text = design_text(designed, proof)
-    with written(json, text, out, "design", FILES, force) as folder:
+    with write_result(json, text, out, "design", FILES, force) as folder:
         if folder is not None:
             fill_design(folder, designed, report, text, plots and can_plot())
     if not quiet and json != "-":

@@ -39,7 +39,7 @@ def explore(
     """
     import webbrowser
 
-    from jaxbundle.cli.explore_given import open_view
+    from jaxbundle.cli.explore_inputs import open_view
     from jaxbundle.explore.server import Server
 
     view = open_view(

@@ -60,11 +60,11 @@ def _silent(values: dict) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _talking() -> Iterator[None]:
-    from jaxbundle.cli.verbose import telling
+    from jaxbundle.cli.verbose import report_times
 
     token = verbose.set(True)
     try:
-        with telling():
+        with report_times():
             yield
     finally:
         verbose.reset(token)

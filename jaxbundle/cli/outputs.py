@@ -26,8 +26,8 @@ from jaxbundle.io.results.result_json import result_text, unsolved_text
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
 from jaxbundle.io.writing.fingerprints import input_files
-from jaxbundle.io.writing.folders import check_folder, replaced_folder
-from jaxbundle.network.columns import some
+from jaxbundle.io.writing.folders import check_folder, replace_folder
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.plotting.files import FIGURES, draw_figures
@@ -107,7 +107,7 @@ def check_page(
     """Refuse a page that cannot be written, or would replace an input or a file that is not a
     page."""
     if html == "-":
-        raise InputError("--html -: a page cannot go to standard output; give a file")
+        raise InputError("--html -: a page cannot be written to standard output; give a file")
     check_file("--html", html, out, inputs)
     if not force:
         _check_content("--html", html, HTML, "HTML", OR_FORCE)
@@ -161,7 +161,7 @@ def check_targets(
     inputs = network_files(input, network, control)
     check_writable(json, out, "adjust", FILES, inputs, force, html)
     if save == "-":
-        raise InputError("--save -: it goes into a file; give the name of one")
+        raise InputError("--save -: give the name of a file")
     check_file("--save", save, None, inputs)
     if not force:
         _check_content("--save", save, SAVED, "a saved adjustment", OR_FORCE)
@@ -176,7 +176,7 @@ def name_inside(file: str, out: Path | None) -> str | None:
 
 
 @contextmanager
-def written(
+def write_result(
     json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
     force: bool, html: str = "", page: Callable[[], Iterable[str]] | None = None,
 ) -> Iterator[Path | None]:  # fmt: skip
@@ -191,7 +191,7 @@ def written(
     if out is None:
         yield None
     else:
-        with replaced_folder(out, by, names, force) as new:
+        with replace_folder(out, by, names, force) as new:
             yield new
             if (name := name_inside(json, out)) is not None:
                 write_text(new / name, text)
@@ -230,7 +230,7 @@ def write_targets(
         return compose_failure(result, origin)
 
     plots = plots and out is not None and solved and result.converged and can_plot()
-    with written(json, text(brief), out, "adjust", FILES, force, html, page) as new:
+    with write_result(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
                 fill_results(result, new, plots, also=also, budget=budget)
@@ -265,7 +265,7 @@ def why_not(result: Adjustment) -> str:
     """Why an adjustment did not converge, and the remedy."""
     parts = [f"not solved: {result.termination}"]
     if result.undetermined:
-        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
+        parts.append(f"not determined: {list_some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or add measurements that determine them")
         parts += result.findings
     elif result.findings or result.weakness.lines:

@@ -48,7 +48,7 @@ def plan(
 
     if out is not None:
         check_folder(out, "plan", FILES, force=force)
-    image_format, extent = _needed("--image", image), _needed("--area", area)
+    image_format, extent = _require_pair("--image", image), _require_pair("--area", area)
     design = design_block(
         c, image_format, extent, sigma_image, height=height, scale_number=scale,
         pixel_on_ground=ground_pixel, pixel=pixel, forward_overlap=forward, side_overlap=side,
@@ -92,8 +92,8 @@ def plan(
         print(f"{name:22}{value}")
 
 
-def _needed(option: str, text: str) -> tuple[float, float]:
-    from jaxbundle.cli.cameras_given import pair
+def _require_pair(option: str, text: str) -> tuple[float, float]:
+    from jaxbundle.cli.camera_inputs import pair
 
     found = pair(option, text)
     if found is None:

@@ -51,8 +51,8 @@ def counting(quiet: bool) -> Progress:
     return bar
 
 
-BEGUN = "/jax/compilation_cache/compile_requests_use_cache"
-MADE = "/jax/core/compile/backend_compile_duration"
+REQUEST_EVENT = "/jax/compilation_cache/compile_requests_use_cache"
+COMPILED_EVENT = "/jax/core/compile/backend_compile_duration"
 """JAX's monitoring events of a program: looking it up in the cache or compiling it; done."""
 
 
@@ -94,9 +94,9 @@ class iterating:
         )
 
     def _hear(self, event: str, *_, **__) -> None:
-        if event == BEGUN:
+        if event == REQUEST_EVENT:
             self.bar.update(self.task, description="compiling programs, once per size")
-        elif event == MADE:
+        elif event == COMPILED_EVENT:
             self.bar.update(self.task, description=self.line)
 
     def __exit__(self, *_):

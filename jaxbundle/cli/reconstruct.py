@@ -46,7 +46,7 @@ def reconstruct_command(
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct a network from photographs: tie points, self-calibration, adjustment."""
-    from jaxbundle.cli.cameras_given import camera_given
+    from jaxbundle.cli.camera_inputs import camera_given
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.reconstruct_files import BY, FILES, make_store, write_reconstruction

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.cli.outputs import FILES as RESULTS
-from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, written
+from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, write_result
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import FILES as COLMAP
 from jaxbundle.io.networks.colmap import fill_colmap
@@ -14,7 +14,7 @@ from jaxbundle.io.results.ply import write_ply
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import write_csv, write_text
-from jaxbundle.io.writing.folders import read_marker, replaced_folder
+from jaxbundle.io.writing.folders import read_marker, replace_folder
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
@@ -25,14 +25,14 @@ from jaxbundle.report.page import UNKNOWN, Origin
 BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
 OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
 FILES = (*OF_A_PART, *(f"part_*/{name}" for name in OF_A_PART), PAIRS, *PAIR_FIGURES)
-SHOWN = 1200
+FIGURE_PIXELS = 1200
 """Pixels of the longer side of a photograph in a figure."""
 
 
 def make_store(out: Path, force: bool) -> Path:
     """The folder of stored features and matches; --out belongs to the command from now on."""
     if read_marker(out) is None:
-        with replaced_folder(out, BY, (), force):
+        with replace_folder(out, BY, (), force):
             pass
     return out / KEPT
 
@@ -46,7 +46,7 @@ def write_reconstruction(
     also = {"reconstruction": _summary(found)}
     text = result_text(first.adjustment, brief, also)
     page = partial(compose_part, found, first, origin)
-    with written(json, text, out, BY, FILES, force, html, page) as new:
+    with write_result(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
         _write_part(found, first, new, plots, str(found) + "\n\n", also)
@@ -80,7 +80,7 @@ def _thumbnail(path: Path):
         grey = read_photograph(path)
     except InputError:
         return np.full((2, 2), 255, np.uint8)
-    step = max(1, max(grey.shape) // SHOWN)
+    step = max(1, max(grey.shape) // FIGURE_PIXELS)
     return grey[::step, ::step]
 
 

@@ -25,7 +25,7 @@ def stability(
 
     from jaxbundle.batch.population import number_or_days
     from jaxbundle.calibration.stability import stability as compare_epochs
-    from jaxbundle.cli.cameras_given import calibration_given
+    from jaxbundle.cli.camera_inputs import calibration_given
     from jaxbundle.io.text.csv_tables import write_bytes
     from jaxbundle.report.layout import table
 

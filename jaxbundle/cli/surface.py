@@ -69,10 +69,15 @@ def surface(
 
     from jaxbundle.cli.outputs import check_json
     from jaxbundle.cli.progress import counting
-    from jaxbundle.cli.surface_made import choose, make_of_ground, make_of_photographs, telling
+    from jaxbundle.cli.surface_outputs import (
+        choose,
+        make_of_ground,
+        make_of_photographs,
+        report_stages,
+    )
     from jaxbundle.io.results.result_json import without_nan
     from jaxbundle.io.text.csv_tables import write_text
-    from jaxbundle.io.writing.folders import check_folder, replaced_folder
+    from jaxbundle.io.writing.folders import check_folder, replace_folder
     from jaxbundle.surface.dsm import make_dsm, write_dsm
     from jaxbundle.surface.files import report_of, text_of, write_cloud_csv
     from jaxbundle.surface.orthophoto import mosaic, write_orthophoto
@@ -88,7 +93,7 @@ def surface(
     given = read_cloud(check).X if check else np.zeros((0, 3))
     check_folder(out, "surface", FILES, input, force)
     with counting(quiet or json == "-") as bar:
-        options = {"points": points, "step": step, "dense": dense, "tell": telling(bar)}
+        options = {"points": points, "step": step, "dense": dense, "tell": report_stages(bar)}
         if len(input) > 1 or is_ground_image(input[0]):
             made = make_of_ground(input, photos, heights, pairs, crs, options)
         else:
@@ -97,7 +102,7 @@ def surface(
     found = made.surface
     report = report_of(found, check=given if check else made.check)
     text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"
-    with replaced_folder(out, "surface", FILES, force) as folder:
+    with replace_folder(out, "surface", FILES, force) as folder:
         write_cloud_csv(found.cloud, folder / "cloud.csv")
         write_cloud(found.cloud, folder / "cloud.ply")
         if dsm is not None:

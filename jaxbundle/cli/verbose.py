@@ -11,8 +11,8 @@ from jax import monitoring
 
 from jaxbundle.report.page.origin import software_versions
 
-MADE = "/jax/core/compile/backend_compile_duration"
-FOUND = "/jax/compilation_cache/cache_hits"
+COMPILED_EVENT = "/jax/core/compile/backend_compile_duration"
+CACHE_HIT_EVENT = "/jax/compilation_cache/cache_hits"
 
 
 def say(words: str) -> None:
@@ -21,18 +21,18 @@ def say(words: str) -> None:
 
 
 @contextlib.contextmanager
-def telling() -> Iterator[None]:
+def report_times() -> Iterator[None]:
     """Print versions, and at the end the elapsed time."""
     say(", ".join(f"{name} {version}" for name, version in software_versions()))
     made: list[float] = []
     found: list[str] = []
 
     def hear_time(event: str, duration_secs: float, **_: str | int) -> None:
-        if event == MADE:
+        if event == COMPILED_EVENT:
             made.append(duration_secs)
 
     def hear(event: str, **_: str | int) -> None:
-        if event == FOUND:
+        if event == CACHE_HIT_EVENT:
             found.append(event)
 
     monitoring.register_event_duration_secs_listener(hear_time)

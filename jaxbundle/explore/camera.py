@@ -38,14 +38,14 @@ from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
 LINES = 13, 9
-"""Of the grid, across and down."""
+"""Lines of the grid, across and down."""
 RADII = 61
 STEPS = 6
 """Rows of the table of distortion."""
 SLIDER = 0.04
 """Range of a slider: largest motion of an image point near a corner, relative to the half
 diagonal."""
-WIDEST = 1000
+PAGE_PIXELS = 1000
 """Pixels across of a photograph on the page."""
 JPEG_QUALITY = 85
 
@@ -187,8 +187,8 @@ class CameraView:
         return radius, of(values), of(self.values)
 
     def _grids(self, values) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-        """Where a camera as given without distortion images even rays, and where these values do;
-        [rows, columns, 2], NaN where there is no image."""
+        """The images of evenly spaced rays by the given camera without distortion, and with these
+        values; [rows, columns, 2], NaN where there is no image."""
         axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, LINES)]
         xy = np.stack(np.meshgrid(*axes), -1)
         rays = _plain_rays(self.model, self.values, xy)
@@ -258,7 +258,7 @@ class CameraView:
     def _lookup(self, shape: tuple[int, int], values):
         """Columns and rows in a photograph of the pixels of its undistorted picture."""
         rows, columns = shape
-        every = max(1.0, columns / WIDEST)
+        every = max(1.0, columns / PAGE_PIXELS)
         u, v = (np.arange(0, n - 1 + 1e-9, every) for n in (columns, rows))
         pixels = np.stack(np.meshgrid(u, v), -1)
         xy = (pixels - self.origin_of_pixels) / self.step

@@ -32,7 +32,7 @@ from jaxbundle.geometry import (
     quaternion_from_matrix,
 )
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.columns import count, did_you_mean, shown
+from jaxbundle.network.columns import count, did_you_mean, show
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.plotting.frame import image_frame
 from jaxbundle.report.layout import clean, significant
@@ -56,9 +56,9 @@ from jaxbundle.statistics.precision import Precision, precision
 MOST_ROWS = 200
 """Points whose σ before and after are listed, those that change most first."""
 MOST_ELLIPSOIDS = 3000
-"""Points whose ellipsoids are drawn anew."""
+"""Maximum number of points whose ellipsoids are redrawn."""
 UPPER = [0, 1, 2, 4, 5, 8]
-"""Of the nine elements of a covariance."""
+"""The six independent ones of the nine elements of a covariance."""
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
@@ -118,7 +118,7 @@ class NetworkView:
         check_keys(given, ("moves", "aim"))
         aim, wanted = switch(given, "aim"), given.get("moves", {})
         if not isinstance(wanted, Mapping):
-            raise InputError(f"moves must be values by station, but is {shown(wanted)}")
+            raise InputError(f"moves must be values by station, but is {show(wanted)}")
         return [self._move(str(id), values, aim) for id, values in wanted.items()]
 
     def _move(self, id: str, values: Any, aim: bool) -> Moved:
@@ -129,7 +129,7 @@ class NetworkView:
             for v in values
         ):  # fmt: skip
             raise InputError(f"image {id!r}: six numbers {', '.join(EXTERIOR)} are expected, not "
-                             f"{shown(values)}")  # fmt: skip
+                             f"{show(values)}")  # fmt: skip
         row = self.ids.index(id)
         pose = np.array(values, float) / self.units
         if not aim:
@@ -210,7 +210,7 @@ class NetworkView:
 
     @cached_property
     def _corners(self) -> Float[np.ndarray, "images 5 3"]:
-        """Of every image, its pyramid in the frame of its camera, from its projection centre."""
+        """The pyramid of every image in the frame of its camera, from the projection centre."""
         from jaxbundle.plotting.style import extent
         from jaxbundle.plotting.views import camera_pyramids, pyramid_size
 
@@ -287,7 +287,7 @@ class NetworkView:
         return table + more
 
     def page(self, given: Given, live: bool) -> Page:
-        """The network of the report to turn, and the place of what is chosen and moved."""
+        """The network of the report to turn, and the place for the chosen station and its moves."""
         found, answer = self.adjustment, self.answer(given)
         drawings = {"network-data": self._scene, "frames": describe_frames(found)}
         title = f"{clean(found.network.name) or 'network'}: explorer"
@@ -295,7 +295,7 @@ class NetworkView:
             find(found), found.warnings, facts(row for row in summary(found) if row[0] != "Note")
         )
         sections = [
-            shown_first, network_section(), _chosen(), self._move_section(given, live),
+            shown_first, network_section(), _selection(), self._move_section(given, live),
             photographs(),
         ]  # fmt: skip
         state = {"moves": given.get("moves", {}), "aim": given.get("aim", True)}
@@ -330,8 +330,8 @@ class NetworkView:
         return Section("move", "Move a station", "".join(parts), "Move a station", True)
 
 
-def _chosen() -> Section:
-    """The place of what is clicked."""
+def _selection() -> Section:
+    """The place for the clicked item."""
     parts = [
         paragraph("Click a point, a station, a ray, or an image point in a photograph: its "
                   "observations with σ a priori, redundancy number r, w, τ, the minimal detectable "
@@ -346,7 +346,7 @@ def _unit(v):
 
 
 def _ratio(before, after):
-    """Of the means of σ² of points."""
+    """Ratio of the means of σ² of points."""
     a, b = (np.sqrt(np.mean(s**2, 1)) for s in (before, after))
     return np.where((a > 0) & (b > 0), b / np.where(a > 0, a, 1.0), 1.0)
 

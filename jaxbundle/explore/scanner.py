@@ -7,7 +7,8 @@ controls too.
 
 Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
 the table, so that the exported flight file has them. Ground places are those of `locate`, the error
-map is `ground_errors`, σ → RMS and CE90 are `propagated` and, for a level camera, `closed_form`.
+map is `ground_errors`, σ → RMS and CE90 are `propagate_accuracy` and, for a level camera,
+`closed_form`.
 """
 
 import dataclasses
@@ -42,7 +43,7 @@ from jaxbundle.explore.tracks import (
     Tracks,
     choose_track,
     idle_controls,
-    rounded,
+    shorten_number,
     track_controls,
     tracks_of,
 )
@@ -56,14 +57,14 @@ from jaxbundle.pushbroom.accuracy import (
     closed_form,
     east_north,
     ground_errors,
-    propagated,
+    propagate_accuracy,
 )
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
 from jaxbundle.pushbroom.interpolation import METHODS, Table
 from jaxbundle.pushbroom.locate import locate_points
-from jaxbundle.pushbroom.noise import Noise, no_errors
+from jaxbundle.pushbroom.noise import Noise, zero_errors
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
@@ -74,7 +75,7 @@ from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
 from jaxbundle.report.page.markup import figure, grid, paragraph
 
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
-"""Where an angle stands in an attitude error: about right (pitch), forward (roll), up (yaw)."""
+"""The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
 PLACES = 7, 6
 """Lines and pixels of the error map."""
 EDGE = 9
@@ -200,7 +201,7 @@ class ScannerView:
         for name, k in ANGLES.items():
             error[k] = np.radians(values[name])
         if error.any():
-            errors = no_errors(image)._replace(attitude_bias=jnp.asarray(error))
+            errors = zero_errors(image)._replace(attitude_bias=jnp.asarray(error))
             image = with_errors_in_rows(image, errors)
         return Chosen(image, earth, _surface_at(values["ground"], earth), truth)
 
@@ -229,7 +230,7 @@ class ScannerView:
         if not np.isfinite(length).all():
             raise InputError("not every image position has a point on the ground: check "
                              "attitude, mounting and height")  # fmt: skip
-        expected = self._expected(chosen)
+        expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
         field = length.reshape(PLACES)
@@ -304,14 +305,14 @@ class ScannerView:
             chosen.image, chosen.truth, chosen.surface, *self._places()
         )
 
-    def _expected(self, chosen: Chosen) -> list[dict[str, float]]:
+    def _expected_accuracy(self, chosen: Chosen) -> list[dict[str, float]]:
         """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
         rows = []
         for level in LEVELS:
             sigma = np.radians(level)
-            exact = propagated(image, surface, *self._places(), Noise(attitude_bias=sigma))
+            exact = propagate_accuracy(image, surface, *self._places(), Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
             rows.append({
                 "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,
@@ -396,7 +397,8 @@ class ScannerView:
             for line, pixel, (e, n) in zip(lines.tolist(), pixels.tolist(), errors.tolist())
         ]
         rows += ["", "sigma_degrees,rms,ce90,closed_rms,closed_ce90"]
-        rows += [",".join(repr(float(v)) for v in row.values()) for row in self._expected(chosen)]
+        expected = self._expected_accuracy(chosen)
+        rows += [",".join(repr(float(v)) for v in row.values()) for row in expected]
         return "\n".join(rows) + "\n"
 
     def _picture(self, chosen: Chosen) -> bytes:
@@ -420,7 +422,7 @@ def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:
 
 
 def _in_pieces(chosen: Chosen) -> Chosen:
-    """With images whose interpolation is data of the same programs."""
+    """The same with trajectories in pieces: their interpolation is data of the same programs."""
     image, truth = (
         eqx.tree_at(lambda i: i.trajectory, image, _pieces(image.trajectory))
         for image in (chosen.image, chosen.truth)
@@ -476,7 +478,7 @@ def _one(sigma) -> float:
 
 
 def _degrees(sigma) -> float:
-    return rounded(np.degrees(_one(sigma)))
+    return shorten_number(np.degrees(_one(sigma)))
 
 
 _locate = jax.jit(locate_points)

@@ -28,15 +28,15 @@ from jaxbundle.report.page import write
 
 HOST = "127.0.0.1"
 MOST_BYTES = 256 * 1024
-"""Of the body of a request."""
+"""Maximum bytes of the body of a request."""
 MOST_READ = 16 * MOST_BYTES
-PATIENCE = 30.0
+REQUEST_TIMEOUT = 30.0
 """Timeout for the announced body of a request, seconds."""
 HTML, JSON = "text/html; charset=utf-8", "application/json"
 
 
 class Refused(Exception):
-    """A request that is not answered: its status, and why."""
+    """A refused request: status and reason."""
 
     def __init__(self, status: HTTPStatus, why: str):
         super().__init__(why)
@@ -77,18 +77,18 @@ class Handler(BaseHTTPRequestHandler):
 
     server: Server
     server_version, sys_version = "jaxbundle", ""
-    timeout = PATIENCE
+    timeout = REQUEST_TIMEOUT
 
     def do_GET(self) -> None:
         """The page."""
         self._respond(self._get, b"")
 
     def do_POST(self) -> None:
-        """What follows from values, or a file made of them."""
+        """The answer to values, or a file made from them."""
         length = self.headers.get("Content-Length", "")
         known = length.isascii() and length.isdigit() and len(length) < 10
-        # Read before it is answered, or the browser would lose the answer; of too much enough to
-        # see that it is.
+        # Read before it is answered, or the browser would lose the answer; of an oversized one only
+        # enough to detect that.
         body = self.rfile.read(min(int(length), MOST_READ)) if known else None
         self._respond(self._post, body)
 
@@ -111,7 +111,7 @@ class Handler(BaseHTTPRequestHandler):
         except (InputError, NotSolvedError) as error:
             status, file = HTTPStatus.BAD_REQUEST, _error(error)
         except Exception as error:
-            self.server.tell(f"a fault of the program: {type(error).__name__}: {_line(error)}")
+            self.server.tell(f"internal error: {type(error).__name__}: {_line(error)}")
             status, file = HTTPStatus.INTERNAL_SERVER_ERROR, _error(error)
         self.send_response(status)
         self.send_header("Content-Type", file.type)
@@ -131,11 +131,11 @@ class Handler(BaseHTTPRequestHandler):
         name leads here must not speak with it."""
         port = self.server.server_port
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
-            raise Refused(HTTPStatus.FORBIDDEN, f"this page is at {HOST} alone")
+            raise Refused(HTTPStatus.FORBIDDEN, f"this page is served at {HOST} only")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
-            raise Refused(HTTPStatus.FORBIDDEN, "the address is not complete: take it from the "
-                          "terminal, with all its letters")  # fmt: skip
+            raise Refused(HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from "
+                          "the terminal")  # fmt: skip
         return "/".join(rest).rstrip("/")
 
     def _get(self, action: str, _: bytes) -> File:
@@ -148,7 +148,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def respond(view: View, action: str, given: Given) -> File:
-    """What a view says to the values of its page: `answer`, `save`, or `export/NAME`.
+    """The reply of a view to the values of its page: `answer`, `save`, or `export/NAME`.
 
     **Raises:** `Refused` for anything else, and what the view raises."""
     if action == "answer":
@@ -192,4 +192,4 @@ def _line(error: Exception) -> str:
 
 
 def _no_number(word: str):
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")

@@ -20,7 +20,7 @@ LABELS = {
     "altitude": ("altitude of the track", "m"), "speed": ("speed over ground", "m/s"),
     "heading": ("heading, clockwise from y", "°"),
 }  # fmt: skip
-"""What an orbit, or a straight track, is chosen by: label and unit."""
+"""The parameters of an orbit and of a straight track: label and unit."""
 USUAL = {"height": 500e3, "inclination": 97.4, "node": 0.0, "argument": 0.0}
 
 
@@ -40,20 +40,23 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
         x, y, _ = velocity = np.asarray(track["velocity"], float)
         straight = {"altitude": track["start"][2], "speed": np.linalg.norm(velocity),
                     "heading": np.degrees(np.arctan2(x, y))}  # fmt: skip
-        known = {ORBIT: USUAL, STRAIGHT: {name: rounded(v) for name, v in straight.items()}}
+        known = {ORBIT: USUAL, STRAIGHT: {name: shorten_number(v) for name, v in straight.items()}}
         return Tracks(STRAIGHT, track, earth or WGS84, known)
     assert earth is not None and image.trajectory.position.rates is not None
     P, V = (np.linalg.norm(np.asarray(rows)[0]) for rows in
             (image.trajectory.position.values, image.trajectory.position.rates))  # fmt: skip
-    straight = {"altitude": rounded(P - earth.a, 3), "speed": rounded(V * earth.a / P, 3),
-                "heading": 0.0}  # fmt: skip
-    orbit = {name: rounded(np.degrees(track.get(name, 0.0))) for name in USUAL}
+    straight = {
+        "altitude": shorten_number(P - earth.a, 3),
+        "speed": shorten_number(V * earth.a / P, 3),
+        "heading": 0.0,
+    }
+    orbit = {name: shorten_number(np.degrees(track.get(name, 0.0))) for name in USUAL}
     orbit = {**orbit, "height": float(track["height"])} if "height" in track else {}
     return Tracks(ORBIT, track, earth, {ORBIT: orbit, STRAIGHT: straight})
 
 
 def track_controls(tracks: Tracks) -> list[Number]:
-    """The numbers of both."""
+    """The parameters of both tracks."""
     return [
         Number(name, LABELS[name][0], value, LABELS[name][1])
         for values in tracks.known.values()
@@ -83,6 +86,6 @@ def choose_track(tracks: Tracks, values: Mapping[str, Any]) -> Mapping[str, Any]
     return {"start": [x, y, chosen["altitude"]], "velocity": velocity}
 
 
-def rounded(value: Any, places: int = 12) -> float:
+def shorten_number(value: Any, places: int = 12) -> float:
     """The shortest form: 0.01, not 0.010000000000000002."""
     return float(f"{value:.{places}g}")

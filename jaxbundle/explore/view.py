@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.report.page import Page
 
 Given = Mapping[str, Any]
@@ -51,7 +51,7 @@ def number(given: Given, key: str, default: float, low: float = -math.inf) -> fl
     fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     if not fits or value < low:
         least = "" if low == -math.inf else f" of at least {low:g}"
-        raise InputError(f"{key} must be a finite number{least}, but is {shown(value)}")
+        raise InputError(f"{key} must be a finite number{least}, but is {show(value)}")
     return float(value)
 
 
@@ -61,7 +61,7 @@ def switch(given: Given, key: str) -> bool:
     **Raises:** `InputError`."""
     value = given.get(key, False)
     if not isinstance(value, bool):
-        raise InputError(f"{key} must be true or false, but is {shown(value)}")
+        raise InputError(f"{key} must be true or false, but is {show(value)}")
     return value
 
 
@@ -71,7 +71,7 @@ def word(given: Given, key: str, default: str, words: Iterable[str]) -> str:
     **Raises:** `InputError`."""
     value, words = given.get(key, default), tuple(words)
     if value not in words:
-        raise InputError(f"{key} is {shown(value)}{did_you_mean(str(value), words)}")
+        raise InputError(f"{key} is {show(value)}{did_you_mean(str(value), words)}")
     return value
 
 
@@ -82,4 +82,4 @@ def check_keys(given: Given, known: Iterable[str]) -> None:
     known = tuple(known)
     for key in given:
         if key not in known:
-            raise InputError(f"there is no value {shown(key)}{did_you_mean(str(key), known)}")
+            raise InputError(f"there is no value {show(key)}{did_you_mean(str(key), known)}")

@@ -2,15 +2,15 @@
 
     show(NetworkView(result))
 
-The page is in a frame; requests of its controls go through the notebook to the view in this
-process, and answers back. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
+The page is in a frame; requests of its controls and the answers pass through the notebook to and
+from the view in this process. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
 """
 
 import functools
 from importlib.resources import files
 from typing import Any
 
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.server import Refused, page_file, respond
 from jaxbundle.explore.view import View
@@ -24,7 +24,7 @@ def show(view: View, *, height: int = 800) -> Any:
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
-    height = whole("height", height, LOWEST, HIGHEST)
+    height = integer("height", height, LOWEST, HIGHEST)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
     widget.on_msg(lambda one, content, buffers: one.send(*reply(view, content)))

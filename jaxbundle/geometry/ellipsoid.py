@@ -35,7 +35,7 @@ class Ellipsoid(NamedTuple):
 
 
 AXIS = 1e-13
-"""What is nearer to the axis than this, in metres, is on it."""
+"""A point nearer to the axis than this, in metres, is on it."""
 
 WGS84 = Ellipsoid(6378137.0, 6378137.0, 6356752.314245179)
 

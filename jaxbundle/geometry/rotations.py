@@ -187,6 +187,7 @@ def rodrigues_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
 
 
 def _angle(sine: Scalar, cosine: Scalar) -> Array:
-    """arctan2, but constant zero where both arguments vanish: an angle lost at a lock."""
+    """arctan2, but constant zero where both arguments vanish: an angle that gimbal lock leaves
+    undefined."""
     lost = sine**2 + cosine**2 < (8 * jnp.finfo(jnp.result_type(sine)).eps) ** 2
     return jnp.where(lost, 0, jnp.arctan2(sine, jnp.where(lost, 1, cosine)))

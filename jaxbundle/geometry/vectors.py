@@ -16,17 +16,17 @@ Vector = Triple | Float[AnyArray, "3 ..."]
 Matrix = tuple[Triple, Triple, Triple] | Float[AnyArray, "3 3"]
 
 
-def unpacked(v: Vector | tuple[Scalar, ...]) -> Triple:
+def unpack(v: Vector | tuple[Scalar, ...]) -> Triple:
     """The three components, read once."""
     x, y, z = v
     return x, y, z
 
 
 def read(M: Float[AnyArray, "3 3"]) -> tuple[Triple, Triple, Triple]:
-    """The rows of a matrix as triples, for `turned` and `turned_back`: every access of an array
+    """The rows of a matrix as triples, for `rotate` and `rotate_back`: every access of an array
     component costs time of compilation."""
     first, second, third = M
-    return unpacked(first), unpacked(second), unpacked(third)
+    return unpack(first), unpack(second), unpack(third)
 
 
 def dot(u: Vector, v: Vector) -> Scalar:
@@ -49,7 +49,7 @@ def difference(u: Vector, v: Vector) -> Triple:
     return u[0] - v[0], u[1] - v[1], u[2] - v[2]
 
 
-def scaled(s: Scalar, v: Vector) -> Triple:
+def scale_vector(s: Scalar, v: Vector) -> Triple:
     """s·v."""
     return s * v[0], s * v[1], s * v[2]
 
@@ -61,15 +61,15 @@ def length(v: Vector) -> Scalar:
 
 def unit(v: Vector) -> Triple:
     """v/|v|."""
-    return scaled(1 / length(v), v)
+    return scale_vector(1 / length(v), v)
 
 
-def turned(M: Matrix, v: Vector) -> Triple:
+def rotate(M: Matrix, v: Vector) -> Triple:
     """M·v."""
     return dot(M[0], v), dot(M[1], v), dot(M[2], v)
 
 
-def turned_back(M: Matrix, v: Vector) -> Triple:
+def rotate_back(M: Matrix, v: Vector) -> Triple:
     """Mᵀ·v."""
     x, y, z = (M[0][k] * v[0] + M[1][k] * v[1] + M[2][k] * v[2] for k in range(3))
     return x, y, z

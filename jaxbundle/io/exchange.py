@@ -12,23 +12,23 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, Conversion, key_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.camera_files import chosen_camera, is_camera_file, read_cameras
-from jaxbundle.io.cameras.nearest_camera import fits_told
+from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
+from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.formats import (
     CAMERA_KINDS,
     TARGETS,
     check_own_models,
     has_model,
     read_network,
-    recognised_target,
+    recognise_target,
 )
 from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
-from jaxbundle.io.networks.jaicov import BESIDE
+from jaxbundle.io.networks.jaicov import COMPANION_SUFFIXES
 from jaxbundle.io.networks.project import FILE_NAME
 from jaxbundle.io.results.coordinates import images_path
-from jaxbundle.io.writing.folders import check_folder, replaced_folder
-from jaxbundle.network.columns import did_you_mean, some
+from jaxbundle.io.writing.folders import check_folder, replace_folder
+from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.outside import outside_warnings
 from jaxbundle.network.rules import check_camera
@@ -101,11 +101,11 @@ def convert(
         _keep_others(output, kind, force)
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
-            network = network_of_cameras(cameras, str(input)).warn(*fits_told(cameras))
+            network = network_of_cameras(cameras, str(input)).warn(*fit_messages(cameras))
             return _convert_network(network, output, kind, model, measured, force)
         made = _convert_cameras(input, cameras, output, kind, model, camera)
         return dataclasses.replace(
-            made, warnings=(*fits_told(cameras), *outside_warnings(cameras))
+            made, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
         )
     network = read_network(
         input, format=format, overrides=overrides, control=control, models=models
@@ -136,7 +136,7 @@ def _convert_network(
     if folder is None:
         lost = TARGETS[kind].write(network, output)
     else:
-        with replaced_folder(folder, "convert", files, force) as new:
+        with replace_folder(folder, "convert", files, force) as new:
             lost = TARGETS[kind].write(network, new)
     return Converted(kind, output, costs, tuple(lost), network.warnings)
 
@@ -147,10 +147,12 @@ def _kind(output: Path, to: str | None) -> str:
         if to not in kinds:
             raise InputError(f"--to {to}: cannot be written{did_you_mean(to, kinds)}")
         return to
-    found = recognised_target(output)
+    found = recognise_target(output)
     if found is None:
         known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
-        raise InputError(f"{output}: what to write is not recognised; give --to or a name: {known}")
+        raise InputError(
+            f"{output}: the output format is not recognised; give --to or a name: {known}"
+        )
     return found
 
 
@@ -216,12 +218,12 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
     beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST],
-              "jaicov": [output.with_suffix(suffix) for suffix in BESIDE]}  # fmt: skip
+              "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES]}  # fmt: skip
     there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(
-            f"{some([str(path) for path in there], 3, str)}: already there and would be replaced; "
-            "give another place, or --force"
+            f"{list_some([str(path) for path in there], 3, str)}: already there and would be "
+            "replaced; give another place, or --force"
         )
 
 
@@ -259,13 +261,13 @@ def _convert_cameras(
 ) -> Converted:  # fmt: skip
     if kind not in CAMERA_KINDS:
         raise InputError(
-            f"{input}: holds cameras alone; they can be written as "
+            f"{input}: contains only cameras; they can be written as "
             f"{', '.join((*CAMERA_KINDS, *(name for name, t in TARGETS.items() if t.alone)))}, not "
             f"as {kind}"
         )
     written = CAMERA_KINDS[kind]
     if written.one or id is not None:
-        cameras = [chosen_camera(cameras, id, str(input))]
+        cameras = [choose_camera(cameras, id, str(input))]
     costs, made = {}, []
     for camera in cameras:
         foreign = not has_model(written.models, camera.model)

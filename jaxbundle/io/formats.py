@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
-from jaxbundle.arguments import shown, text
+from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
@@ -49,7 +49,7 @@ from jaxbundle.io.networks.transforms import is_transforms, read_transforms, wri
 from jaxbundle.io.results.coordinates import write_coordinates
 from jaxbundle.io.results.dxf import write_dxf
 from jaxbundle.io.results.ply import write_ply
-from jaxbundle.network.columns import count, did_you_mean, some
+from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import is_plain
@@ -263,7 +263,7 @@ def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
     return not models or any(isinstance(model, str) and fnmatchcase(model, m) for m in models)
 
 
-def recognised_target(path: Path) -> str | None:
+def recognise_target(path: Path) -> str | None:
     """The kind of an output, from its name."""
     kinds = (
         *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
@@ -272,7 +272,7 @@ def recognised_target(path: Path) -> str | None:
     return next((name for name, kind in kinds if kind.recognises(path)), None)
 
 
-def recognised_format(path: Path) -> str | None:
+def recognise_format(path: Path) -> str | None:
     """The kind of an input, from its name and content; None if none fits."""
     return next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)
 
@@ -281,7 +281,7 @@ def read_oriented(path: str | Path) -> Network:
     """The network of an input in any known format; a project needs only cameras and images.
 
     **Raises:** `InputError`."""
-    is_project = os.path.exists(path) and recognised_format(Path(path)) == "project"
+    is_project = os.path.exists(path) and recognise_format(Path(path)) == "project"
     return read_project(path, oriented=True) if is_project else read_network(path)
 
 
@@ -310,21 +310,21 @@ def read_network(
         isinstance(overrides, Sequence) and all(isinstance(one, str) for one in overrides)
     ):
         raise InputError(
-            f"overrides must be a list of texts, such as ['datum=inner'], but is {shown(overrides)}"
+            f"overrides must be a list of texts, such as ['datum=inner'], but is {show(overrides)}"
         )
     if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
-            what = "holds a camera alone" if format == "opencv" else "is written only"
+            what = "contains only a camera" if format == "opencv" else "is written only"
             raise InputError(
                 f"--format {format}: {what}; a network is read as {', '.join(FORMATS)}"
             )
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder")
-    format = format or recognised_format(path)
+    format = format or recognise_format(path)
     if format is None and is_camera_file(path):
         raise InputError(
-            f"{path}: holds cameras alone, without images and points; a project, or another "
+            f"{path}: contains only cameras, without images and points; a project, or another "
             "network, is expected (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
@@ -344,7 +344,7 @@ def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
 
     **Raises:** `InputError`."""
     if not (isinstance(models, list | tuple) and all(isinstance(m, CameraModel) for m in models)):
-        raise InputError(f"models must be a list of CameraModels, but is {shown(models)}")
+        raise InputError(f"models must be a list of CameraModels, but is {show(models)}")
     check_unique([model_of(m).name for m in models], Source("models", None, "number"), "model")
     return tuple(models)
 
@@ -355,7 +355,8 @@ def _of_adjusted_control(network: Network):
     held = [id for id, role in zip(points.id, points.role) if role == "fixed"]
     weighted = points.role.count("control")
     if held:
-        yield f"{count(len(held), 'control point')} without positive σ held as fixed: {some(held)}"
+        points = count(len(held), "control point")
+        yield f"{points} without positive σ held as fixed: {list_some(held)}"
     if weighted:
         yield (
             f"the file gives {count(weighted, 'control point')} with adjusted coordinates and a "

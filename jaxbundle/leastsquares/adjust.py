@@ -17,9 +17,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxbundle.arguments import one_of, truth, whole
+from jaxbundle.arguments import integer, one_of, truth
 from jaxbundle.choices import ESTIMATORS, METHODS
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.datum.motions import likely_motions
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
@@ -41,11 +41,11 @@ from jaxbundle.leastsquares.quality.snooping import Removed, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 
 DATUMS = ("given", "inner", "minimal")
-FEW = 60
+FEWEST_ELIMINATED = 60
 """Problems with fewer unknowns are solved without elimination."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class TableResult:
     """A table after the adjustment: `value` in the given form; `sigma` a posteriori and
@@ -229,7 +229,7 @@ def adjust(
     one_of("robust", robust, ESTIMATORS, none=True)
     truth("estimate_components", estimate_components)
     check_test(snooping, significance)
-    steps = whole("max_iterations", max_iterations) + 1
+    steps = integer("max_iterations", max_iterations) + 1
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")
     tables = tuple(tables)
@@ -281,7 +281,7 @@ def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observatio
     size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
     total = sum(int(t.free.sum()) for t in tables)
     largest = max(size, key=size.__getitem__, default=None)
-    worth = largest is not None and total >= FEW and size[largest] > total / 4
+    worth = largest is not None and total >= FEWEST_ELIMINATED and size[largest] > total / 4
     return largest if worth else None
 
 

@@ -10,9 +10,9 @@ from jaxbundle.geometry import transform_point
 from jaxbundle.leastsquares.datum.motions import Together
 from jaxbundle.leastsquares.spaces import tangent_basis
 
-FARTHEST = 1e8
+LARGEST_DISTANCE = 1e8
 """Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
-THERE = 0.99
+INFINITY_FROM = 0.99
 """The fraction of it from which a point counts as at infinity."""
 
 
@@ -25,7 +25,7 @@ class AnyDistance:
         X ← (X + A·δ)/(1 + |X|/s·δ₃),   A = (n·e₁, n·e₂, −s·u),  u = X/|X|,  n² = |X|² + s².
 
     So nearly parallel rays give a well-determined direction and an inverse distance that may become
-    0, instead of a diverging distance. A step beyond infinity (`FARTHEST`) ends there.
+    0, instead of a diverging distance. A step beyond infinity (`LARGEST_DISTANCE`) ends there.
 
     Source: Förstner and Wrobel (2016), 5.1 and 10.2, spherically normalised homogeneous vectors.
     """
@@ -36,7 +36,7 @@ class AnyDistance:
         A, c = _frame(value)
         return tuple(value[:3]), tuple(map(tuple, A)), c
 
-    def moved(self, block, change):
+    def move(self, block, change):
         X, A, c = block
         if not change:
             return X
@@ -46,7 +46,7 @@ class AnyDistance:
     def retract(self, value, change):
         A, c = _frame(value)
         moved, s = value[:3] + A @ change, value[3]
-        least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, FARTHEST * s, 1.0), 0.0)
+        least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, LARGEST_DISTANCE * s, 1.0), 0.0)
         return value.at[:3].set(moved / jnp.maximum(1 + c * change[2], least))
 
     def difference(self, value, origin):
@@ -73,7 +73,7 @@ def derivative(value):
 
 def is_at_infinity(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
     """Which points at any distance are at infinity."""
-    return (np.linalg.norm(X, axis=1) > THERE * FARTHEST * s) & (s > 0)
+    return (np.linalg.norm(X, axis=1) > INFINITY_FROM * LARGEST_DISTANCE * s) & (s > 0)
 
 
 def shares(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
@@ -104,7 +104,7 @@ def _transform(motion, value):
     moved = transform_point(motion, value[:3])
     turned = moved - transform_point(motion, jnp.zeros(3))
     turned = turned * length(value[:3]) / length(turned)
-    far = jnp.sqrt(value[:3] @ value[:3]) > THERE * FARTHEST * value[3]
+    far = jnp.sqrt(value[:3] @ value[:3]) > INFINITY_FROM * LARGEST_DISTANCE * value[3]
     return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
 
 

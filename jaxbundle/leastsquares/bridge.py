@@ -56,10 +56,10 @@ class Chart:
         change = lambda y: self.space.difference(self.value(start, scale, y), here)
         return self.space.prepare(here), tuple(map(tuple, jax.jacfwd(change)(y)))
 
-    def moved(self, block, change):
+    def move(self, block, change):
         here, slope = block
         moves = tuple(sum(a * d for a, d in zip(row, change)) for row in slope) if change else ()
-        return self.space.moved(here, moves)
+        return self.space.move(here, moves)
 
     def chart(self, value):
         return None

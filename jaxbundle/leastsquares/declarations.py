@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree
 
 from jaxbundle.arguments import numeric_array
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
@@ -24,7 +24,7 @@ OF_THE_VALUES: Any = None
 """Placeholder: the space is derived from the values of the table."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Table:
     """Unknowns of one type.
@@ -176,7 +176,7 @@ class Motions:
     curved: tuple[int, ...] = ()
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Observations:
     """Observations of one kind.
@@ -217,7 +217,7 @@ class Observations:
     def number(self) -> int:
         return len(self.rows[0])
 
-    def resolved(self, tables: Sequence[Table]) -> "Observations":
+    def resolve_labels(self, tables: Sequence[Table]) -> "Observations":
         """The same with row numbers for labels.
 
         **Raises:** `InputError` for an unknown table or label."""

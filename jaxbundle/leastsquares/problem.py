@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
-from jaxbundle.leastsquares.indexing.indices import common, finish, rounded
+from jaxbundle.leastsquares.indexing.indices import common, finish, round_up
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 from jaxbundle.system.memory import return_freed_memory
 
-LARGE = 200_000
+LARGE_PROBLEM = 200_000
 """Problems with more observations are compiled for their exact sizes."""
 WORTH_RETURNING = 10_000
 """Planning more observations leaves memory worth returning to the system."""
@@ -113,7 +113,7 @@ def make_problem(
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
-    observations = tuple(given.resolved(tables) for given in observations)
+    observations = tuple(given.resolve_labels(tables) for given in observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple(o.kind for o in observations), spaces, motions)
@@ -131,14 +131,14 @@ def make_problem(
 def _make_plan(tables, observations, eliminate, ways):
     """The plan on the device, the sizes of its lists, and the choices made."""
     host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways)
-    sizes = common([sizes], rounder(observations))
+    sizes = common([sizes], choose_rounding(observations))
     return jax.device_put(finish(host, sizes)), sizes, choices
 
 
-def rounder(observations) -> Callable:
+def choose_rounding(observations) -> Callable:
     """The rounding of plan sizes for this number of observations."""
-    large = sum(o.number for o in observations) > LARGE
-    return lambda key, n: n if large else rounded(n)
+    large = sum(o.number for o in observations) > LARGE_PROBLEM
+    return lambda key, n: n if large else round_up(n)
 
 
 def with_factor(problem: Problem) -> Problem:
@@ -165,7 +165,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: give `datum`")
     weight, minimal = choose(gauge)
     weight = {
-        t: _longer(np.asarray(w, float), problem.sizes["table", t], "constant")
+        t: _append_unused(np.asarray(w, float), problem.sizes["table", t], "constant")
         for t, w in weight.items()
     }
     datum = make_datum(problem.plan, survey, gauge, weight, minimal, real)
@@ -174,7 +174,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     return dataclasses.replace(problem, plan=plan, counts=counts)
 
 
-def open_at(problem: Problem, values: Values) -> Problem:
+def with_motions_at(problem: Problem, values: Values) -> Problem:
     """The problem with its open motions at these values: those about a weighted point follow the
     point."""
     datum, invariant = problem.plan.datum, (kind.invariant for kind in problem.declared.kinds)
@@ -207,7 +207,7 @@ def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"
     tables = tuple(
         dataclasses.replace(t, free=free) if t.name == table else t for t in problem.tables
     )
-    wide = _longer(free, problem.sizes["table", table], "constant")
+    wide = _append_unused(free, problem.sizes["table", table], "constant")
     plan, groups = problem.plan, dict(problem.plan.groups)
     for name, group in groups.items():
         for m in group.members:
@@ -281,13 +281,13 @@ def check_numbers(tables, observations, weights) -> None:
 def make_data(declared: Declared, tables, observations) -> Data:
     """The data of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
-    weights = observed_weights(tables, observations)
+    weights = weights_of(tables, observations)
     check_numbers(tables, observations, weights)
     measured = tuple(o.measured for o in observations)
     return Data(*jax.device_put((start, measured, tuple(weights))))
 
 
-def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
+def weights_of(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
     """The weights of sets of observations; the number of residuals of a kind is found from the
     shapes."""
     called = {t.name: t for t in tables}
@@ -304,7 +304,7 @@ def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
 @partial(jax.jit, static_argnums=(0, 1))
 def _evaluate(kind, spaces, values, measured):
     """The residuals of one observation."""
-    blocks = [space.moved(space.prepare(v), ()) for space, v in zip(spaces, values)]
+    blocks = [space.move(space.prepare(v), ()) for space, v in zip(spaces, values)]
     first = scalars(jax.tree.map(lambda x: x[None], measured))
     return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], first))
 
@@ -316,7 +316,7 @@ def pad_data(problem: Problem, data: Data) -> Data:
 
 def fill_data(problem: Problem, data: Data) -> Data:
     """The data padded to the sizes of the plan, with weights 0."""
-    fill = lambda o: lambda x: _longer(x, problem.sizes["observations", o], "constant")
+    fill = lambda o: lambda x: _append_unused(x, problem.sizes["observations", o], "constant")
     return Data(
         pad_values(problem, data.start),
         tuple(jax.tree.map(fill(o), m) for o, m in enumerate(data.measured)),
@@ -326,7 +326,7 @@ def fill_data(problem: Problem, data: Data) -> Data:
 
 def pad_values(problem: Problem, values: Values) -> Values:
     """The tables padded to the sizes of the plan by repeating the last row."""
-    fill = lambda t: lambda x: _longer(x, problem.sizes["table", t], "edge")
+    fill = lambda t: lambda x: _append_unused(x, problem.sizes["table", t], "edge")
     return {t: jax.tree.map(fill(t), rows) for t, rows in values.items()}
 
 
@@ -339,14 +339,14 @@ def without_filling(problem: Problem, values: Values) -> Values:
             for t in problem.tables}  # fmt: skip
 
 
-def _longer(x, n: int, mode: Literal["constant", "edge"]) -> Any:
+def _append_unused(x, n: int, mode: Literal["constant", "edge"]) -> Any:
     """At least one row more, so that there is an unused one."""
     x = x if isinstance(x, Tracer) else np.asarray(x)
     room = [(0, n - len(x)), *[(0, 0)] * (x.ndim - 1)]
     return jnp.pad(x, room, mode) if isinstance(x, Tracer) else np.pad(x, room, mode)
 
 
-def given_data(problem: Problem, data: Data | None) -> Data:
+def complete_data(problem: Problem, data: Data | None) -> Data:
     """The data in the sizes of the plan: those of the problem, or others of the same shapes.
 
     **Raises:** `InputError` if the shapes differ."""
@@ -374,7 +374,7 @@ def make_solver(
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
-    rows = rounded(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
+    rows = round_up(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
     return LeastSquares(
         problem.declared, problem.plan, tolerance, problem.retraction, rows=rows,
         max_steps=jax.device_put(np.int64(max_steps)), **options,

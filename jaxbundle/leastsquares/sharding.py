@@ -26,7 +26,13 @@ from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, minimise
-from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
+from jaxbundle.leastsquares.problem import (
+    Problem,
+    choose_rounding,
+    fill_data,
+    pad_values,
+    without_filling,
+)
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -50,8 +56,8 @@ class Shards:
 
 
 @contextmanager
-def alone() -> Iterator[None]:
-    """Problems solved inside are those of this process only: its own devices share them."""
+def use_own_devices() -> Iterator[None]:
+    """Problems solved in this context belong to this process only: its own devices share them."""
     before = _ALONE.set(True)
     try:
         yield
@@ -69,7 +75,7 @@ def distribute(problem: Problem, devices=None) -> Shards:
     devices = sharing_devices() if devices is None else devices
     rows, seen = _cut(problem, len(devices))
     planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
-    sizes = common((sizes for _, sizes in planned), rounder(problem.observations))
+    sizes = common((sizes for _, sizes in planned), choose_rounding(problem.observations))
     here, host = dataclasses.replace(problem, sizes=sizes), jax.tree.map(np.asarray, problem.data)
     take = lambda of_sets, at: tuple(_take(x, rows) for x, rows in zip(of_sets, at))
     data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]

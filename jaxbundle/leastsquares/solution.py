@@ -22,20 +22,20 @@ from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,
     Values,
-    in_given_order,
     lay_out_data,
     prepare,
     residuals,
+    restore_order,
 )
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
-    LARGE,
+    LARGE_PROBLEM,
     Problem,
     make_solver,
-    open_at,
     pad_data,
     pad_values,
+    with_motions_at,
     without_filling,
 )
 from jaxbundle.leastsquares.quality.cofactors import (
@@ -48,14 +48,14 @@ from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 from jaxbundle.system.programs import compile_once
 
-HERE = "the plan"
+PLAN_PLACEHOLDER = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
 
 TO_SHARE = 10_000
 """Problems with at least this many observations are distributed over several devices; for smaller
 ones waiting exceeds computing."""
 
-RETURNS, SAME = 10, 1e-12
+RETURNS, COST_TOLERANCE = 10, 1e-12
 """Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
@@ -70,7 +70,7 @@ def find_minimum(
 
     `progress(step, cost, λ)` is called during the iterations of large problems, otherwise at their
     end: JAX compiles a program that calls the host in every process anew."""
-    large = sum(o.number for o in problem.observations) > LARGE
+    large = sum(o.number for o in problem.observations) > LARGE_PROBLEM
     if large and progress is not None:
         options["progress"] = progress
     given = pad_values(problem, problem.data.start)
@@ -81,7 +81,7 @@ def find_minimum(
     if not large and progress is not None:
         report(minimum, progress)
     for _ in range(RETURNS):
-        there = open_at(problem, without_filling(problem, minimum.values))
+        there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
         if there is problem or not bool(converged(minimum.termination)):
             break
@@ -90,7 +90,7 @@ def find_minimum(
         before, after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
-        if after <= before * (1 + SAME) + SAME:
+        if after <= before * (1 + COST_TOLERANCE) + COST_TOLERANCE:
             break
         minimum = minimise_from(values)
     values = without_filling(problem, values)
@@ -166,7 +166,7 @@ class Solution:
     @functools.cached_property
     def problem(self) -> Problem:
         """The problem with its open motions at these values."""
-        return open_at(self._as_given, self.values)
+        return with_motions_at(self._as_given, self.values)
 
     @functools.cached_property
     def _data(self) -> Data:
@@ -278,7 +278,7 @@ class Solution:
 
 @compile_once
 def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
-    return in_given_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
+    return restore_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
 
 
 @compile_once
@@ -290,7 +290,7 @@ def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Facto
 def without_plan(factor: Factor) -> Factor:
     """A factor without its plan, which a compiled function would copy."""
     is_plan = lambda x: isinstance(x, Plan)
-    return jax.tree.map(lambda x: HERE if is_plan(x) else x, factor, is_leaf=is_plan)
+    return jax.tree.map(lambda x: PLAN_PLACEHOLDER if is_plan(x) else x, factor, is_leaf=is_plan)
 
 
 def with_plan(factor: Factor, plan: Plan) -> Factor:
@@ -309,7 +309,7 @@ def _by_eliminated(declared, plan, values, data):
     for number in range(len(plan.parts)):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)
-    return in_given_order(plan, found)
+    return restore_order(plan, found)
 
 
 @compile_once

@@ -1,7 +1,7 @@
 """Parametrisation of one row of a table of unknowns: vectors, rotations, poses, directions.
 
 A space defines, for ONE row, the number of directions (`width`), the block of scalars that an
-observation receives (`prepare`), the effect of a small change δ on that block (`moved`, correct to
+observation receives (`prepare`), the effect of a small change δ on that block (`move`, correct to
 second order at δ = 0, where all derivatives are taken), the application of a finite change
 (`retract`), and the change between two values (`difference`; `small_difference`, if there is one,
 has the same first derivatives where both are equal). `hold` is a value with its held part taken
@@ -41,7 +41,7 @@ class Space(Protocol):
 
     def prepare(self, value: Any) -> Any: ...
 
-    def moved(self, block: Any, change: Change) -> Any: ...
+    def move(self, block: Any, change: Change) -> Any: ...
 
     def retract(self, value: Any, change: Float[AnyArray, " width"]) -> Any: ...
 
@@ -79,7 +79,7 @@ class Vector:
     def prepare(self, value):
         return tuple(value) if self.size else value
 
-    def moved(self, block, change):
+    def move(self, block, change):
         if not self.size:
             return block + change[0] if change else block
         if not change:
@@ -165,7 +165,7 @@ class Rotation:
     def prepare(self, value):
         return Turned(tuple(matrix_from_quaternion(value).ravel()))
 
-    def moved(self, block, change):
+    def move(self, block, change):
         return block._replace(turn=tuple(change)) if change else block
 
     def retract(self, value, change):
@@ -204,7 +204,7 @@ class Pose:
         matrix = tuple(matrix_from_quaternion(value.rotation).ravel())
         return Posed(Turned(matrix), tuple(value.position))
 
-    def moved(self, block, change):
+    def move(self, block, change):
         if not change:
             return block
         centre = tuple(c + d for c, d in zip(block.centre, change[:3]))
@@ -254,7 +254,7 @@ class Frame:
     def prepare(self, value):
         return Pose().prepare(value)
 
-    def moved(self, block, change):
+    def move(self, block, change):
         if not change:
             return block
         every = [0.0] * 6
@@ -294,7 +294,7 @@ class Direction:
     def prepare(self, value):
         return tuple(value), tuple(map(tuple, tangent_basis(value)))
 
-    def moved(self, block, change):
+    def move(self, block, change):
         value, basis = block
         if not change:
             return value

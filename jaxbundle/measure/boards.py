@@ -24,12 +24,15 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import number, shown, whole
+from jaxbundle.arguments import integer, number, show
 from jaxbundle.choices import BOARDS
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
-LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2}
+SMALLEST_SIDE = {
+    "chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2
+}  # fmt: skip
+"""Minimum columns and rows of a board."""
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
 ARUCO, APRILTAGS = "DICT_4X4_50", "DICT_APRILTAG_36h11"
@@ -69,9 +72,9 @@ class Board:
     def __post_init__(self):
         if not isinstance(self.kind, str) or self.kind not in BOARDS:
             raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, BOARDS)}")
-        least = LEAST[self.kind]
+        least = SMALLEST_SIDE[self.kind]
         for name in ("columns", "rows"):
-            whole(f"board: {name}", getattr(self, name), least=0)
+            integer(f"board: {name}", getattr(self, name), least=0)
         if min(self.columns, self.rows) < least or self.columns * self.rows > 100_000:
             raise InputError(
                 f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
@@ -135,6 +138,6 @@ def require_board(board: Board) -> Board:
     **Raises:** `InputError`."""
     if not isinstance(board, Board):
         raise InputError(
-            f"board must be a Board, such as Board(9, 6, 0.03), but is {shown(board)}"
+            f"board must be a Board, such as Board(9, 6, 0.03), but is {show(board)}"
         )
     return board

@@ -19,7 +19,9 @@ def filter_cloud(
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError("point cloud: finite coordinates [points, 3] are expected")
     if not (np.isfinite(size) and size > 0) or least < 1:
-        raise InputError(f"point cloud: cubes of {size:g} with at least {least} points cannot be")
+        raise InputError(
+            f"point cloud: cubes of {size:g} with at least {least} points are impossible"
+        )
     cubes, counts = np.unique(np.floor(points / size), axis=0, return_counts=True)
     full = counts >= least
     return cubes[full] * size, counts[full]

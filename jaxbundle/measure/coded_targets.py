@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.choices import CODED_TARGETS
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.corners import find_board
@@ -30,7 +30,7 @@ from jaxbundle.photographs.opencv import need_opencv
 
 CORNER = 0.1
 """σ of a corner, pixels."""
-WITHIN = 3
+CORNER_HALF_WINDOW = 3
 """Half a window in which a corner is refined, pixels."""
 SAMPLES = 20
 """Samples in every sector of a ring."""
@@ -38,11 +38,11 @@ GAP, RING, BEYOND = 1.5, 2.5, 3.4
 """Radii in the middle of the dark gap, of the ring, and beyond it, in radii of the disc."""
 FEWEST_PIXELS, ROUND = 20, 0.12
 """Minimum pixels of a disc, and the relative tolerance of its area to that of its ellipse."""
-CLEAR = 0.3
+SECTOR_TOLERANCE = 0.3
 """Tolerance of sectors and the gap relative to the contrast."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class NamedPoints:
     """Points found in a photograph: names, pixels, σ in pixels."""
@@ -109,7 +109,7 @@ def _markers(grey, dictionary, border):
     found = []
     for four, id in zip(corners, [] if ids is None else ids.ravel().tolist()):
         side = np.linalg.norm(np.diff(four[0], axis=0), axis=1).min()
-        half = int(np.clip(side / 8, 1, WITHIN))
+        half = int(np.clip(side / 8, 1, CORNER_HALF_WINDOW))
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.005)
         xy = cv2.cornerSubPix(grey, four[0].astype(np.float32).copy(), (half, half), (-1, -1), stop)
         found += [(f"{id}-{k}", place, (CORNER, CORNER)) for k, place in enumerate(xy, 1)]
@@ -183,7 +183,7 @@ def _code(grey, target, bits):
     gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
     dark = np.median(gap)
     gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond))
-    if np.abs(gap).max() > CLEAR or beyond.mean() > 0.5:
+    if np.abs(gap).max() > SECTOR_TOLERANCE or beyond.mean() > 0.5:
         return None
     # the sectors begin at the changes
     by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
@@ -191,7 +191,7 @@ def _code(grey, target, bits):
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
     off = np.minimum(np.abs(means), np.abs(means - 1))
-    if np.any(off > CLEAR):
+    if np.any(off > SECTOR_TOLERANCE):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():

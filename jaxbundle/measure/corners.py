@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
-from jaxbundle.measure.boards import LEAST, MARKER, Board
+from jaxbundle.measure.boards import MARKER, SMALLEST_SIDE, Board
 from jaxbundle.measure.corner_windows import half_window, refine_by_gradients
 from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
@@ -25,7 +25,7 @@ SIDES = (1600, 3200)
 """Longer sides of the reduced copies in which boards are searched in turn, in pixels."""
 MARKERS = 3
 """More markers than this prove another dictionary: false ones are rare."""
-QUICK = 800
+QUICK_SIDE = 800
 """The same for boards of other sizes."""
 
 
@@ -60,7 +60,7 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
         return None
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    grey, _ = _reduce(need_opencv(), grey, QUICK)
+    grey, _ = _reduce(need_opencv(), grey, QUICK_SIDE)
     # A part of a board is a board too: the largest is searched first.
     for columns, rows in sorted(near, key=lambda size: -size[0] * size[1]):
         try:
@@ -94,8 +94,8 @@ def largest_chessboard(grey: Grey, board: Board) -> Board | None:
     """The chessboard in the photograph with all its corners, of any number; searched in a
     reduced copy. More columns than rows, or as in `board`."""
     cv2 = need_opencv()
-    grey, _ = _reduce(cv2, grey, QUICK)
-    least = LEAST["chessboard"]
+    grey, _ = _reduce(cv2, grey, QUICK_SIDE)
+    least = SMALLEST_SIDE["chessboard"]
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     try:
         found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags)
@@ -127,7 +127,7 @@ def _chessboard(cv2, grey, board):
             "with a light margin"
         )
     xy = _refine(cv2, grey, xy.reshape(*board.grid, 2))
-    return _first_black(grey, _turned_right(xy), board).reshape(-1, 2)
+    return _first_black(grey, _turn_upright(xy), board).reshape(-1, 2)
 
 
 def _in_copies(cv2, grey, seek):
@@ -158,7 +158,7 @@ def _refine(cv2, grey, xy):
     return refine_by_gradients(grey, xy.reshape(-1, 2), half).reshape(xy.shape)
 
 
-def _turned_right(xy):
+def _turn_upright(xy):
     """Rows from the top, each from the left: not mirrored, the first row at the top."""
     right, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
     if np.linalg.det([right.sum(0), down.sum(0)]) < 0:
@@ -234,9 +234,9 @@ def _circles(cv2, grey, board):
         )
     xy = xy.reshape(*board.grid, 2)
     if uneven:
-        xy = _uneven_rows(xy)
+        xy = _number_asymmetric(xy)
     else:
-        xy = _turned_right(xy)
+        xy = _turn_upright(xy)
     return np.array([centre_by_ellipse(grey, place).xy for place in xy.reshape(-1, 2)])
 
 
@@ -251,7 +251,7 @@ def _blob_finder(cv2, grey, shade):
     return cv2.SimpleBlobDetector_create(wanted)
 
 
-def _uneven_rows(xy):
+def _number_asymmetric(xy):
     """The numbering with the second row shifted to the right, not mirrored."""
 
     def fits(xy):

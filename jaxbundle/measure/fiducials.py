@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
 from jaxbundle.leastsquares.iterations.small import adjust
@@ -30,7 +30,7 @@ from jaxbundle.types import AnyArray
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Transformation:
     """A transformation of the plane with its residuals.

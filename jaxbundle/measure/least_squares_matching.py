@@ -54,13 +54,13 @@ from jaxbundle.types import AnyArray
 
 STEPS = 12
 """Evaluations of a matching: two of three end after six."""
-STILL = 0.005
+LAST_STEP = 0.005
 """Steps below this, anywhere in the window, end the iterations, pixels."""
-FAR = 0.5
+LARGEST_SHIFT = 0.5
 """The centre may move from its start by this part of the side of the window."""
-FLAT = 1e-6
+SMALLEST_CONTRAST = 1e-6
 """Standard deviation of grey values, relative to the largest, below which there is no contrast."""
-DETERMINED = 1e-5
+SMALLEST_PIVOT = 1e-5
 """Smallest square of a pivot of N, scaled to a unit diagonal; below it nothing is determined."""
 TINY = 1e-20
 UNKNOWNS = 8
@@ -119,7 +119,7 @@ def match_least_squares(
     start = start.astype(dtype)
     mean = jnp.mean(template)
     contrast = jnp.std(template)
-    textured = contrast > FLAT * jnp.max(jnp.abs(template))
+    textured = contrast > SMALLEST_CONTRAST * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
     grey = ((template - mean) / unit).ravel()
     other = spline_coefficients((image.astype(dtype) - mean) / unit)
@@ -175,7 +175,7 @@ def _status(affine, start, shape, n, textured, known, moving):
     reasons = (
         (~textured, MatchingStatus.NO_TEXTURE),
         (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
-        (~((away < FAR * n) & (turned > 0.1)), MatchingStatus.DIVERGED),
+        (~((away < LARGEST_SHIFT * n) & (turned > 0.1)), MatchingStatus.DIVERGED),
         (~known, MatchingStatus.NO_TEXTURE),
         (moving, MatchingStatus.NOT_CONVERGED),
     )
@@ -302,7 +302,7 @@ def _minimise(normal_equations, begin, steps):
         better = square1 <= square
         new = (p + step, N1, g1, square1)
         kept = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
-        still = jnp.max(jnp.abs(step[:6])) < STILL
+        still = jnp.max(jnp.abs(step[:6])) < LAST_STEP
         rate = jnp.where(better, 0.1, 10.0).astype(damping.dtype)
         return count + 1, *kept, jnp.maximum(damping * rate, 1e-6), moving & ~still
 
@@ -320,7 +320,7 @@ def _inverse(N):
     scaled = N * scale * scale[:, None]
     factor = cho_factor(scaled)
     least = jnp.min(jnp.diag(factor[0]) ** 2)
-    determined = jnp.isfinite(least) & (least > DETERMINED)
+    determined = jnp.isfinite(least) & (least > SMALLEST_PIVOT)
     safe = jnp.where(determined, scaled, jnp.eye(UNKNOWNS, dtype=N.dtype))
     return cho_solve(cho_factor(safe), jnp.eye(UNKNOWNS, dtype=N.dtype)) * scale * scale[
         :, None

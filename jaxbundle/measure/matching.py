@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, ground_point, image_point
 from jaxbundle.system.programs import compile_once
@@ -33,7 +33,7 @@ FEWEST, MOST = 16, 4096
 """Minimum and maximum number of heights."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Match:
     """The best match: its image point [2] in the other image, pixels; its ground point [3]; ρ."""

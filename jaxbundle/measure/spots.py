@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 import scipy  # its parts are loaded on use
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 
 FIRST, LARGEST = 8, 256
@@ -25,7 +25,7 @@ MARGIN = 3
 """Pixels of the blurred edge beyond the spot."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Spot:
     """A spot in its window: the window's corner (column, row) in the photograph, grey values, the

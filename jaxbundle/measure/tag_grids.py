@@ -1,9 +1,9 @@
 """Grids of AprilTags as Kalibr prints them: tag 0 at the lower left, numbers to the right and then
 up, black squares in the gaps between the corners of tags, borders of two bits.
 
-Tags are found and read by OpenCV. Which corner of a tag is which follows from the place of the tag
-among the others (a homography of all of them), not from how the tag itself is turned. Grids
-numbered from the upper left, and borders of one bit, are recognised.
+Tags are found and read by OpenCV. The corners of a tag are identified by its position among the
+others (a homography of all of them), not by its own orientation. Grids numbered from the upper
+left, and borders of one bit, are recognised.
 
 Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
 """
@@ -23,7 +23,7 @@ FEWEST = 4
 """Fewest tags of a grid."""
 NEIGHBOURS = 9
 """Tags whose middles give the places of the corners of a tag."""
-FAR = 0.25
+LARGEST_OFFSET = 0.25
 """Largest distance of a corner from its place by the homography, in sides of its tag."""
 
 
@@ -65,7 +65,7 @@ def find_tags(cv2, grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
     side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
     for which, there, four, length in zip(corners, near, seen, side):
         apart = np.linalg.norm(there[:, None] - four, axis=2)
-        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < FAR * length:
+        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < LARGEST_OFFSET * length:
             found[which] = there  # OpenCV's corners reach into the squares of the gaps
     known = np.isfinite(found[:, 0])
     marker = board.marker or MARKER * board.square

@@ -21,7 +21,7 @@ import numpy as np
 import scipy  # its parts are loaded on use
 from jaxtyping import Float
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.ellipses import fit_ellipse
 from jaxbundle.measure.spots import MARGIN, find_spot
@@ -39,7 +39,7 @@ SAMPLING = 0.045
 """
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Target:
     """The measured centre of a target.
@@ -84,7 +84,7 @@ def centre_by_ellipse(grey, near) -> Target:
     weights = np.isfinite(edge).all(1).astype(float)
     if weights.sum() < 0.6 * len(edge):
         raise InputError(f"{_place(spot, xy)}: the edge of the target is not fully visible")
-    centre, covariance, axes, angle = _fitted(np.nan_to_num(edge), weights)
+    centre, covariance, axes, angle = _fit_robustly(np.nan_to_num(edge), weights)
     if not np.isfinite(covariance).all():
         raise InputError(f"{_place(spot, xy)}: the edge of the target is not an ellipse")
     return _target(spot, centre, np.sqrt(np.diagonal(covariance)), axes, angle)
@@ -160,7 +160,7 @@ def _fit(xy, weights):
     return fit_ellipse(xy, weights)
 
 
-def _fitted(xy, weights):
+def _fit_robustly(xy, weights):
     """Centre, its covariance, axes and angle of the ellipse; the worst points are left out once."""
     for _ in range(2):
         found = _fit(xy, weights)

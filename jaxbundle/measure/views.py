@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import numeric_array
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
@@ -28,7 +28,7 @@ SAME, ALIKE = 0.05, 0.8
 """Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
 the board. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, with no larger
 noise, does not determine the camera better either."""
-SEARCHED = 3
+MOST_SEARCHED = 3
 """Number of photographs searched for boards of other sizes: those without a board, if few
 have it, and the others, whether their board is a part of a larger one."""
 
@@ -38,7 +38,7 @@ HINT = "give --board"
 HINTS = (HINT, "give --dictionary")
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class BoardViews:
     """The measurements of a board: image points of every view, and failed photographs.
@@ -135,7 +135,7 @@ def measure_boards(
     if not files:
         raise InputError("no photographs are given")
     file_of = name_photographs(files)
-    repeated = _repeated(file_of)
+    repeated = _find_repeated(file_of)
     search = lambda name: repeated.get(name) or search_board(file_of[name], board)
     looks = {}
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -167,12 +167,12 @@ def collect_views(
     size = sizes.most_common(1)[0][0]
     for name, other, _ in found:
         if other != size:
-            turned = ": it was turned after it was taken" if other == size[::-1] else ""
+            turned = ": it was rotated after exposure" if other == size[::-1] else ""
             failed[name] = (
                 f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
             )
     used = [(name, xy) for name, other, xy in found if other == size]
-    failed |= _saved_again(used)
+    failed |= _find_saved_again(used)
     used = [(name, xy) for name, xy in used if name not in failed]
     order = {name: i for i, name in enumerate(file_of)}
     return BoardViews(
@@ -198,7 +198,7 @@ def search_alone(task: tuple[str | Path, Board]) -> Look:
     return search_board(*task)
 
 
-def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
+def _find_repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     """The files with the content of an earlier one, and the earlier one."""
     first: dict[bytes, str] = {}
     found = {}
@@ -213,7 +213,7 @@ def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     return found
 
 
-def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
+def _find_saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
     """Views with the same points as an earlier one: one photograph in another
     compression or format."""
     found: dict[str, str] = {}
@@ -243,7 +243,7 @@ def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
 def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
     """Reasons of some photographs without the board, with the size of another board in them."""
     sizes = {}
-    for name in list(failed)[:SEARCHED]:
+    for name in list(failed)[:MOST_SEARCHED]:
         try:
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
@@ -265,7 +265,7 @@ def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[st
     """A warning if most of some photographs show the same larger board; one may be wrong."""
     if board.kind != "chessboard":
         return ()
-    few = used[:SEARCHED]
+    few = used[:MOST_SEARCHED]
     sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in few)
     (other, times), *_ = sizes.most_common(1) or [(None, 0)]
     if other is None or times <= len(few) / 2:

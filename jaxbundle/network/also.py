@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.spaces import Posed
@@ -28,9 +28,9 @@ class InObjectSpace:
 
     def __call__(self, *blocks_and_measured):
         *blocks, measured = blocks_and_measured
-        return self.residual(*map(self._placed, self.of, blocks), measured)
+        return self.residual(*map(self._place, self.of, blocks), measured)
 
-    def _placed(self, table, block):
+    def _place(self, table, block):
         if table == "image":
             centre = tuple(c + o for c, o in zip(block.centre, self.origin))
             return Posed(block.rotation, centre)
@@ -51,7 +51,7 @@ def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Obser
         if not isinstance(item, Table | Observations):
             raise InputError(
                 "also: tables (leastsquares.Table) and observations (a Kind, called) are expected, "
-                f"but one is {shown(item)}"
+                f"but one is {show(item)}"
             )
     for table in tables:
         if table.name.split(",")[0] in OWN:

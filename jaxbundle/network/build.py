@@ -31,7 +31,7 @@ from jaxbundle.network.columns import (
     as_columns,
     did_you_mean,
     is_missing,
-    shown,
+    show,
 )
 from jaxbundle.network.further import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (
@@ -113,7 +113,7 @@ def make_network(
     for key, value in (("object_unit", object_unit), ("name", name)):
         text(key, value)
     if isinstance(datum_points, str) or not isinstance(datum_points, Iterable):
-        raise InputError(f"datum_points must be a list of ids, not {shown(datum_points)}")
+        raise InputError(f"datum_points must be a list of ids, not {show(datum_points)}")
 
     cameras = make_cameras(cameras)
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
@@ -208,7 +208,7 @@ def make_cameras(
     if isinstance(cameras, str | np.ndarray) or not isinstance(cameras, Iterable):
         raise InputError(
             f"{where}cameras: expected Camera objects, dict rows or a data frame of pandas, not "
-            f"{shown(cameras)}"
+            f"{show(cameras)}"
         )
     made = tuple(
         camera if isinstance(camera, Camera) else _camera(camera, number, where, models)
@@ -263,18 +263,18 @@ def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
     listed = lambda g: isinstance(g, Sequence) and not isinstance(g, str)
     if not listed(given) or not all(listed(g) and len(g) > 1 for g in given):
         raise InputError(
-            f'{where}tie is {shown(given)}; expected groups of names such as [["fx", "fy"]]'
+            f'{where}tie is {show(given)}; expected groups of names such as [["fx", "fy"]]'
         )
     return tuple(tuple(map(str, group)) for group in given)
 
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, NO_NUMBERS) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{where}{key} is {shown(value)}; a number is expected")
+        raise InputError(f"{where}{key} is {show(value)}; a number is expected")
     try:
         return float(value)
     except OverflowError:
-        raise InputError(f"{where}{key} is {shown(value)}; that is too large") from None
+        raise InputError(f"{where}{key} is {show(value)}; that is too large") from None
 
 
 def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:

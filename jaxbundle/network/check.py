@@ -11,7 +11,7 @@ from typing import SupportsIndex
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import count, did_you_mean, some
+from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.rules import (
     AXES,
@@ -142,7 +142,7 @@ def _check_cameras(network: Network) -> Network:
     )
     cameras = tuple(network.cameras[i] for i in used)
     return network.replace(cameras=cameras, images=images).warn(
-        f"left out {count(len(unused), 'camera')} without images: {some(unused)}"
+        f"left out {count(len(unused), 'camera')} without images: {list_some(unused)}"
     )
 
 
@@ -221,7 +221,7 @@ def _check_points(network: Network) -> Network:
 
 
 def _names(points: Points, mask) -> str:
-    return some(points.id[row] for row in np.flatnonzero(mask))
+    return list_some(points.id[row] for row in np.flatnonzero(mask))
 
 
 def _check_observations(network: Network) -> None:

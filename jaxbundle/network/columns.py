@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.arguments import refuse_traced
-from jaxbundle.arguments import shown as shown
+from jaxbundle.arguments import show as show
 from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
@@ -102,7 +102,7 @@ class Columns:
         if not good or isinstance(value, NO_NUMBERS):
             or_word = "".join(f" or {word!r}" for word in words)
             raise InputError(
-                f"{self.source(row)}: {name} is {shown(value)}; a number{or_word} is expected"
+                f"{self.source(row)}: {name} is {show(value)}; a number{or_word} is expected"
             )
         return number
 
@@ -139,7 +139,7 @@ def as_columns(table: Any, name: str) -> Columns:
     if not all(isinstance(row, Mapping) for row in rows):
         raise InputError(
             f"{name}: expected a data frame of pandas, a dict of columns, or a list of dict rows, "
-            f"not {shown(table)}"
+            f"not {show(table)}"
         )
     refuse_traced(name, rows)
     keys = dict.fromkeys(str(key) for row in rows for key in row)
@@ -162,7 +162,7 @@ def _column(values: Any, column: str, name: str) -> Column:
     """Values of a column; None where an array is masked."""
     refuse_traced(f"{name}: column {column!r}", values)
     if isinstance(values, str) or not isinstance(values, Iterable):
-        raise InputError(f"{name}: column {column!r} must be a sequence, not {shown(values)}")
+        raise InputError(f"{name}: column {column!r} must be a sequence, not {show(values)}")
     shape = tuple(getattr(values, "shape", (0,)))
     if len(shape) != 1:
         raise InputError(
@@ -193,12 +193,12 @@ def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> st
     return f"; known: {', '.join(known)}" if listing and known else ""
 
 
-def quoted(name: Any) -> str:
+def quote(name: Any) -> str:
     """A name in quotes."""
     return repr(str(name))
 
 
-def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quoted) -> str:
+def list_some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quote) -> str:
     """The first few names of a list, and the number of others."""
     names = list(names)
     text = ", ".join(map(as_text, names[:most]))

@@ -19,10 +19,10 @@ from jaxbundle.cameras import get_model
 from jaxbundle.geometry.rotations import quaternion_from_omega_phi_kappa
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.rows import Data as EngineData
 from jaxbundle.leastsquares.indexing.rows import Values as Tables
-from jaxbundle.leastsquares.problem import observed_weights
+from jaxbundle.leastsquares.problem import weights_of
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
@@ -213,12 +213,12 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     declared = [f.among(network).declare(network, origin) for f in taking_part]
     further += [table for one in declared for table in one.tables]
     tables += further
-    others = [place(one, origin).resolved(tables) for one in others]
+    others = [place(one, origin).resolve_labels(tables) for one in others]
     others += [one for of_kind in declared for one in of_kind.observations]
     similarity = kinds.SIMILARITY if lengths is None else kinds.SIMILARITY_AT_ANY_DISTANCE
     actions = (*similarity.actions, *(action for one in declared for action in one.actions))
     start = dataclasses.replace(start, other={t.name: t.value for t in further})
-    weights = observed_weights(tables, others)
+    weights = weights_of(tables, others)
     data = dataclasses.replace(
         data, start=start, other=tuple((one.measured, w) for one, w in zip(others, weights))
     )
@@ -278,7 +278,7 @@ def order_cameras(network: Network) -> Network:
 
 def _quaternions(angles):
     """Rotations, by a program shared by small networks."""
-    wide = np.resize(angles, (max(rounded(len(angles)), LEAST_IMAGES), 3))
+    wide = np.resize(angles, (max(round_up(len(angles)), LEAST_IMAGES), 3))
     return np.asarray(_quaternions_of(wide))[: len(angles)]
 
 

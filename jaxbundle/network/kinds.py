@@ -52,7 +52,7 @@ class ColumnsOfImagePoint:
     def __call__(self, *touched):
         *poses, p, ray, _ = touched
         model = cameras.get_model(self.model)
-        return present(model.local).columns(p, *model.ideal(p, *_seen(poses, ray)))
+        return present(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,12 +64,12 @@ class LocalImagePoint:
     def __call__(self, *touched):
         *poses, p, ray, columns, values, xy = touched
         model = cameras.get_model(self.model)
-        at = model.ideal(p, *_seen(poses, ray))
+        at = model.ideal(p, *_transform_ray(poses, ray))
         x, y = present(model.local).distort(p, columns, values, *at)
         return x - xy[0], y - xy[1]
 
 
-def _seen(poses, ray):
+def _transform_ray(poses, ray):
     for pose in poses:
         ray = pose.ray(ray)
     return ray
@@ -93,7 +93,7 @@ def image_points(
     moving: bool = False,
 ) -> Kind:  # fmt: skip
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
-    "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: of
+    "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
     cameras with a rolling shutter."""
     between = (VELOCITIES, READ_OUT) if moving else ()
     of = (*poses, *between, camera, "point")

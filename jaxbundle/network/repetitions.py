@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network
 
-LEAST = 3
+FEWEST_EQUAL = 3
 """Number of exactly equal image points for an image to repeat another; of images for a point."""
 
 
@@ -27,7 +27,7 @@ def warn_of_repetitions(network: Network) -> Network:
     ):
         pairs = _repetitions(of, by, rays.xy)
         if pairs:
-            names = some((f"{ids[b]!r} repeats {ids[a]!r}" for a, b in pairs), 5, str)
+            names = list_some((f"{ids[b]!r} repeats {ids[a]!r}" for a, b in pairs), 5, str)
             network = network.warn(
                 f"{count(len(pairs), thing)} with the same measurements as another: {names}; "
                 f"{remedy} They count twice: remove one"
@@ -49,7 +49,7 @@ def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     total, number = np.add.reduceat(mixed[order], first), np.diff(np.append(first, len(of)))
     _, group, size = np.unique(total, return_inverse=True, return_counts=True)
-    candidates = of[order[first]][(size[group] > 1) & (number >= LEAST)]
+    candidates = of[order[first]][(size[group] > 1) & (number >= FEWEST_EQUAL)]
     rows = np.flatnonzero(np.isin(of, candidates))
     rows = rows[np.lexsort((by[rows], of[rows]))]
     known, found = {}, []

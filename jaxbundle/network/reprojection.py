@@ -20,7 +20,7 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
 from jaxbundle.system.programs import compile_once
 
-AT_ONCE = 4096
+POINTS_AT_ONCE = 4096
 """Batch size of image points: all networks share one program per camera model."""
 
 
@@ -55,15 +55,15 @@ def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
     images, rays = network.images, network.observations
     found = np.zeros((len(rows), 2))
     with local_x64():
-        for first in range(0, len(rows), AT_ONCE):
-            mine = rows[first : first + AT_ONCE]
-            all = np.pad(mine, (0, AT_ONCE - len(mine)), mode="edge")
+        for first in range(0, len(rows), POINTS_AT_ONCE):
+            mine = rows[first : first + POINTS_AT_ONCE]
+            all = np.pad(mine, (0, POINTS_AT_ONCE - len(mine)), mode="edge")
             image = rays.image[all]
             part = _portion(
                 model, values[images.camera[image]], images.position[image], images.angles[image],
                 network.points.position[rays.point[all]],
             )  # fmt: skip
-            found[first : first + AT_ONCE] = np.asarray(part)[: len(mine)]
+            found[first : first + POINTS_AT_ONCE] = np.asarray(part)[: len(mine)]
     return found
 
 

@@ -18,7 +18,7 @@ from jaxbundle.cameras import (
     is_own,
 )
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
@@ -57,7 +57,7 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
     if not isinstance(model, CameraModel) and not is_known(model):
         known = did_you_mean(model, (*MODEL_NAMES, *FAMILIES))
         raise InputError(
-            f"{where}unknown {'' if where else 'camera '}model {shown(model)}{known}"
+            f"{where}unknown {'' if where else 'camera '}model {show(model)}{known}"
             f"{'' if known.endswith('?') else ';'} pass your own as a CameraModel, for a "
         "file that names it by read_network(path, models=[…])"
         )
@@ -122,17 +122,17 @@ def check_camera(camera: Camera, where: str = "") -> None:
 def _check_fields(camera: Camera, where: str) -> None:
     """Refuse fields that are not numbers by name, names, or groups of names."""
     if not isinstance(camera.model, str | CameraModel):
-        raise InputError(f"{where}model is {shown(camera.model)}; expected a name or a CameraModel")
+        raise InputError(f"{where}model is {show(camera.model)}; expected a name or a CameraModel")
     for field in ("parameters", "sigma"):
         given = getattr(camera, field)
         if not isinstance(given, Mapping):
-            raise InputError(f"{where}{field} is {shown(given)}; expected numbers by name, such as "
+            raise InputError(f"{where}{field} is {show(given)}; expected numbers by name, such as "
                              "{'c': 20.0}")  # fmt: skip
     if not _are_names(camera.free):
-        raise InputError(f"{where}free is {shown(camera.free)}; expected names of parameters, such "
+        raise InputError(f"{where}free is {show(camera.free)}; expected names of parameters, such "
                          "as ('c', 'x0')")  # fmt: skip
     if not isinstance(camera.tie, list | tuple) or not all(map(_are_names, camera.tie)):
-        raise InputError(f"{where}tie is {shown(camera.tie)}; expected groups of names, such as "
+        raise InputError(f"{where}tie is {show(camera.tie)}; expected groups of names, such as "
                          "[('fx', 'fy')]")  # fmt: skip
 
 
@@ -160,15 +160,15 @@ def _check_ties(camera: Camera, values, where: str) -> None:
 def _check_pair(where, name, pair, meaning):
     numbers = np.shape(pair) == (2,) and not isinstance(pair, str | np.ma.MaskedArray)
     if pair is not None and not (numbers and all(map(_positive, pair))):
-        raise InputError(f"{where}{name} is {shown(pair)}; expected {meaning}, both positive")
+        raise InputError(f"{where}{name} is {show(pair)}; expected {meaning}, both positive")
 
 
 def check_sigma_image(sigma: float, where: str = "") -> None:
     """Refuse a default σ of image coordinates that is not finite and positive."""
     if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
-        raise InputError(f"{where}sigma_image is {shown(sigma)}; a number is expected")
+        raise InputError(f"{where}sigma_image is {show(sigma)}; a number is expected")
     if not _positive(sigma):
-        raise InputError(f"{where}sigma_image is {shown(sigma)}; it must be finite and positive")
+        raise InputError(f"{where}sigma_image is {show(sigma)}; it must be finite and positive")
 
 
 def _positive(value) -> bool:

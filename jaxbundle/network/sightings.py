@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further.base import among, rows_of
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
@@ -78,7 +78,7 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
     return dataclasses.replace(points, role=roles)
 
 
-def controlled_axes(points: Points):
+def count_controlled_axes(points: Points):
     """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
     axes = np.isfinite(points.sigma).sum(1)
     return np.where(
@@ -102,7 +102,7 @@ def leave_out_undetermined(network: Network) -> Network:
     points, distances = network.points, network.distances
     fixed, check = points.has_role("fixed"), points.has_role("check")
     rays = np.bincount(network.observations.point, minlength=len(points))
-    known = controlled_axes(points) + equations_of(network, "POINTS")
+    known = count_controlled_axes(points) + equations_of(network, "POINTS")
     keep = np.ones(len(points), bool)
     while True:
         ends = distances.points[keep[distances.points].all(1)]
@@ -115,7 +115,7 @@ def leave_out_undetermined(network: Network) -> Network:
     out = ~keep
     messages = [
         f"left out {count(mask.sum(), thing)} {why}: "
-        f"{some(points.id[row] for row in np.flatnonzero(mask))}"
+        f"{list_some(points.id[row] for row in np.flatnonzero(mask))}"
         for mask, thing, why in (
             (out & ~check & (rays == 0), "point", "without any ray"),
             (out & ~check & (rays > 0), "tie point", "with a single ray"),
@@ -161,7 +161,8 @@ def check_images(before: Network, network: Network) -> None:
             raise NotSolvedError(
                 f"{place}not solved: it shares too few points with other images, so that neither "
                 f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-                f"{some(lone)} can be determined; add images of the same points, or control points",
+                f"{list_some(lone)} can be determined; add images of the same points, or "
+                "control points",
                 [f"{name} of image {images.id[row]}" for name in EXTERIOR]
                 + [f"X, Y, Z of point {id}" for id in lone],
             )
@@ -176,9 +177,9 @@ def check_images(before: Network, network: Network) -> None:
 def check_parts(network: Network) -> None:
     """Refuse parts of the network that are neither connected nor positioned."""
     images, points, rays = network.images, network.points, network.observations
-    known = controlled_axes(points) == 3
+    known = count_controlled_axes(points) == 3
     ties = ~(known | points.has_role("check"))[rays.point]
-    part = connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
+    part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
         return
@@ -194,12 +195,12 @@ def check_parts(network: Network) -> None:
         raise InputError(
             f"{images.source.name}: the network consists of {len(labels)} parts without common tie "
             f"points, and one part has only {count(known_points[smallest], 'known point')}: "
-            f"{count(len(names), 'image')} {some(names)}; measure common points, or at least 3 "
-            "control points in it"
+            f"{count(len(names), 'image')} {list_some(names)}; measure common points, or at least "
+            "3 control points in it"
         )
 
 
-def connected_parts(image, point, images: int, points: int):
+def label_connected_parts(image, point, images: int, points: int):
     """A label for each image; images that share points, directly or in a chain, have the same.
 
     Smallest labels travel along the rays, with hooking and halving, so that a strip of n images
@@ -239,7 +240,7 @@ def check_redundancy(network: Network) -> None:
     )  # fmt: skip
     conditions = 0
     if network.datum != "control":
-        known = controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
+        known = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
         conditions = max(0, 7 - known - (len(network.distances) > 0))
     missing = unknowns - rows - conditions
     if missing > 0:

@@ -11,7 +11,7 @@ from jaxbundle.network.tables import Network
 
 ON_A_LINE = 1e-7
 """Relative distances from a line that count as zero."""
-WEAK = 1.0
+LARGEST_ROLL_SIGMA = 1.0
 """Degrees: a larger σ of the roll is reported."""
 REMEDY = (
     "give a control point beside the strip, a σ of omega or phi, or photographs of a crossing strip"
@@ -44,7 +44,7 @@ def check_single_strip(network: Network) -> Network:
         )
     spread = float(np.sqrt((off**2).sum()))
     roll = float(np.degrees(np.sqrt(np.mean(sigma[given] ** 2)) / spread))
-    if roll > WEAK:
+    if roll > LARGEST_ROLL_SIGMA:
         return network.warn(
             f"{where} but for {off.max():.2g} {network.object_unit}: the rotation about the axis "
             f"of the strip (its roll) is known only to about {roll:.2g}°; {REMEDY}"

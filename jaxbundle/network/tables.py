@@ -20,9 +20,9 @@ from typing import Any, SupportsIndex
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel, get_model, key_of
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 
 ROLES = ("tie", "control", "fixed", "check")
@@ -98,7 +98,7 @@ def _fill_masked(table: Any) -> None:
         object.__setattr__(table, field.name, filled)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Images:
     """Exposures with the start values of their exterior orientation."""
@@ -123,7 +123,7 @@ class Images:
         )  # fmt: skip
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Points:
     """Object points: role, coordinates (start values, given values) and σ."""
@@ -151,7 +151,7 @@ class Points:
         return np.isin(np.array(self.role, dtype=object), roles)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Observations:
     """Measured image points: image, point, coordinates, σ."""
@@ -174,7 +174,7 @@ class Observations:
         )
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Distances:
     """Measured distances between two points, in the object unit."""
@@ -194,7 +194,7 @@ class Distances:
         return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Network:
     """A photogrammetric network: the complete input of an adjustment, checked before use.
@@ -247,5 +247,5 @@ def require_network(network: Network, name: str = "network") -> Network:
     remedy = f"jaxbundle.read_network({os.fspath(network)!r})" if is_path else (
         "use jaxbundle.read_network(path), make_network or simulate"
     )
-    raise InputError(f"{name} must be a Network, but is {shown(network)}: {remedy}"
+    raise InputError(f"{name} must be a Network, but is {show(network)}: {remedy}"
                      + " reads it" * is_path)  # fmt: skip

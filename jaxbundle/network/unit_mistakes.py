@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 
-WIDEST = 10.0
+LARGEST_RADIUS = 10.0
 """Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
 FIELDS = (0.02, 5.0)
 """Common range of r/c, used only to check a remedy."""
@@ -29,7 +29,7 @@ LEAST_PIXELS = 300.0
 """No camera has a c of fewer pixels."""
 HALF_OF_POINTS = 1 / 3
 """Width of an image evenly filled from whose centre half of its points lie (sides 3 : 2)."""
-THOUSAND = (300.0, 3000.0)
+MILLIMETRE_RATIOS = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
 
@@ -55,11 +55,12 @@ def _check_field(camera: Camera, xy) -> str:
     point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
     usual = float(np.median(np.hypot(*(xy - point).T)))
     size = camera.pixel_size
-    if usual > WIDEST * c:
+    if usual > LARGEST_RADIUS * c:
         raise InputError(
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
             f"more than {usual:.4g} {model.unit} from the principal point, "
-            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens shows that. "
+            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens has such a field of "
+            "view. "
             f"{_remedy(camera, model.unit, name, c, usual)}"
         )
     if size is not None and max(size) < FINE and usual < NARROW * c:
@@ -158,12 +159,12 @@ def _distances_against_control(network: Network) -> str:
     if not off:
         return ""
     return (
-        f"distances a thousand times those of the control points, or a thousandth: {some(off)}; "
-        f"are they in {network.object_unit}, like the control points?"
+        f"distances a thousand times those of the control points, or a thousandth: "
+        f"{list_some(off)}; are they in {network.object_unit}, like the control points?"
     )
 
 
 def _thousand(a: float, b: float) -> bool:
     if not min(a, b) > 0:
         return False
-    return THOUSAND[0] < max(a / b, b / a) < THOUSAND[1]
+    return MILLIMETRE_RATIOS[0] < max(a / b, b / a) < MILLIMETRE_RATIOS[1]

@@ -111,15 +111,15 @@ def _pixel_grid(camera: Camera):
     model = get_model(camera.model)
     centred = (model.unit, model.axes) == ("px", "up")
     if camera.pixel_size is None:
-        raise _needed(camera, "pixel_size", "[width, height] in mm")
+        raise _require_size(camera, "pixel_size", "[width, height] in mm")
     if centred:
         return np.zeros(2), np.array(camera.pixel_size)
     if camera.image_size is None:
-        raise _needed(camera, "image_size", "[columns, rows]")
+        raise _require_size(camera, "image_size", "[columns, rows]")
     return _grid(camera.image_size, camera.pixel_size)
 
 
-def _needed(camera, name, meaning):
+def _require_size(camera, name, meaning):
     return InputError(
         f"camera {camera.id!r}: {name} is needed to convert between pixels and mm; "
         f"give {name} = {meaning}"

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.unknowns import named, value_of
+from jaxbundle.adjustment.unknowns import find_unknowns, value_of
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import AIMS
 from jaxbundle.errors import InputError
@@ -74,7 +74,7 @@ class Aim:
         if isinstance(self.of, str):
             one_of("aim: of", self.of, ("points", "cameras"))
         elif not callable(self.of) and not len(self.of):
-            raise InputError("aim: of names nothing; give names, \"points\" or \"cameras\"")
+            raise InputError("aim: no names; give names, \"points\" or \"cameras\"")
 
     @property
     def convex(self) -> bool:
@@ -95,7 +95,7 @@ def functions_of(problem: Problem, aim: Aim) -> Functions | None:
 
     **Raises:** `InputError` if no camera has a free parameter, `KeyError` for unknown names."""
     of = aim.of
-    if aim.measure != "reliability" and of == "points" and not of_interest(problem).any():
+    if aim.measure != "reliability" and of == "points" and not points_of_interest(problem).any():
         raise InputError("aim: all points are held, and their σ is 0; aim at the cameras")
     if aim.measure == "reliability" or of == "points":
         return None
@@ -111,11 +111,11 @@ def functions_of(problem: Problem, aim: Aim) -> Functions | None:
                 f"aim: the {aim.measure} σ of camera parameters of different units; choose the "
                 "determinant, or name one parameter"
             )
-    wanted = named(problem, of)
+    wanted = find_unknowns(problem, of)
     return lambda values: jnp.stack([value_of(problem, name, values) for name in wanted])
 
 
-def of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
+def points_of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
     """The points of the aim: tie points, or if there are none all that are not held."""
     points = problem.network.points
     tie = points.has_role("tie")
@@ -143,11 +143,11 @@ def task_of(problem: Problem, aim: Aim) -> Task:
     problem = problem.with_factor()
     system, functions = problem.system, functions_of(problem, aim)
     if problem.reduction not in FACTORS:
-        raise InputError("design: the network is too large for its covariance; take part of it")
+        raise InputError("design: the network is too large for its covariance; use a part of it")
     of = None
     if functions is not None:
         of = lambda tables: functions(problem.layout.values(without_filling(system, tables)))
-    rows = of_interest(problem)
+    rows = points_of_interest(problem)
     mask = np.zeros(system.sizes["table", "point"])
     mask[: len(rows)] = rows
     index = np.asarray(AIMS.index(aim.measure))

@@ -10,15 +10,15 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, shown
-from jaxbundle.display import shows_itself
+from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, show
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.types import Numbers
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Conditions:
     """Conditions of stations and rays; lengths in the object unit, angles in radians.
@@ -91,7 +91,7 @@ def box(name: str, given) -> Box:
     **Raises:** `InputError`."""
     corners = numeric_array(name, given, "two corners X, Y, Z").astype(float)
     if corners.shape != (2, 3) or not np.isfinite(corners).all():
-        raise InputError(f"{name}: two corners X, Y, Z are expected, but given is {shown(given)}")
+        raise InputError(f"{name}: two corners X, Y, Z are expected, but given is {show(given)}")
     if not (corners[0] < corners[1]).all():
         raise InputError(
             f"{name}: the box from {corners[0].tolist()} to {corners[1].tolist()} is empty; the "
@@ -109,7 +109,7 @@ def interval(name: str, given) -> tuple[float, float]:
     if ends.shape != (2,) or not (0 <= ends[0] < ends[1]):
         raise InputError(
             f"{name}: a smallest and a larger largest length are expected, but given is "
-            f"{shown(given)}"
+            f"{show(given)}"
         )
     return float(ends[0]), float(ends[1])
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.arguments import one_of, positive, shown, whole
+from jaxbundle.arguments import integer, one_of, positive, show
 from jaxbundle.choices import DESIGNED, ORDERS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
@@ -35,7 +35,7 @@ from jaxbundle.network_design.feasible import (
 from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs, make_pairs
 from jaxbundle.network_design.realise import problem_of, realise
 from jaxbundle.network_design.result import Design, State
-from jaxbundle.network_design.search import Step, configuration, kept, make_program, search
+from jaxbundle.network_design.search import Step, configuration, make_program, satisfies, search
 from jaxbundle.network_design.variables import Start, bounds, choose_variables
 from jaxbundle.network_design.weights import select
 
@@ -43,7 +43,7 @@ ROLLED = 0.1
 """Random initial roll, radians, since zero roll is often a saddle point."""
 CANDIDATES, REFINED = 48, 2
 """Number of positions tried for a further photograph, and of the best ones refined."""
-ROUGH = 0.1
+ROUGH_SOFTNESS = 0.1
 """Softness of the conditions in this comparison."""
 
 
@@ -87,17 +87,17 @@ def design(
     one_of("order", order, tuple(ORDERS))
     aim = aim if isinstance(aim, Aim) else Aim(aim)
     if conditions is not None and not isinstance(conditions, Conditions):
-        raise InputError(f"conditions must be Conditions, but is {shown(conditions)}")
+        raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
     network = split_check_points(require_network(network))[0]
     sigma = _sigma(network, sigma_image)
-    whole("starts", starts)
+    integer("starts", starts)
     if order == "zero":
         return _design_datum(network, aim, conditions, sigma, seed)
     if order == "second":
         return _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed)
     if order == "third":
-        more = 1 if photographs is None else whole("photographs", photographs)
+        more = 1 if photographs is None else integer("photographs", photographs)
         return _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed)
     if photographs is not None:
         raise InputError("photographs: their number is designed by order \"second\" or \"third\"")
@@ -125,14 +125,14 @@ def _design_configuration(
         begin = _roll(start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
                         variables, seed + attempt)  # fmt: skip
         end, steps, done = search(pairs, variables, begin, program, ends, max_iterations)
-        if not kept(conditions, variables, pairs.problem.origin, end):
+        if not satisfies(conditions, variables, pairs.problem.origin, end):
             continue
         after = _state(pairs, network, end.values, seed)
         if best is None or _better(after, best):
             best, path, converged = after, steps, done
     if best is None:
         raise NotSolvedError(
-            "design: the stations cannot be brought to keep their conditions (apart, obstacles); "
+            "design: the stations cannot satisfy their conditions (apart, obstacles); "
             "give a larger room, or more starts"
         )
     best = before if _better(before, best) and _keeps(conditions, pairs, variables, start) else best
@@ -142,7 +142,7 @@ def _design_configuration(
 
 def _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed) -> Design:
     if photographs is None:
-        raise InputError("photographs: order \"second\" needs how many of the candidates are taken")
+        raise InputError("photographs: order \"second\" needs the number of candidates to select")
     candidates = network.images.id
     pairs = make_pairs(network, aim, conditions, sigma)
     values = start_at(pairs).values
@@ -158,7 +158,7 @@ def _design_weights(network, aim, conditions, sigma, photographs, max_iterations
         raise InputError(f"targets {', '.join(lost[:10])}: fewer than two of the candidates see "
                          "them; give further candidates, or leave these targets out")  # fmt: skip
     before = _state(pairs, network, values, seed)
-    found = select(pairs, whole("photographs", photographs), max_iterations)
+    found = select(pairs, integer("photographs", photographs), max_iterations)
     ids = network.images.id
     taken = pairs.measured(values) & found.chosen[pairs.problem.image]
     after = _state(pairs, network, values, seed, taken)
@@ -203,19 +203,19 @@ def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
     program = make_program(pairs, configuration(pairs, variables))
     position, rotation, target = try_stations(pairs, CANDIDATES, seed)
     begins = [_place(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
-    aims = np.array([program(variables.vector(s), s, ROUGH)[0] for s in begins])
+    aims = np.array([program(variables.vector(s), s, ROUGH_SOFTNESS)[0] for s in begins])
     boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
     best = None
     for k in np.argsort(aims)[:REFINED]:
         end, steps, done = search(pairs, variables, begins[k], program, ends, max_iterations)
         value = program(variables.vector(end), end, 0.03)[0]
-        if kept(pairs.conditions, variables, pairs.problem.origin, end) and (
+        if satisfies(pairs.conditions, variables, pairs.problem.origin, end) and (
             best is None or value < best[0]
         ):
             best = value, end, steps, done
     if best is None:
-        raise NotSolvedError("design: no place for a further photograph keeps the conditions")
+        raise NotSolvedError("design: no place for a further photograph satisfies the conditions")
     return *best[1:], (position + pairs.problem.origin, np.exp(aims))
 
 
@@ -264,7 +264,7 @@ def _keeps(conditions, pairs, variables, start) -> bool:
     """Whether the start satisfies the conditions of stations."""
     low, high = room_of(conditions, pairs)
     inside = ((start.values.position >= low) & (start.values.position <= high)).all()
-    return bool(inside) and kept(conditions, variables, pairs.problem.origin, start)
+    return bool(inside) and satisfies(conditions, variables, pairs.problem.origin, start)
 
 
 def _require_determined(state: State) -> None:
@@ -332,6 +332,6 @@ def _sigma(network: Network, given: float | None) -> float:
         return positive("sigma_image", given)
     sigma = network.observations.sigma
     if not len(sigma) or not np.isfinite(sigma).any():
-        raise InputError("sigma_image: the network has no image points; say how well they will be "
-                         "measured")  # fmt: skip
+        raise InputError("sigma_image: the network has no image points; give the σ they will "
+                         "have")  # fmt: skip
     return float(np.nanmedian(sigma))

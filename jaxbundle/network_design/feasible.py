@@ -10,15 +10,15 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.pairs import FEWEST_RAYS, Pairs
-from jaxbundle.network_design.variables import Start, looked_at, turned
+from jaxbundle.network_design.variables import Start, points_on_axes, turn_axis
 from jaxbundle.network_design.visibility import margins, visible
 
-TRIED = 1024
+TRIAL_POSITIONS = 1024
 """Trial positions in the room."""
-REACH = 3.0
+LARGEST_DISTANCE = 3.0
 """Without a room, the limit of the distance of stations, relative to the largest at the start."""
 
 
@@ -29,7 +29,7 @@ def room_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
     start = pairs.problem.data.start
     middle = np.asarray(start.point).mean(0)
     reach = np.linalg.norm(np.asarray(start.position) - middle, axis=1).max()
-    return middle + REACH * reach * np.array([[-1.0] * 3, [1.0] * 3])
+    return middle + LARGEST_DISTANCE * reach * np.array([[-1.0] * 3, [1.0] * 3])
 
 
 def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
@@ -40,7 +40,7 @@ def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]
     return np.stack([points.min(0), points.max(0)])
 
 
-_turned = jax.jit(jax.vmap(turned))
+_turned = jax.jit(jax.vmap(turn_axis))
 
 
 def try_stations(
@@ -63,7 +63,7 @@ def try_stations(
     return position, np.asarray(_turned(upright, away)), targets
 
 
-def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
+def check_feasible(pairs: Pairs, tried: int = TRIAL_POSITIONS) -> None:
     """Refuse conditions that no station satisfies, and targets visible from none.
 
     **Raises:** `InputError` naming the condition, or the targets."""
@@ -73,7 +73,7 @@ def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
     rotation = np.concatenate([rotation, start.rotation])
     found = {}
     for c in range(len(pairs.views)):
-        seen = _seen(pairs, c, start, position, rotation)
+        seen = _test_conditions(pairs, c, start, position, rotation)
         for name, rows in seen.items():
             found[name] = found.get(name, False) | rows
         both = np.logical_and.reduce(list(seen.values()))
@@ -89,8 +89,8 @@ def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
         ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
         raise InputError(
             f"conditions: {len(ids)} of {len(interest)} targets cannot be measured from any place "
-            f"in the room ({len(position)} tried): {some(ids)}. Widen the conditions, or leave "
-            "these targets out"
+            f"in the room ({len(position)} tried): {list_some(ids)}. Widen the conditions, or "
+            "leave these targets out"
         )
 
 
@@ -112,7 +112,7 @@ def _why(found, tried: int) -> str:
     return (f"conditions: no station can satisfy {names} together for any target {places}{hint}")
 
 
-def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
+def _test_conditions(pairs: Pairs, c: int, start: Values, position, rotation):
     """Which conditions the stations of a camera satisfy, [stations, points] each."""
     view = pairs.views[c]
     interior = jnp.asarray(start.camera)[c, : len(view.model.parameters)]
@@ -130,7 +130,7 @@ def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
 def start_at(pairs: Pairs) -> Start:
     """The start configuration."""
     values = jax.tree.map(np.asarray, pairs.problem.data.start)
-    return Start(values, looked_at(values))
+    return Start(values, points_on_axes(values))
 
 
 def lost_targets(pairs: Pairs, measured) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from jaxbundle.network_design.aims import (
     Aim,
     Task,
     log_aim,
-    of_interest,
+    points_of_interest,
     refuse_arbitrary,
     task_of,
 )
@@ -104,7 +104,7 @@ class Pairs:
     def data(self, values: Values, weight: Float[AnyArray, " rays"]) -> EngineData:
         """The numbers of the design, padded to the sizes of the plan: weights are 1/σ times
         `weight`, image coordinates those of the values."""
-        xy, data = self.predicted(values), self.problem.data
+        xy, data = self.predict(values), self.problem.data
         weight = jnp.asarray(data.image_weight) * jnp.asarray(weight)[:, None]
         at = lambda d: (d.start, d.image_xy, d.image_weight)
         data = eqx.tree_at(at, data, (values, xy, weight))
@@ -116,11 +116,11 @@ class Pairs:
         image = self.problem.image
         rays = np.bincount(image[measured], minlength=len(self.problem.network.images))
         weight = np.where(rays[image] < FEWEST_TARGETS, IDLE, np.asarray(measured, float))
-        data = self._filled(values, weight)
+        data = self._fill(values, weight)
         return float(jnp.exp(log_aim(self.task, data)[0]))
 
     @cached_property
-    def _filled(self):
+    def _fill(self):
         return jax.jit(self.data)
 
     def seen(self, values: Values) -> dict[str, Bool[np.ndarray, " rays"]]:
@@ -135,7 +135,7 @@ class Pairs:
         return jax.jit(lambda values: self.each_ray(one, values))
 
     @cached_property
-    def predicted(self):
+    def predict(self):
         """The image coordinates of all rays at given values, [rays, 2]."""
         one = lambda view, p, q, interior, X, n: image_of(view, p, q, interior, X)
         return jax.jit(lambda values: self.each_ray(one, values))
@@ -177,7 +177,7 @@ def make_pairs(
         problem, aim, task_of(problem, aim), conditions, kept.ravel(),
         views=tuple(view_of(c, conditions.edge) for c in problem.network.cameras),
         rules=rules_of(conditions, problem.origin), normals=conditions.of_points(len(points)),
-        interest=of_interest(problem),
+        interest=points_of_interest(problem),
     )  # fmt: skip
 
 
@@ -197,7 +197,7 @@ def _refuse(network: Network) -> None:
     if network.further:
         raise InputError(
             f"{network.further[0].source.name}: a design uses image points, distances, control "
-            "points and priors; leave the other observations out"
+            "points and priors; omit the other observations"
         )
     if len(network.points) < 3 or len(network.images) < 1:
         raise InputError("a design needs three targets and a station to start from")

@@ -11,19 +11,19 @@ import dataclasses
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.arguments import whole
-from jaxbundle.display import shows_itself
+from jaxbundle.arguments import integer
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, of_interest
+from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, points_of_interest
 
 FIELDS = ("image", "control", "exterior", "interior", "distance")
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Proof:
     """The predicted aim, and that from `draws` adjustments of simulated measurements."""
@@ -63,10 +63,10 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     **Arguments:** `problem`: its start values are the truth.
 
     **Raises:** `NotSolvedError` if no draw can be adjusted."""
-    draws = whole("draws", draws, least=2, most=100_000)
+    draws = integer("draws", draws, least=2, most=100_000)
     truth, exact = problem.data.start, problem.data
     functions = functions_of(problem, aim)
-    interest = np.flatnonzero(of_interest(problem))
+    interest = np.flatnonzero(points_of_interest(problem))
     of = _points_of(interest) if functions is None else lambda values: functions(values)[None]
     random = np.random.default_rng(seed)
     found = []

@@ -36,7 +36,7 @@ def realise(
     )  # fmt: skip
     points = dataclasses.replace(network.points, position=np.asarray(values.point) + origin)
     rays = network.observations
-    xy = np.asarray(pairs.predicted(values))
+    xy = np.asarray(pairs.predict(values))
     if seed is not None:
         noise = np.random.default_rng(seed).standard_normal(xy.shape)
         xy = np.where(pairs.soft[:, None], xy + rays.sigma * noise, rays.xy)

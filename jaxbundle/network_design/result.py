@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.choices import ORDERS
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network_design.aims import Aim, smallest_redundancy
 from jaxbundle.network_design.conditions import Conditions
@@ -31,7 +31,8 @@ class State:
 
     @cached_property
     def smallest_redundancy(self) -> float:
-        """Of an image coordinate; NaN if the network cannot be adjusted."""
+        """The smallest redundancy number of an image coordinate; NaN if the network cannot be
+        adjusted."""
         problem = problem_of(self.exact)
         return np.nan if problem is None else smallest_redundancy(problem)
 
@@ -46,7 +47,7 @@ class State:
         return len(self.network.images)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Design:
     """A designed network.
@@ -141,13 +142,13 @@ class Design:
             yield "gain: none; the start is as good as any found"
         for name, state in (("before", self.before), ("after", self.after)):
             if state.lost:
-                yield (f"{name}: {len(state.lost)} targets have fewer than two rays and take no "
-                       f"part: {some(state.lost)}")  # fmt: skip
+                yield (f"{name}: {len(state.lost)} targets have fewer than two rays and are "
+                       f"excluded: {list_some(state.lost)}")  # fmt: skip
         if self.bound:
             yield (f"no {self.after.photographs} photographs of these have an aim below "
                    f"{self.bound:.4g} ({100 * (self.after.aim / self.bound - 1):.2g} % less)")
         if self.dropped:
-            yield f"not needed: {some(self.dropped)}"
+            yield f"not needed: {list_some(self.dropped)}"
         for id in self.added:
             images = self.after.network.images
             X0 = images.position[images.id.index(id)]

@@ -25,11 +25,11 @@ from jaxbundle.types import AnyArray
 
 ROUNDS = (0.3, 0.1, 0.03)
 """Softness of the conditions."""
-WORST = 1e3
+UNDETERMINED_AIM = 1e3
 """The logarithm of an undetermined aim."""
-SETTLED = 1e-4
+SMALLEST_CHANGE = 1e-4
 """A change of the logarithm of the aim that ends a round."""
-ROUNDED = 20.0
+EDGE_ROUNDING = 20.0
 """Edges of obstacles are rounded to 1/20 of their half size for projection centres."""
 
 
@@ -64,7 +64,7 @@ def make_program(
         value, slopes = log_aim(pairs.task, forward(x, given))
         slope = np.asarray(back(x, given, slopes))
         if not (np.isfinite(value) and np.isfinite(slope).all()):
-            return WORST, np.zeros(len(x))
+            return UNDETERMINED_AIM, np.zeros(len(x))
         return float(value), slope
 
     return program
@@ -89,7 +89,7 @@ def station_margins(
         return None
     boxes = np.array(conditions.obstacles).reshape(-1, 2, 3) - origin
     middle, half = boxes.mean(1), (boxes[:, 1] - boxes[:, 0]) / 2
-    sharp = ROUNDED / half.mean(1)
+    sharp = EDGE_ROUNDING / half.mean(1)
 
     def margins(x, start):
         position = variables.place(start, x).values.position
@@ -146,7 +146,7 @@ def search(
         bound = [{**c, "args": (start,)} for c in conditions]
         found = minimize(
             log_aim, x, jac=True, method="SLSQP", bounds=np.stack([low, high], 1), callback=keep,
-            constraints=bound, options={"maxiter": max_iterations, "ftol": SETTLED},
+            constraints=bound, options={"maxiter": max_iterations, "ftol": SMALLEST_CHANGE},
         )  # fmt: skip
         start = jax.tree.map(np.asarray, variables.placed(start, np.clip(found.x, low, high)))
         converged = bool(found.success)
@@ -159,7 +159,7 @@ def _compile(margins):
     return ({"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)},)
 
 
-def kept(
+def satisfies(
     conditions: Conditions, variables: Variables, origin: np.ndarray, start: Start
 ) -> bool:
     """Whether the stations satisfy their conditions, to a thousandth of their lengths."""

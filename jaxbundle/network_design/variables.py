@@ -94,7 +94,8 @@ class Variables:
         if "direction" in parts:
             look = look.at[self.images].set(parts["direction"] * self.unit)
             away = (look - position)[self.images]
-            rotation = rotation.at[self.images].set(jax.vmap(turned)(rotation[self.images], away))
+            turned = jax.vmap(turn_axis)(rotation[self.images], away)
+            rotation = rotation.at[self.images].set(turned)
         if "roll" in parts:
             rolled = jax.vmap(_roll)(rotation[self.images], parts["roll"][:, 0])
             rotation = rotation.at[self.images].set(rolled)
@@ -103,7 +104,7 @@ class Variables:
         return Start(Values(values.camera, position, rotation, point, values.other), look)
 
 
-def turned(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
+def turn_axis(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
     """The attitude rotated so that the axis has the direction `away` (object space)."""
     d = matrix_from_quaternion(q) @ away
     d = d / jnp.sqrt(jnp.sum(d**2))
@@ -137,7 +138,7 @@ def choose_variables(
 _axes = jax.jit(jax.vmap(lambda q: matrix_from_quaternion(q).T @ AXIS))
 
 
-def looked_at(values: Values) -> Float[np.ndarray, "images 3"]:
+def points_on_axes(values: Values) -> Float[np.ndarray, "images 3"]:
     """The points on the axes of all images at the depth of the centre of the targets."""
     position, middle = np.asarray(values.position), np.asarray(values.point).mean(0)
     axis = np.asarray(_axes(np.asarray(values.rotation)))

@@ -28,15 +28,15 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.types import AnyArray
 
-WIDE = np.radians(70.0)
+WIDE_ANGLE = np.radians(70.0)
 """Rays of narrower cameras are compared by tangents of the angle off the axis, others by the
 angle."""
-STEEPEST = np.radians(87.0)
+LARGEST_ANGLE = np.radians(87.0)
 """Angles off the axis whose tangents are compared; beyond, the angle is added."""
 AT_CORNERS = 1e-6
 """Tolerance of a ray beyond the corner of the image: rounding."""
 WIDENED, SPARED = 3.0, 4.0
-TOUCHED = 1e-9
+MARGIN_TOLERANCE = 1e-9
 """Margins down to this count as satisfied: rounding, and targets on the surface of an obstacle."""
 
 
@@ -144,7 +144,7 @@ def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
 
 def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
     """Which conditions a ray satisfies, by its margins."""
-    return {name: jnp.all(m >= -TOUCHED) for name, m in found.items()}
+    return {name: jnp.all(m >= -MARGIN_TOLERANCE) for name, m in found.items()}
 
 
 def _in_view(view: View, interior, x, y, depth):
@@ -152,8 +152,8 @@ def _in_view(view: View, interior, x, y, depth):
     xy, angle = _image(view, interior, x, y, depth)
     low, high = jnp.array(view.low), jnp.array(view.high)
     half = (high - low) / 2
-    if view.angle < WIDE:
-        flat = jnp.minimum(angle, STEEPEST)
+    if view.angle < WIDE_ANGLE:
+        flat = jnp.minimum(angle, LARGEST_ANGLE)
         off = (jnp.tan(flat) + angle - flat) / np.tan(view.angle)
     else:
         off = angle / view.angle

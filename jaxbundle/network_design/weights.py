@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network_design.pairs import IDLE, Pairs
-from jaxbundle.network_design.search import WORST, make_program
+from jaxbundle.network_design.search import UNDETERMINED_AIM, make_program
 
-NOTHING = IDLE**2
+IDLE_WEIGHT = IDLE**2
 """The weight of an unselected photograph, so that its orientation stays determined."""
 MOST_EXCHANGES = 50
 
@@ -56,15 +56,16 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
         aims.append(float(np.exp(min(program(w)[0] / 2, 700.0))))
 
     keep(start)
-    if program(start)[0] >= 2 * WORST:
+    if program(start)[0] >= 2 * UNDETERMINED_AIM:
         raise NotSolvedError("design: all candidates together do not determine the network")
     found = minimize(
-        program, start, jac=True, method="SLSQP", bounds=[(NOTHING, 1.0)] * images, callback=keep,
+        program, start, jac=True, method="SLSQP", bounds=[(IDLE_WEIGHT, 1.0)] * images,
+        callback=keep,
         constraints=[{"type": "eq", "fun": lambda w: w.sum() - photographs,
                       "jac": lambda w: np.ones_like(w)}],
         options={"maxiter": max_iterations, "ftol": 1e-8},
     )  # fmt: skip
-    weight = np.clip(found.x, NOTHING, 1.0)
+    weight = np.clip(found.x, IDLE_WEIGHT, 1.0)
     chosen = np.zeros(images, bool)
     chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
     chosen = _exchange(program, chosen)
@@ -72,7 +73,7 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
     bound = float(np.sqrt(max(lowest, 0.0))) if pairs.aim.convex else 0.0
-    return Selection(np.where(weight > 10 * NOTHING, weight, 0.0), chosen, aims, bound,
+    return Selection(np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0), chosen, aims, bound,
                      bool(found.success))  # fmt: skip
 
 
@@ -84,7 +85,7 @@ def _program(pairs: Pairs):
     program = make_program(pairs, lambda w: (values, seen * jnp.sqrt(w)[image]))
 
     def squared(w):
-        value, slope = program(np.maximum(w, NOTHING))
+        value, slope = program(np.maximum(w, IDLE_WEIGHT))
         return 2 * value, 2 * slope
 
     return squared

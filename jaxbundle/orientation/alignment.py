@@ -5,14 +5,14 @@ from jaxtyping import Float
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, controlled
+from jaxbundle.orientation.growth import Model, are_controlled
 from jaxbundle.orientation.sights import Sights
 
-APART = 3.0
+OUTLIER_LIMIT = 3.0
 """Points with residuals above this multiple of the median are excluded from the similarity."""
 LEAST_RAYS = 5
 """Minimum rays to control points: four give seven unknowns and one redundancy."""
-FEW = 6
+FEWEST_WITH_OUTLIERS = 6
 """With at most this many points all are used, since outliers cannot be identified."""
 ROUNDS = 3
 LEAST_TO_TELL = 4
@@ -21,11 +21,11 @@ MIRRORED, FITS = 5.0, 30.0
 """Mirror image: required improvement of the fit, and fit relative to the extent."""
 
 
-def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | None:
+def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model | None:
     """The model in the frame of control points and of images whose position is given, else of the
     rays to control points, else of the approximate coordinates of points; None without enough."""
     points, images = network.points, network.images
-    control = controlled(points) & model.known
+    control = are_controlled(points) & model.known
     stations = model.placed & np.isfinite(images.position).all(1)
     found = similarity(
         np.concatenate([model.X[control], model.X0[stations]]),
@@ -36,7 +36,7 @@ def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | No
     if found is None:
         tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
         found = similarity(model.X[tie], points.position[tie])
-    return None if found is None else model.moved(*found)
+    return None if found is None else model.transform(*found)
 
 
 def _by_rays(network: Network, sights: Sights, model: Model):
@@ -44,7 +44,7 @@ def _by_rays(network: Network, sights: Sights, model: Model):
 
     Start values use a point at the typical distance along each ray."""
     points = network.points
-    rows = np.flatnonzero(model.placed[sights.image] & controlled(points)[sights.point])
+    rows = np.flatnonzero(model.placed[sights.image] & are_controlled(points)[sights.point])
     if len(rows) < LEAST_RAYS or len(np.unique(sights.point[rows])) < 3 or not model.known.any():
         return None
     image, point = sights.image[rows], sights.point[rows]
@@ -70,7 +70,7 @@ def to_scale(network: Network, model: Model) -> tuple[Model, str]:
     scale = scale_of_distances(network, model)
     if scale is None:
         return model, "in an arbitrary frame and scale"
-    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
+    return model.transform(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
 
 
 def scale_of_distances(network: Network, model: Model) -> float | None:
@@ -83,7 +83,7 @@ def scale_of_distances(network: Network, model: Model) -> float | None:
     return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
 
 
-def joined(sights: Sights, model: Model, part: Model) -> Model | None:
+def join(sights: Sights, model: Model, part: Model) -> Model | None:
     """A model merged with a second one; None if nothing connects them.
 
     The similarity is found from common points, or from the pose of a common image and the distances
@@ -99,7 +99,7 @@ def joined(sights: Sights, model: Model, part: Model) -> Model | None:
         found = similarity(part.X[both], model.X[both])
     if found is None:
         return None
-    part = part.moved(*found)
+    part = part.transform(*found)
     image, point = part.placed & ~model.placed, part.known & ~model.known
     choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     return Model(
@@ -114,11 +114,11 @@ def _by_an_image(model, part, image, both):
     return A, model.X0[image] - A @ part.X0[image]
 
 
-def mirrored(network: Network, model: Model) -> str:
+def describe_mirror(network: Network, model: Model) -> str:
     """Whether a model in an arbitrary frame fits the control points only as a mirror image, in
     words; empty if not, or if undecidable (fewer than four, or coplanar)."""
     points = network.points
-    control = controlled(points) & model.known
+    control = are_controlled(points) & model.known
     source, target = model.X[control], points.position[control]
     if len(source) < LEAST_TO_TELL:
         return ""
@@ -129,8 +129,8 @@ def mirrored(network: Network, model: Model) -> str:
     return (
         f"the {len(source)} control points fit the images only as a mirror image (by "
         f"{off[1]:.3g} {network.object_unit}, otherwise {off[0]:.3g}): X and Y are exchanged, or "
-        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; turn one "
-        "axis round"
+        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; reverse one "
+        "axis"
     )
 
 
@@ -148,9 +148,9 @@ def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
     good = np.ones(len(source), bool)
     for _ in range(ROUNDS):
         found = many.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
-        if found is None or len(source) < FEW:
+        if found is None or len(source) < FEWEST_WITH_OUTLIERS:
             return found
         A, t = found
         off = np.linalg.norm(source @ A.T + t - target, axis=1)
-        good = off <= APART * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
+        good = off <= OUTLIER_LIMIT * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
     return found

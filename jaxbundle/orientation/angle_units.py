@@ -12,7 +12,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, misclosures
 from jaxbundle.orientation.sights import sights
 
-FAR = 3.0
+LARGEST_MISCLOSURE = 3.0
 """Limit for the median misclosure of image points, in tolerances of start values."""
 
 
@@ -36,7 +36,7 @@ def name_angle_unit(network: Network) -> str:
         off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]
         missed[unit] = float(np.median(off))
     best = min(missed, key=missed.__getitem__)
-    if not (missed[best] < 1 and missed[network.angle_unit] > FAR):
+    if not (missed[best] < 1 and missed[network.angle_unit] > LARGEST_MISCLOSURE):
         return ""
     return (
         f"the start values of the images fit the measurements if omega, phi, kappa are in {best}, "

@@ -12,9 +12,9 @@ P by the singular value decomposition of the normalised equations (Hartley, 1997
     K = ⎢    fy y0⎥        x = x0 − fx·r/q − s·s/q,  y = y0 − fy·s/q  (r, s, q in the camera frame)
         ⎣        1⎦
 
-by making the rows of P's left part perpendicular from the last to the first. Refined, the
-misclosures of the collinearity equations are least, if asked with radial distortion as a
-correction of the measured coordinates, (x̄, ȳ)·(1 + K1·r² + K2·r⁴ + …).
+by making the rows of P's left part perpendicular from the last to the first. Refinement minimises
+the misclosures of the collinearity equations, optionally with radial distortion as a correction of
+the measured coordinates, (x̄, ȳ)·(1 + K1·r² + K2·r⁴ + …).
 """
 
 import equinox as eqx
@@ -29,7 +29,7 @@ from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
-FLAT = 1e-7
+SMALLEST_SINGULAR_VALUE = 1e-7
 """Extents of points, and second last singular values, below this part of the first are zero."""
 
 
@@ -77,9 +77,9 @@ def direct_linear_transformation(
     at_mean = P[2, :3] @ m + P[2, 3]
     size = extent(X, p)
     status = first_of(
-        (size[1] < FLAT, Status.COLLINEAR_POINTS),
-        (size[2] < FLAT, Status.COPLANAR_POINTS),
-        (singular[-2] < FLAT * singular[0], Status.UNDETERMINED),
+        (size[1] < SMALLEST_SINGULAR_VALUE, Status.COLLINEAR_POINTS),
+        (size[2] < SMALLEST_SINGULAR_VALUE, Status.COPLANAR_POINTS),
+        (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0], Status.UNDETERMINED),
     )
     return P / jnp.where(at_mean == 0, 1, at_mean), status
 
@@ -138,7 +138,7 @@ def project(camera: Camera, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
     return jnp.stack([fx * x + skew * y, fy * y])
 
 
-def corrected(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+def correct(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """A measured point relative to the principal point, corrected for radial distortion."""
     reduced = jnp.asarray(xy) - camera.interior[3:]
     square = reduced @ reduced
@@ -146,7 +146,7 @@ def corrected(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
 
 
 def _misclosures(camera, xy, X, root):
-    one = lambda xy, X, root: root * (project(camera, X) - corrected(camera, xy))
+    one = lambda xy, X, root: root * (project(camera, X) - correct(camera, xy))
     return jax.vmap(one)(xy, X, root).ravel()
 
 

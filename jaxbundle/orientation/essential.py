@@ -111,7 +111,7 @@ def _coplanarity(a1, a2, weights):
 
 
 def _nearest_essential(E):
-    """With singular values (1, 1, 0)."""
+    """The nearest matrix with singular values (1, 1, 0)."""
     U, _, Vt = jnp.linalg.svd(E)
     return U[:, :2] @ Vt[:2]
 

@@ -12,21 +12,21 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import FITS
-from jaxbundle.orientation.growth import FOR_ITSELF, Model, controlled, intersect
+from jaxbundle.orientation.growth import FOR_ITSELF, Model, are_controlled, intersect
 from jaxbundle.orientation.sights import Sights, sights
 
-CONTRADICTION = "control points contradict each other"
+CONTRADICTORY_CONTROL = "control points contradict each other"
 TRIPLES = 120
 """Largest number of tested similarities of three points."""
-FEW = 12
+ALL_PAIRS_UP_TO = 12
 """With at most this many points every swap of two is tried."""
-AGREED = 4
+FEWEST_AGREEING = 4
 """Minimum number of consistent points before the others are suspected; three always agree."""
-AS_GOOD = 3.0
+EQUAL_FIT_RATIO = 3.0
 """Explanations with a fit worse than the best by at most this factor are also reported."""
 
 
@@ -38,7 +38,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
     seen = sights(network) if seen is None else seen
     points = network.points
     alone = _without_control(network, seen, model)
-    control = np.flatnonzero(controlled(points) & alone.known)
+    control = np.flatnonzero(are_controlled(points) & alone.known)
     found = contradiction(alone.X[control], points.position[control])
     if found is None:
         return ""
@@ -46,7 +46,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
     causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in found.exchanges]
     causes += [f"the coordinates or the number of {ids[k]!r} are wrong" for k in found.wrong]
     shown = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
-    begin = f"the {len(ids)} {CONTRADICTION} by {found.before:.2g} {unit}"
+    begin = f"the {len(ids)} {CONTRADICTORY_CONTROL} by {found.before:.2g} {unit}"
     if found.together or len(causes) == 1:
         return (
             f"{begin}, and fit to {found.after:.2g} {unit} if {' and '.join(shown)}: correct the "
@@ -62,9 +62,9 @@ def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> st
     """Control points that contradict the images without an explanation."""
     names = [network.points.id[p] for p in np.flatnonzero(suspects)]
     return (
-        f"the control points {some(names)} contradict the images or each other, and no exchange "
-        "of two explains it: look for wrong numbers, wrong coordinates, wrong units, and a wrong "
-        "principal distance"
+        f"the control points {list_some(names)} contradict the images or each other, and no "
+        "exchange of two explains it: look for wrong numbers, wrong coordinates, wrong units, and "
+        "a wrong principal distance"
     )
 
 
@@ -93,7 +93,7 @@ def contradiction(
     if off is None or off.max() < tolerance:
         return None
     good = _agreeing(source, target, tolerance)
-    if good.sum() >= max(AGREED, n / 2):
+    if good.sum() >= max(FEWEST_AGREEING, n / 2):
         return _by_majority(source, target, good, tolerance, off.max())
     return _by_trial(source, target, tolerance, off.max())
 
@@ -117,10 +117,10 @@ def _by_majority(source, target, good, tolerance, before):
 
 def _by_trial(source, target, tolerance, before):
     n = len(source)
-    if n > FEW:
+    if n > ALL_PAIRS_UP_TO:
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
-    trials += [((), (k,)) for k in range(n) if n >= AGREED]
+    trials += [((), (k,)) for k in range(n) if n >= FEWEST_AGREEING]
     found = []
     for pair, left_out in trials:
         order = np.arange(n)
@@ -132,7 +132,7 @@ def _by_trial(source, target, tolerance, before):
     if not found:
         return None
     best = min(found)[0]
-    found = [entry for entry in sorted(found) if entry[0] <= AS_GOOD * best]
+    found = [entry for entry in sorted(found) if entry[0] <= EQUAL_FIT_RATIO * best]
     exchanges = [pair for _, pair, _ in found if pair]
     wrong = [k for *_, left_out in found for k in left_out]
     return Contradiction(before, best, exchanges, wrong, together=False)
@@ -141,7 +141,7 @@ def _by_trial(source, target, tolerance, before):
 def _agreeing(source, target, tolerance) -> Bool[np.ndarray, " n"]:
     """The most points that fit one similarity from three of them, seen once more."""
     triples = list(itertools.islice(itertools.combinations(range(len(source)), 3), 2 * TRIPLES))
-    if len(source) > FEW:
+    if len(source) > ALL_PAIRS_UP_TO:
         rng = np.random.default_rng(0)
         triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIPLES)]
     best = np.zeros(len(source), bool)

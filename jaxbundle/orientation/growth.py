@@ -2,10 +2,10 @@
 
     known points ──resection──▶ images ──intersection──▶ more points ──▶ …
 
-An image is resected from at least `LEAST` known points, most of which must agree; images with the
-most known points come first. A point is intersected from at least two consistent rays with an angle
-above `NARROW`. All tests use the tolerance of start values; the subsequent adjustment refines the
-result.
+An image is resected from at least `FEWEST_POINTS` known points, most of which must agree; images
+with the most known points come first. A point is intersected from at least two consistent rays with
+an angle above `Demands.angle`. All tests use the tolerance of start values; the subsequent
+adjustment refines the result.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.sights import Sights
 from jaxbundle.orientation.status import Status
 
-LEAST = 4
+FEWEST_POINTS = 4
 """Minimum known points of an image: three, and one to choose among their solutions."""
 ENOUGH, WAITING = 12, 0.4
 """An image waits while it has fewer known points, or less than this fraction of the maximum of all
@@ -27,9 +27,9 @@ images."""
 DRIFTS, LARGER = 30, 2.5
 """Number of images for the first improvement of a model, and its growth factor until the next."""
 PARALLEL, FAR_AWAY = 2e-3, 2e3
-"""Radians between the rays of a point that is far away and their middle; and how far, in radii of
-the places of the images."""
-AGREE = 0.4
+"""Maximum angle, radians, between the rays of a distant point and their mean; and its distance, in
+radii of the positions of the images."""
+AGREEING_SHARE = 0.4
 """Minimum fraction of consistent points of an image or a pair."""
 
 
@@ -71,7 +71,7 @@ class Model:
         """An image, or several, with their poses."""
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
-    def moved(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
+    def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
         """The same model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))
         return dataclasses.replace(
@@ -79,7 +79,7 @@ class Model:
         )
 
 
-def controlled(points: Points) -> Bool[np.ndarray, " points"]:
+def are_controlled(points: Points) -> Bool[np.ndarray, " points"]:
     """Points whose three coordinates are known: fixed, or control with all axes."""
     return points.has_role("fixed") | (
         points.has_role("control") & ~np.isposinf(points.sigma).any(1)
@@ -105,7 +105,7 @@ def grow(
     intersect(sights, model, FOR_OTHERS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
-        waiting = among & ~model.placed & (known >= LEAST) & (known > tried)
+        waiting = among & ~model.placed & (known >= FEWEST_POINTS) & (known > tried)
         if not waiting.any():
             break
         most = known[waiting].max()
@@ -161,7 +161,7 @@ def place_images(sights: Sights, model: Model, images) -> int:
         sights.tolerance[images],
     )  # fmt: skip
     number = np.minimum([len(r) for r in rows], many.SLOTS)
-    good = (part >= AGREE) & (part * number >= LEAST)
+    good = (part >= AGREEING_SHARE) & (part * number >= FEWEST_POINTS)
     for i, image in enumerate(images):
         if good[i]:
             model.place(image, X0[i], M[i])
@@ -179,7 +179,7 @@ def _refine(sights: Sights, model: Model) -> None:
     error = misclosures(sights, model)
     rows = [_known_rows(sights, model, image) for image in images]
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
-    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= LEAST]
+    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= FEWEST_POINTS]
     if not use:
         return
     images, rows = images[use], [rows[k] for k in use]

@@ -11,7 +11,7 @@ h₁, h₂ of each H give two equations of B = K⁻ᵀ·K⁻¹ (Zhang, 2000, IEE
 
     h₁ᵀ·B·h₂ = 0,        h₁ᵀ·B·h₁ = h₂ᵀ·B·h₂
 
-`adjustment.batch_start` has the same idea for a thousand cameras at once, in another layout.
+`batch.start` has the same idea for a thousand cameras at once, in another layout.
 """
 
 import jax
@@ -26,7 +26,7 @@ from jaxbundle.types import AnyArray
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""
-FLAT = 1e-7
+SMALLEST_SINGULAR_VALUE = 1e-7
 """Second last singular value, in parts of the first, of a system that determines nothing."""
 
 
@@ -53,7 +53,7 @@ def homography(
     at_mean = H[2, :2] @ m + H[2, 2]
     status = first_of(
         (extent(source, p)[1] < LINE, Status.COLLINEAR_POINTS),
-        (singular[-2] < FLAT * singular[0], Status.UNDETERMINED),
+        (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0], Status.UNDETERMINED),
     )
     return H / jnp.where(at_mean == 0, 1, at_mean), status
 
@@ -93,7 +93,7 @@ def interior_from_homographies(
     fx, fy = jnp.sqrt(jnp.where(squares > 0, squares, 1))
     s = -b12 * fx**2 * fy / scale
     x0 = s * y0 / fy - b13 * fx**2 / scale
-    bad = (singular[-2] < FLAT * singular[0]) | ~jnp.all(squares > 0)
+    bad = (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0]) | ~jnp.all(squares > 0)
     return size * jnp.stack([fx, fy, s, x0, y0]), first_of((bad, Status.PARALLEL_PLANES))
 
 

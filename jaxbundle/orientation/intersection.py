@@ -73,7 +73,7 @@ def intersection(
 
 
 def _widest(d, p):
-    """The sine is exact where the cosine is flat, and the other way round."""
+    """The sine is exact where the cosine is flat, and vice versa."""
     sine = jnp.linalg.norm(jnp.cross(d[:, None], d[None]), axis=-1)
     angles = jnp.arctan2(sine, jnp.abs(d @ d.T))
     return jnp.max(jnp.where((p[:, None] > 0) & (p > 0), angles, 0))

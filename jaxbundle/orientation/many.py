@@ -46,8 +46,8 @@ def resect(
     """X0, M of images, and the part of their points that agree within `tolerance` (c = 1); 0: no
     pose."""
     rows = [spread(len(a)) for a in xy]
-    return in_lanes(
-        _resect, LANES, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
+    return run_in_lanes(
+        _resect, LANES, _gather_slots(xy, rows, SLOTS), _gather_slots(X, rows, SLOTS),
         _weights(rows, SLOTS), tolerance,
     )  # fmt: skip
 
@@ -55,9 +55,9 @@ def resect(
 def refine(poses, xy, X, weights):
     """X0, M of images improved from start values by points of weight > 0."""
     rows = [spread(len(a)) for a in xy]
-    return in_lanes(
-        _refine, LANES, *poses, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
-        _filled(weights, rows, SLOTS),
+    return run_in_lanes(
+        _refine, LANES, *poses, _gather_slots(xy, rows, SLOTS), _gather_slots(X, rows, SLOTS),
+        _gather_slots(weights, rows, SLOTS),
     )  # fmt: skip
 
 
@@ -65,23 +65,23 @@ def orient_pairs(xy1, xy2, tolerance):
     """M, b of pairs of images, the part of the points that agree within `tolerance`, and the
     median angle of intersection (radians)."""
     rows = [spread(len(a)) for a in xy1]
-    return in_lanes(
-        _orient_pair, LANES, _filled(xy1, rows, SLOTS), _filled(xy2, rows, SLOTS),
+    return run_in_lanes(
+        _orient_pair, LANES, _gather_slots(xy1, rows, SLOTS), _gather_slots(xy2, rows, SLOTS),
         _weights(rows, SLOTS), tolerance,
     )  # fmt: skip
 
 
 def intersect(X0, rays, weights):
     """X, angle of intersection and status of points with up to `RAYS` rays, [n, RAYS, …]."""
-    return in_lanes(_intersect, POINT_LANES, X0, rays, weights)
+    return run_in_lanes(_intersect, POINT_LANES, X0, rays, weights)
 
 
 def similarity(source, target, weights):
     """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
     rows = [spread(len(source))]
-    A, t, status = in_lanes(
-        _similarity, 1, _filled([source], rows, SLOTS), _filled([target], rows, SLOTS),
-        _filled([weights], rows, SLOTS) * _weights(rows, SLOTS),
+    A, t, status = run_in_lanes(
+        _similarity, 1, _gather_slots([source], rows, SLOTS), _gather_slots([target], rows, SLOTS),
+        _gather_slots([weights], rows, SLOTS) * _weights(rows, SLOTS),
     )  # fmt: skip
     return (A[0], t[0]) if status[0] == int(Status.SOUND) else None
 
@@ -90,24 +90,25 @@ def similarity_by_rays(X, X0, rays, A, t):
     """A and t of X' = A·X + t by which points X come to lie on rays, from start values; and the
     misclosure of every ray, the tangent of its angle."""
     rows = [spread(len(X))]
-    filled = (_filled([a], rows, SLOTS) for a in (X, X0, rays))
-    A, t, off = in_lanes(_similarity_by_rays, 1, *filled, _weights(rows, SLOTS), A[None], t[None])
+    filled = (_gather_slots([a], rows, SLOTS) for a in (X, X0, rays))
+    weights = _weights(rows, SLOTS)
+    A, t, off = run_in_lanes(_similarity_by_rays, 1, *filled, weights, A[None], t[None])
     return A[0], t[0], off[0][: len(rows[0])]
 
 
 def matrices(angles):
     """M of ω, φ, κ."""
-    return in_lanes(_matrix, POINT_LANES, angles)[0]
+    return run_in_lanes(_matrix, POINT_LANES, angles)[0]
 
 
 def matrices_of_quaternions(q):
     """M of unit quaternions."""
-    return in_lanes(_matrix_of_quaternion, POINT_LANES, q)[0]
+    return run_in_lanes(_matrix_of_quaternion, POINT_LANES, q)[0]
 
 
 def angles(M):
     """ω, φ, κ of M."""
-    return in_lanes(_angles, POINT_LANES, M)[0]
+    return run_in_lanes(_angles, POINT_LANES, M)[0]
 
 
 def prepare() -> None:
@@ -212,7 +213,7 @@ def _angles(M):
     return (omega_phi_kappa_from_matrix(M),)
 
 
-def _filled(columns, rows, slots):
+def _gather_slots(columns, rows, slots):
     """[items, slots, …]: the chosen rows of each column, the last one repeated."""
     return np.stack([np.asarray(a)[_fill(r, slots)] for a, r in zip(columns, rows)])
 
@@ -225,7 +226,7 @@ def _weights(rows, slots):
     return np.stack([(np.arange(slots) < len(r)).astype(float) for r in rows])
 
 
-def in_lanes(program, lanes, *arrays):
+def run_in_lanes(program, lanes, *arrays):
     """The program applied to items, `lanes` at a time; missing ones repeat the last."""
     number = len(arrays[0])
     parts = []

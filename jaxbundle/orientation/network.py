@@ -20,22 +20,22 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
-from jaxbundle.orientation.alignment import joined, mirrored, onto_the_given, to_scale
+from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
-    AGREE,
+    AGREEING_SHARE,
+    FEWEST_POINTS,
     FOR_OTHERS,
-    LEAST,
     Model,
-    controlled,
+    are_controlled,
     finish,
     grow,
     misclosures,
@@ -44,26 +44,26 @@ from jaxbundle.orientation.growth import (
 from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.types import Index
 
-IN_COMMON = 6
+FEWEST_COMMON = 6
 """Minimum common points of a starting pair."""
 PAIRS = 16
 """Largest number of pairs for relative orientation."""
 SEEDS = 6
 """Largest number of pairs a model is grown from."""
-OUT_OF_THE_QUESTION = 3.0
+EXCLUSION_RATIO = 3.0
 """Image points with larger misclosures, in tolerances, are excluded."""
-CONTRADICTED = 0.1
+CONTRADICTED_SHARE = 0.1
 """Fraction of rays that miss their control points, or of points whose rays do not intersect, above
 which a mirror image is tested."""
 LEAST_CONTROL = 3
 """Minimum remaining control points for the datum."""
-MOST = 0.8
+SUFFICIENT_SHARE = 0.8
 """A model that uses at least this fraction of the image points is accepted without alternatives."""
-WIDE = 0.5
+WIDE_ANGLE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Oriented:
     """A network with start values; `images`, `points`: reasons for those that could not be
@@ -95,7 +95,7 @@ class Oriented:
 def lacks_start_values(network: Network) -> bool:
     """Whether an image or a tie point has no start value."""
     images, points = network.images, network.points
-    tie = points.has_role("tie") | (points.has_role("control") & ~controlled(points))
+    tie = points.has_role("tie") | (points.has_role("control") & ~are_controlled(points))
     return bool(
         np.isnan(images.position).any()
         or np.isnan(images.angles).any()
@@ -118,15 +118,15 @@ def find_start_values(
     seen = sights(network, tolerance)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
-        why = _mirrored(network, seen) or _why_nothing(network, seen)
+        why = _describe_mirror(network, seen) or _why_nothing(network, seen)
         raise _no_start_values(network, why)
     found = _result(network, seen, model, frame)
-    missed = _missed(network, seen, model)
+    missed = _find_missed(network, seen, model)
     finding = name_contradiction(network, seen, model) if missed.any() else ""
-    left = (controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
+    left = (are_controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
     why = ""
     if _control_contradicts(network, seen, model):
-        why = _mirrored(network, seen) or (finding if left < LEAST_CONTROL else "")
+        why = _describe_mirror(network, seen) or (finding if left < LEAST_CONTROL else "")
     if why:
         raise _no_start_values(network, why)
     if missed.any() and left < LEAST_CONTROL:
@@ -141,10 +141,10 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
     return NotSolvedError(f"no start values found: {causes}", _names(network))
 
 
-def _missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
+def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
     wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
-    return controlled(network.points) & (2 * wrong > _rays_of(seen, model))
+    return are_controlled(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
 def _rays_of(seen: Sights, model: Model):
@@ -155,26 +155,26 @@ def _rays_of(seen: Sights, model: Model):
 def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     """Whether many rays miss their control points grossly, or many points have rays that do not
     intersect."""
-    control = controlled(network.points)
+    control = are_controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
     wrong = _out_of_the_question(seen, model)
     seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
-        wrong[rays].sum() > CONTRADICTED * rays.sum()
-        or unmet.sum() > CONTRADICTED * seen_twice.sum()
+        wrong[rays].sum() > CONTRADICTED_SHARE * rays.sum()
+        or unmet.sum() > CONTRADICTED_SHARE * seen_twice.sum()
     )
 
 
-def _mirrored(network: Network, seen: Sights) -> str:
+def _describe_mirror(network: Network, seen: Sights) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
     model = _from_a_pair(seen, Model.empty(seen), None)
-    return "" if model is None else mirrored(network, model)
+    return "" if model is None else describe_mirror(network, model)
 
 
 def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
-    model, frame = _given(network, seen), "in the frame given"
+    model, frame = _given_model(network, seen), "in the frame given"
     grow(seen, model, improve=improve)
     if not model.placed.any():
         approximate = _with_approximate_points(network, model)
@@ -186,11 +186,11 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
         if part is None:
             break
         if model.placed.any():
-            part = joined(seen, model, part)
+            part = join(seen, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
         grow(seen, model, improve=improve)
-        if not fixed and (moved := onto_the_given(network, seen, model)):
+        if not fixed and (moved := move_to_given_frame(network, seen, model)):
             fixed, frame = True, "in the frame given"
             model = _with_control(network, moved)
             grow(seen, model, improve=improve)
@@ -199,7 +199,7 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
     return (model, frame) if fixed else to_scale(network, model)
 
 
-def _given(network: Network, seen: Sights) -> Model:
+def _given_model(network: Network, seen: Sights) -> Model:
     """Images with all six start values, points with all three coordinates known."""
     model, images = Model.empty(seen), network.images
     there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
@@ -209,7 +209,7 @@ def _given(network: Network, seen: Sights) -> Model:
 
 
 def _with_control(network: Network, model: Model) -> Model:
-    held = controlled(network.points)
+    held = are_controlled(network.points)
     X = np.where(held[:, None], network.points.position, model.X)
     return dataclasses.replace(model, X=X, known=model.known | held, held=held)
 
@@ -234,9 +234,9 @@ def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
         grow(seen, part, new | old, improve)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
-        if good > most and not (linked and joined(seen, model, part) is None):
+        if good > most and not (linked and join(seen, model, part) is None):
             best, most = part, good
-        if most >= MOST * rows.sum():
+        if most >= SUFFICIENT_SHARE * rows.sum():
             break
     return best
 
@@ -245,7 +245,7 @@ def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.nd
     """The images that share enough points with some of these."""
     of_these = np.zeros(seen.points, bool)
     of_these[seen.point[images[seen.image]]] = True
-    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= IN_COMMON
+    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= FEWEST_COMMON
 
 
 def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
@@ -257,8 +257,8 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
     xy = [_common_points(seen, *pair) for pair in pairs]
     tolerance = seen.tolerance[pairs].mean(1)
     M, b, part, angle = many.orient_pairs([a for a, _ in xy], [b for _, b in xy], tolerance)
-    worth = np.sqrt(common) * part * np.minimum(angle, WIDE)
-    usable = (part >= AGREE) & (angle > FOR_OTHERS.angle)
+    worth = np.sqrt(common) * part * np.minimum(angle, WIDE_ANGLE)
+    usable = (part >= AGREEING_SHARE) & (angle > FOR_OTHERS.angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
         yield *pairs[k], M[k], b[k]
 
@@ -267,7 +267,7 @@ def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
     pairs, number = _all_pairs(seen, among)
-    use = (number >= IN_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
+    use = (number >= FEWEST_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
     pairs, number = pairs[use], number[use]
     order = np.argsort(-number, kind="stable")
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
@@ -320,7 +320,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     network = keep_points(keep_images(network, keep), known)
     said = [
         f"left out {count(len(found), thing)} for which no start values were found: "
-        + some((f"{id} ({why})" for id, why in found.items()), 5, str)
+        + list_some((f"{id} ({why})" for id, why in found.items()), 5, str)
         for thing, found in zip(("image", "point"), reasons) if found
     ]  # fmt: skip
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
@@ -331,21 +331,21 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
 
 def _in_contradiction(names: Sequence[str]) -> str:
     return (
-        f"left out {count(len(names), 'image point')} in contradiction to the start values: "
-        f"{some(names, 5, str)}"
+        f"left out {count(len(names), 'image point')} that contradict the start values: "
+        f"{list_some(names, 5, str)}"
     )
 
 
 def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
-    return misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+    return misclosures(seen, model) > EXCLUSION_RATIO * seen.tolerance[seen.image]
 
 
 def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
     """The images with too few consistent known points."""
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     known = of_image(model.known[seen.point])
-    return of_image(_out_of_the_question(seen, model)) > (1 - AGREE) * known
+    return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
 
 
 def _reasons(network: Network, seen: Sights, model: Model, known):
@@ -353,12 +353,15 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
     of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
     images = {}
     for image in np.flatnonzero(~model.placed):
-        if of_known[image] < LEAST:
-            why = f"it sees {of_known[image]} known points of {rays[image]}; {LEAST} are needed"
+        if of_known[image] < FEWEST_POINTS:
+            why = (
+                f"it sees {of_known[image]} known points of {rays[image]}; "
+                f"{FEWEST_POINTS} are needed"
+            )
         else:
             why = (
-                f"fewer than {AGREE:.0%} of the {of_known[image]} known points it sees agree on a "
-                "pose: look for wrong point numbers, or a wrong principal distance"
+                f"fewer than {AGREEING_SHARE:.0%} of the {of_known[image]} known points it "
+                "sees agree on a pose: look for wrong point numbers, or a wrong principal distance"
             )
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]
@@ -374,24 +377,25 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
 
 
 def _why_nothing(network: Network, seen: Sights) -> str:
-    control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
+    known = are_controlled(network.points)
+    control = np.bincount(seen.image, known[seen.point], minlength=seen.images)
     best = int(control.argmax())
     begin = (
-        f"no image sees {LEAST} control points that agree ({int(control[best])} in "
+        f"no image sees {FEWEST_POINTS} control points that agree ({int(control[best])} in "
         f"{network.images.id[best]!r} at most), and "
     )
     one, other, most = _most_in_common(seen)
-    if most < IN_COMMON:
+    if most < FEWEST_COMMON:
         pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
         return (
-            f"{begin}no two images have the {IN_COMMON} points in common that a relative "
+            f"{begin}no two images have the {FEWEST_COMMON} points in common that a relative "
             f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
             "give start values"
         )
     return (
-        f"{begin}no two images share {IN_COMMON} points whose rays meet at an angle ({most} points "
-        "in common at most): take images from different positions, look for wrong point numbers, "
-        "or give start values"
+        f"{begin}no two images share {FEWEST_COMMON} points whose rays meet at an angle ({most} "
+        "points in common at most): take images from different positions, look for wrong point "
+        "numbers, or give start values"
     )
 
 

@@ -12,13 +12,13 @@ reported.
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.sights import sights
 
-IN_COMMON = 5
+FEWEST_COMMON = 5
 """Minimum common points: a rotation has 3 parameters, the points 10 coordinates."""
-MOST = 200
+MOST_COMPARED = 200
 """Number of images compared with the one that has the most image points."""
 NOISE = 3.0
 """Misclosures up to this number of σ are explained by the measurements."""
@@ -30,26 +30,26 @@ def name_one_place(network: Network) -> str:
     seen = sights(network)
     number = np.bincount(seen.image, minlength=seen.images)
     base = int(number.argmax())
-    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST]
+    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST_COMPARED]
     c = np.array([camera.parameters[get_model(camera.model).principal_distance[0]]
                   for camera in network.cameras])  # fmt: skip
     of_camera = network.images.camera[seen.image]
     sigma = network.observations.sigma[seen.row] / c[of_camera, None]
-    if not others or not all(_turned_only(seen, sigma, base, image) for image in others):
+    if not others or not all(_is_rotation(seen, sigma, base, image) for image in others):
         return ""
     names = [network.images.id[image] for image in sorted([base, *others])]
     return (
-        f"images {some(names)} were taken from one place, as far as their measurements tell: a "
-        "rotation alone takes one to the other, and points have no depth; add images from other "
+        f"images {list_some(names)} were taken from one place, as far as their measurements show: "
+        "a rotation alone maps one to the other, and points have no depth; add images from other "
         "places"
     )
 
 
-def _turned_only(seen, sigma, one: int, other: int) -> bool:
+def _is_rotation(seen, sigma, one: int, other: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
     a, b = seen.of(one), seen.of(other)
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
-    if len(k) < IN_COMMON:
+    if len(k) < FEWEST_COMMON:
         return False
     noise = np.sqrt((sigma[a][k] ** 2).sum(1) + (sigma[b][l] ** 2).sum(1))
     field = min(_field(seen.xy[a][k]), _field(seen.xy[b][l]))

@@ -25,7 +25,7 @@ from jaxbundle.orientation.pose import ray_of
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
-SAME = 1e-9
+EQUAL_WITHIN = 1e-9
 """Squares of singular values nearer than this are equal: there is no base."""
 
 
@@ -60,7 +60,7 @@ def planar_orientations(
     square, V = jnp.linalg.eigh(G.T @ G)
     v3, v2, v1 = V.T
     long, short = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
-    no_base = long + short < SAME
+    no_base = long + short < EQUAL_WITHIN
     apart = jnp.sqrt(jnp.where(no_base, 1.0, long + short))
 
     def solution(sign):

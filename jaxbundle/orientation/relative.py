@@ -1,9 +1,9 @@
 """Relative orientation of two images by coplanarity, without start values.
 
 The first camera is the frame: M₁ = I, X0₁ = 0; the second has the rotation M from the first and its
-centre at the base b, |b| = 1. Essential matrices in closed form (`essential`) give candidates of
-which that is taken whose points are in front of both cameras with the least vᵀPv. It is refined on
-the five-parameter manifold with the misclosures of coplanarity as lengths in the image,
+centre at the base b, |b| = 1. Essential matrices in closed form (`essential`) give candidates; the
+one with the points in front of both cameras and the least vᵀPv is taken, and refined on the
+five-parameter manifold with the misclosures of coplanarity as lengths in the image,
 
     v = a₂ᵀ·E·a₁/√(|(E·a₁)ₓᵧ|² + |(Eᵀ·a₂)ₓᵧ|²),        E = M·[b]×,        Σ p·v² = min
 
@@ -22,7 +22,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
-from jaxbundle.geometry.vectors import dot, read, turned, turned_back, unpacked
+from jaxbundle.geometry.vectors import dot, read, rotate, rotate_back, unpack
 from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.essential import eight_points, five_solutions, orientations
@@ -34,7 +34,7 @@ from jaxbundle.types import AnyArray
 
 SIMPLER = 6.0
 """Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""
-EXACT = 1e-20
+ROUNDING_VARIANCE = 1e-20
 """Variance of image coordinates (c = 1) that is rounding."""
 REFINED = 4
 """Candidates that are refined."""
@@ -86,7 +86,7 @@ def relative_orientation(
         E = jnp.concatenate([E, five_solutions(*held)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
-    chosen, score = _refined_best(M, b, stop_gradient(data), p)
+    chosen, score = _refine_best(M, b, stop_gradient(data), p)
     fit = finish(_misclosures, retract, chosen, data, 5)
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
@@ -111,7 +111,7 @@ def sampson_distance(
     """Misclosure of coplanarity of one point as a length in the image, c = 1, with a sign."""
     a1, a2 = _rays(xy1, xy2)
     E = read(jnp.cross(M, b))  # M·[b]×
-    line2, line1 = turned(E, a1), turned_back(E, a2)
+    line2, line1 = rotate(E, a1), rotate_back(E, a2)
     length = line2[0] ** 2 + line2[1] ** 2 + line1[0] ** 2 + line1[1] ** 2
     return jnp.divide(dot(a2, line2), jnp.sqrt(jnp.where(length > 0, length, 1)))
 
@@ -124,7 +124,7 @@ def distances_along_rays(
 ) -> Float[Array, "2"]:
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = _rays(xy1, xy2)
-    a2, base = turned_back(read(M), a2), unpacked(b)
+    a2, base = rotate_back(read(M), a2), unpack(b)
     aa, cc, both = dot(a1, a1), dot(a2, a2), dot(a1, a2)
     first, second = dot(base, a1), dot(base, a2)
     determinant = aa * cc - both * both
@@ -133,18 +133,18 @@ def distances_along_rays(
 
 
 def _rays(xy1, xy2):
-    """Of one point in two images, as scalars: over 1500 models of 64 points a twelfth of the time
-    of products of small matrices."""
+    """The rays of one point in two images, as scalars: over 1500 models of 64 points a twelfth of
+    the time of products of small matrices."""
     return (*xy1, -1.0), (*xy2, -1.0)
 
 
-def _refined_best(M, b, data, p):
-    """Of the candidates the best few refined, of these the best, and its score."""
+def _refine_best(M, b, data, p):
+    """The best few candidates refined; of these the best, and its score."""
     xy1, xy2, _ = data
 
     def score(pair, square):
         behind = 1 - _in_front(pair, xy1, xy2, p)
-        value = (square / jnp.sum(p) + EXACT) * (1 + 100 * behind)
+        value = (square / jnp.sum(p) + ROUNDING_VARIANCE) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
     first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
@@ -210,5 +210,5 @@ def _simpler(points, vtpv):
         return jnp.where(spare > 0, square, jnp.inf)
 
     rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)
-    limit = lambda other: SIMPLER * other + EXACT * average
+    limit = lambda other: SIMPLER * other + ROUNDING_VARIANCE * average
     return rotation < limit(jnp.minimum(variance, plane)), plane < limit(variance)

@@ -39,9 +39,9 @@ from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray, Scalar
 
-FAR = 1e6
+IMPOSSIBLE_ERROR = 1e6
 """Error of an observation that is impossible in a model (a point behind the camera)."""
-CUT = 2.5
+OUTLIER_LIMIT = 2.5
 """Observations beyond this number of robust standard deviations are gross errors (LMedS)."""
 ROUNDING = 1e-11
 """Smallest standard deviation."""
@@ -102,9 +102,10 @@ def consensus(
 
 
 def robust_limit(e: Float[AnyArray, " n"], present: Bool[AnyArray, " n"], size: int) -> Array:
-    """CUT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p. 202)."""
+    """OUTLIER_LIMIT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p.
+    202)."""
     spare = jnp.maximum(jnp.sum(present) - size, 1)
-    return CUT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
+    return OUTLIER_LIMIT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
 
 
 def robust_resection(
@@ -124,7 +125,7 @@ def robust_resection(
     def errors(pose, xy, X):
         e = jnp.linalg.norm(jax.vmap(image_of, (None, 0))(pose, X) - xy, axis=1)
         q = jax.vmap(to_camera, (None, 0))(pose, X)[:, 2]
-        return jnp.where(q < 0, e, FAR)
+        return jnp.where(q < 0, e, IMPOSSIBLE_ERROR)
 
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
@@ -134,7 +135,7 @@ def robust_resection(
         found = refine_resection(pose, xy, X, p * good)
         return found, _good(errors(found.pose, xy, X), p > 0, 3, threshold)
 
-    return _repeated(again, good, pose, lambda found: found.pose)
+    return _repeat(again, good, pose, lambda found: found.pose)
 
 
 def robust_relative_orientation(
@@ -156,7 +157,7 @@ def robust_relative_orientation(
         M, b = pair
         e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2))
         s = jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
-        return jnp.where(jnp.all(s > 0, 1), e, FAR)
+        return jnp.where(jnp.all(s > 0, 1), e, IMPOSSIBLE_ERROR)
 
     def solve(xy1, xy2):
         """Of the four orientations of an E that with most of the five points in front."""
@@ -176,7 +177,7 @@ def robust_relative_orientation(
         result = relative_orientation(xy1, xy2, p * good)
         return result, _good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
-    return _repeated(again, found.inliers)
+    return _repeat(again, found.inliers)
 
 
 def robust_homography(
@@ -237,7 +238,7 @@ def robust_direct_linear_transformation(
 
     def errors(found, xy, X):
         x, y, w = found[0] @ jnp.pad(X, ((0, 0), (0, 1)), constant_values=1).T
-        return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), FAR)
+        return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), IMPOSSIBLE_ERROR)
 
     solve = direct_linear_transformation
     return _robust_linear(key, solve, errors, (xy, X), weights, 6, samples, threshold)
@@ -260,7 +261,7 @@ def robust_intersection(
         d = found.X - X0
         along = jnp.sum(d * rays, 1)
         angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), jnp.abs(along))
-        return jnp.where(along > 0, angle, FAR)
+        return jnp.where(along > 0, angle, IMPOSSIBLE_ERROR)
 
     return _robust_linear(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
 
@@ -280,10 +281,10 @@ def _robust_linear(key, solve, errors, data, weights, size, samples, threshold):
         found = solve(*data, p * good)
         return found, _good(errors(found, *data), p > 0, size, threshold)
 
-    return _repeated(again, good)
+    return _repeat(again, good)
 
 
-def _repeated(again, good, model=None, model_of=lambda found: None):
+def _repeat(again, good, model=None, model_of=lambda found: None):
     """The solution by the good observations, `ROUNDS` times chosen anew, and which they are: one
     program for all rounds and the last solution.
 
@@ -309,10 +310,10 @@ def _good(e, present, size, threshold):
 
 
 def _finite(e):
-    return jnp.where(jnp.isfinite(e), e, FAR)
+    return jnp.where(jnp.isfinite(e), e, IMPOSSIBLE_ERROR)
 
 
 def _median(e, present):
-    """Of those present, the upper one of two."""
+    """The median of those present, the upper one of two."""
     ordered = jnp.sort(jnp.where(present, e, jnp.inf))
     return ordered[jnp.minimum(jnp.sum(present) // 2, e.shape[0] - 1)]

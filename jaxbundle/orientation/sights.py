@@ -18,7 +18,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Index
 
-STEEPEST = -0.15
+LEAST_FORWARD = -0.15
 """Least −q of a unit ray that counts as in front of the camera."""
 PORTION = 4096
 
@@ -89,6 +89,6 @@ def ideal_points(camera: Camera, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarr
 def _portion(model, p, xy):
     def one(xy):
         r, s, q = image_ray(model, tuple(p), xy[0], xy[1])
-        return jnp.where(q < STEEPEST, jnp.stack([-r / q, -s / q]), jnp.nan)
+        return jnp.where(q < LEAST_FORWARD, jnp.stack([-r / q, -s / q]), jnp.nan)
 
     return jax.vmap(one)(xy)

@@ -20,6 +20,6 @@ def need_pillow():
         from PIL import Image
     except ImportError:
         raise InputError(
-            "the heads of photographs need Pillow: pip install 'jaxbundle[images]'"
+            "image headers need Pillow: pip install 'jaxbundle[images]'"
         ) from None
     return Image

@@ -17,7 +17,7 @@ from jaxbundle.photographs.exif import Place
 
 SIGMA, SIGMA_HEIGHT = 3.0, 6.0
 """Default σ of satellite positions, metres."""
-WORTH = 8.0
+SMALLEST_EXTENT = 8.0
 """Minimum extent of positions, in σ."""
 
 
@@ -52,7 +52,7 @@ def map_positions(
     height = np.array([p.height for p in known], float)
     sigma = np.array([p.sigma or SIGMA for p in known])
     spread = np.hypot(np.ptp(x), np.ptp(y))
-    if not spread > WORTH * np.median(sigma):
+    if not spread > SMALLEST_EXTENT * np.median(sigma):
         return None
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)

@@ -119,7 +119,7 @@ def _refuse_cut(path):
         with open_image(path) as image:
             image.load()
     except (OSError, SyntaxError, ValueError):
-        raise InputError(f"{path}: the file is cut short; copy it again") from None
+        raise InputError(f"{path}: the file is truncated; copy it again") from None
 
 
 def _by_pillow(path, colour):

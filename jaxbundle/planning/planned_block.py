@@ -10,7 +10,7 @@ from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block
 from jaxbundle.planning.vertical_photographs import BlockDesign
 
-LEAST = 5
+FEWEST_ROWS = 5
 """Minimum rows and columns of tie points; odd, so that control points can be at the middles."""
 RELIEF = 0.02
 """Heights of tie points vary by ± this fraction of the flying height."""
@@ -71,6 +71,6 @@ def _control(points: int, every: int | None) -> list[int]:
 
 
 def _odd(steps: float) -> int:
-    """An odd number of points for at least so many steps."""
-    n = max(LEAST, math.ceil(steps - 1e-9) + 1)
+    """An odd number of points for at least this many steps."""
+    n = max(FEWEST_ROWS, math.ceil(steps - 1e-9) + 1)
     return n + (n + 1) % 2

@@ -17,10 +17,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxbundle.arguments import at_least_zero, numeric_array, vector, whole
+from jaxbundle.arguments import at_least_zero, integer, numeric_array, vector
 from jaxbundle.cameras import default_parameters, get_model, image_ray
 from jaxbundle.cameras.pixel_frame import pixel_frame
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
@@ -67,10 +67,10 @@ class Sensor:
 
     def __post_init__(self):
         at_least_zero("sensor: noise", self.noise)
-        whole("sensor: fine", self.fine, most=16)
+        integer("sensor: fine", self.fine, most=16)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Rendered:
     """A photograph: grey values; `point`: the true object point of every pixel's centre, NaN where

@@ -25,11 +25,11 @@ from jaxbundle.types import present
 BLOCKS = (32, 8)
 """Sides of the blocks of rays, rows and columns, before single rays."""
 STEPS, SECANTS = 400, 12
-NEAR = 1e-3
+NEAR_SURFACE = 1e-3
 """A ray is traced to f below this fraction of the relief, then by secants."""
-GRAZING = 1e-9
-"""Like `NEAR`, if the secants diverge because the ray grazes a summit."""
-SETTLED = 1e-9
+GRAZING_TOLERANCE = 1e-9
+"""Like `NEAR_SURFACE`, if the secants diverge because the ray grazes a summit."""
+ON_SURFACE = 1e-9
 """Tolerance of f for a point on the surface, relative to the length of the ray."""
 SAMPLES = 256
 """Samples per side for bounds of height and slope if these are not given."""
@@ -121,15 +121,15 @@ class HeightField:
         near, spread = np.broadcast_to(near, len(d)), np.broadcast_to(spread, len(d))
         leave = leave + relief
         ends = (reach + spread, near, spread, leave)
-        t = self._march(o, d, t, np.flatnonzero(usable), ends, NEAR * relief)
+        t = self._march(o, d, t, np.flatnonzero(usable), ends, NEAR_SURFACE * relief)
         if not last:
             return t
         found = self._settle(o, d, t)
         lost = np.flatnonzero(np.isfinite(t) & ~np.isfinite(found))
         if len(lost):  # a ray that grazes a summit goes on
-            t = self._march(o, d, t, lost, ends, GRAZING * relief)
+            t = self._march(o, d, t, lost, ends, GRAZING_TOLERANCE * relief)
             with np.errstate(invalid="ignore"):
-                on = self._above(o[lost], d[lost], t[lost]) <= GRAZING * relief
+                on = self._above(o[lost], d[lost], t[lost]) <= GRAZING_TOLERANCE * relief
             found[lost] = self._inside(o[lost], d[lost], np.where(on, t[lost], np.inf))
         return found
 
@@ -162,9 +162,9 @@ class HeightField:
                 step = np.where(g == f, 0.0, -g * (other - here) / (g - f))
                 step = np.where(np.isfinite(step), step, 0.0)
                 here, f = other, g
-                if (np.abs(f) <= SETTLED * here).all():
+                if (np.abs(f) <= ON_SURFACE * here).all():
                     break
-        good = (np.abs(f) <= 1e3 * SETTLED * here) & (here > 0)
+        good = (np.abs(f) <= 1e3 * ON_SURFACE * here) & (here > 0)
         t = np.full(len(t), np.inf)
         t[chosen] = self._inside(o, d, np.where(good, here, np.inf))
         return t

@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.arguments import numeric_array, positive, shown, text, whole
+from jaxbundle.arguments import integer, numeric_array, positive, show, text
 from jaxbundle.cameras import default_parameters, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice
 from jaxbundle.network.tables import (
@@ -142,13 +142,13 @@ def simulate_with_truth(
     check_choice("residuals", residuals, CHOICES["residuals"])
     if not isinstance(stations, Stations):
         raise InputError(
-            f"stations must be Stations, but is {shown(stations)}: use ring_of_stations, "
+            f"stations must be Stations, but is {show(stations)}: use ring_of_stations, "
             "aerial_block or stations_looking_at"
         )
     targets = rows_of_three(targets, "targets")
-    seed = whole("seed", seed, least=0, most=LARGEST_SEED)
-    min_rays = whole("min_rays", min_rays, least=0)
-    max_rays = None if max_rays is None else whole("max_rays", max_rays)
+    seed = integer("seed", seed, least=0, most=LARGEST_SEED)
+    min_rays = integer("min_rays", min_rays, least=0)
+    max_rays = None if max_rays is None else integer("max_rays", max_rays)
     if max_incidence is not None:
         max_incidence = positive("max_incidence", max_incidence)
     distance_sigma = positive("distance_sigma", distance_sigma)
@@ -172,7 +172,7 @@ def simulate_with_truth(
     if max_rays is not None:
         kept[kept] = _at_most(rays[1][kept], max_rays, rng)
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    (image, point, xy), used = _imaged(rays, kept, need)
+    (image, point, xy), used = _select_imaged(rays, kept, need)
     row = np.cumsum(used) - 1
     points = _points(targets, role, used, control_sigma)
     ends = _ends(distances, len(targets), used, row)
@@ -190,7 +190,7 @@ def simulate_with_truth(
     return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
 
 
-def _imaged(rays, kept, need):
+def _select_imaged(rays, kept, need):
     """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""
@@ -271,14 +271,14 @@ def _roles(points: int, control, control_sigma, check):
     role = np.full(points, "tie", dtype=object)
     sigma = _not_negative(control_sigma, 3, "control_sigma")
     if (sigma == 0).any() and (sigma > 0).any():
-        raise InputError("control_sigma: 0 (fixed) must stand for all three axes or for none")
+        raise InputError("control_sigma: 0 (fixed) must be given for all three axes or for none")
     for name, chosen, word in (
         ("control", control, "fixed" if (sigma == 0).all() else "control"),
         ("check", check, "check"),
     ):
         chosen = _indices(name, chosen)
         if chosen.ndim != 1:
-            raise InputError(f"{name} must be a list of indices, but is {shown(chosen.tolist())}")
+            raise InputError(f"{name} must be a list of indices, but is {show(chosen.tolist())}")
         if not np.isin(chosen, np.arange(points)).all():
             raise InputError(f"{name} holds an index that is not among the {points} targets")
         if (role[chosen] != "tie").any():
@@ -292,14 +292,14 @@ def _indices(name: str, values):
     array = numeric_array(name, values, "indices of targets")
     if array.size and array.dtype.kind not in "iu":
         raise InputError(f"{name} must be indices of targets, whole numbers, but is "
-                         f"{shown(array.tolist())}")  # fmt: skip
+                         f"{show(array.tolist())}")  # fmt: skip
     return array.astype(int)
 
 
 def _not_negative(value, size: int, name: str):
     value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
     if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
-        raise InputError(f"{name} is {shown(value.tolist())}; it must be 0 or positive, one number "
+        raise InputError(f"{name} is {show(value.tolist())}; it must be 0 or positive, one number "
                          f"or {size}")  # fmt: skip
     return np.broadcast_to(value, size)
 
@@ -319,7 +319,7 @@ def _ends(distances, targets: int, used, row):
                                .any()):  # fmt: skip
         raise InputError(
             "distances must be pairs of indices of two different targets, but is "
-            f"{shown(ends.tolist())}"
+            f"{show(ends.tolist())}"
         )
     ends = ends.reshape(-1, 2)
     if not np.isin(ends, np.arange(targets)).all():
@@ -363,7 +363,7 @@ def _at_most(point, max_rays: int, rng):
 def _look(stations, targets, cameras, of_station, image_format):
     """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
     found, number = [], len(targets)
-    wide = max(LEAST_TARGETS, rounded(number))
+    wide = max(LEAST_TARGETS, round_up(number))
     targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
     for c, camera in enumerate(cameras):
         model = get_model(camera.model)
@@ -371,7 +371,7 @@ def _look(stations, targets, cameras, of_station, image_format):
         p = tuple(float(values[name]) for name in model.parameters)
         low, high = _format(camera, image_format)
         index = np.flatnonzero(of_station == c)
-        some = max(LEAST_STATIONS, rounded(len(index)))
+        some = max(LEAST_STATIONS, round_up(len(index)))
         at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
         for begin in range(0, len(index), at_once):
             # The last batch is padded, so that all have one shape and compile once.

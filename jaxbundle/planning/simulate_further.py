@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
@@ -20,7 +20,7 @@ from jaxbundle.planning.stations import LARGEST_SEED
 from jaxbundle.system.programs import compile_once
 
 MOST_ROUNDS, SETTLED = 50, 1e-13
-"""Of the search for the line of an image point, and the change that ends it, relative to the
+"""Rounds of the search for the line of an image point, and the change that ends it, relative to the
 largest image coordinate."""
 
 
@@ -43,7 +43,7 @@ def simulate_further(
     and truth have different image points.
     """
     require_x64()
-    random = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
+    random = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
     known: set[str] = set()
     made = []
     for rows in require_network(network).further:
@@ -53,7 +53,7 @@ def simulate_further(
         known |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
         if isinstance(rows, RollingShutter):
-            shift = _moved_image_points(truth, rows, values) - truth.observations.xy
+            shift = _expose_moving(truth, rows, values) - truth.observations.xy
             network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
@@ -69,7 +69,7 @@ def simulate_further(
     return network.replace(further=tuple(made))
 
 
-def _moved_image_points(truth: Network, rows: RollingShutter, values):
+def _expose_moving(truth: Network, rows: RollingShutter, values):
     """The image points of the truth in the moving camera: an image point is exposed with
     its line, which depends on the image point."""
     truth = truth.replace(further=(rows,), residuals="measured")

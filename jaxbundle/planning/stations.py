@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import number, numeric_array, positive, shown, vector, whole
-from jaxbundle.display import shows_itself
+from jaxbundle.arguments import integer, number, numeric_array, positive, show, vector
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.system.programs import compile_once
@@ -21,7 +21,7 @@ COORDINATES = "finite coordinates X, Y, Z"
 LARGEST_SEED = 2**128
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Stations:
     """Exterior orientations: projection centres [I, 3] and ω, φ, κ [I, 3] in radians.
@@ -83,7 +83,7 @@ def stations_looking_at(
     if look_at.shape not in ((3,), position.shape) or not np.isfinite(look_at).all():
         raise InputError(
             f"look_at must be finite coordinates [3], or {list(position.shape)}, one point for "
-            f"each station, but is {shown(look_at.tolist())}"
+            f"each station, but is {show(look_at.tolist())}"
         )
     above = vector("up", up, 3, "a direction X, Y, Z")
     if not above.any():
@@ -122,9 +122,9 @@ def ring_of_stations(
     camera is rolled by 90° (2: every other one; 0: none). Without rolled cameras, or an object with
     depth, the principal point is poorly determined.
     """
-    stations = whole("stations", stations)
+    stations = integer("stations", stations)
     radius, height = positive("radius", radius), number("height", height)
-    roll_every = whole("roll_every", roll_every, least=0)
+    roll_every = integer("roll_every", roll_every, least=0)
     middle = vector("look_at", look_at, 3, COORDINATES)
     azimuth = 2 * np.pi * np.arange(stations) / stations
     offset = np.stack(
@@ -161,8 +161,8 @@ def aerial_block(
 
     **Returns:** strips × images_per_strip stations, centred above `centre`.
     """
-    strips = whole("strips", strips)
-    images_per_strip = whole("images_per_strip", images_per_strip)
+    strips = integer("strips", strips)
+    images_per_strip = integer("images_per_strip", images_per_strip)
     size = vector("footprint", footprint, 2, "two lengths, along and across the flight")
     if not (size > 0).all():
         raise InputError(f"footprint must be two positive lengths, but is {size.tolist()}")
@@ -218,13 +218,13 @@ def grid_of_targets(
     **Arguments:** `spacing` along X and Y; `relief`: heights vary at random (by `seed`) within
     ± relief; 0 gives a plane.
     """
-    columns, rows = whole("columns", columns), whole("rows", rows)
+    columns, rows = integer("columns", columns), integer("rows", rows)
     dx, dy = vector("spacing", spacing, 2, "one positive length, or two along X and Y")
     if not min(dx, dy) > 0:
-        raise InputError(f"spacing must be positive, but is {shown(spacing)}")
+        raise InputError(f"spacing must be positive, but is {show(spacing)}")
     relief = number("relief", relief, "0 or a positive length", _a_length)
     middle = vector("centre", centre, 3, COORDINATES)
-    seed = whole("seed", seed, least=0, most=LARGEST_SEED)
+    seed = integer("seed", seed, least=0, most=LARGEST_SEED)
     x = dx * (np.arange(columns) - (columns - 1) / 2)
     y = dy * (np.arange(rows) - (rows - 1) / 2)
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -240,10 +240,10 @@ def cloud_of_targets(
     centre: Numbers = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "points 3"]:
     """Targets at random in a box of the given `size` (one edge, or three): [points, 3]."""
-    points = whole("points", points)
+    points = integer("points", points)
     half = vector("size", size, 3, "one length of an edge, or three") / 2
     if (half < 0).any():
-        raise InputError(f"size must be 0 or positive lengths, but is {shown((2 * half).tolist())}")
+        raise InputError(f"size must be 0 or positive lengths, but is {show((2 * half).tolist())}")
     middle = vector("centre", centre, 3, COORDINATES)
-    rng = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
+    rng = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
     return middle + rng.uniform(-half, half, (points, 3))

@@ -19,10 +19,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.arguments import number, positive, whole
+from jaxbundle.arguments import integer, number, positive
 
 OCTAVES_OF_EDGES = 4
-AT_ONCE = 1 << 15
+SAMPLES_AT_ONCE = 1 << 15
 """Batch size of interpolated samples, which stay in the cache."""
 TURN = (1.0, 1.0), (0.7236, 0.6180), (2.1, 0.0731)
 """Rotation, radians, and scale of the copies of the tile; the first is not turned."""
@@ -54,7 +54,7 @@ class Texture:
 
     def __post_init__(self):
         positive("texture: texel", self.texel)
-        side = whole("texture: side", self.side, least=16, most=1 << 14)
+        side = integer("texture: side", self.side, least=16, most=1 << 14)
         if side & (side - 1):
             raise ValueError(f"texture: side must be a power of two, but is {side}")
         number("texture: contrast", self.contrast)
@@ -66,8 +66,8 @@ class Texture:
     ) -> Float[np.ndarray, " n"]:
         """Grey values of patches of the given widths at surface coordinates, object unit."""
         out = np.empty(len(s))
-        for first in range(0, len(s), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
+        for first in range(0, len(s), SAMPLES_AT_ONCE):
+            part = slice(first, first + SAMPLES_AT_ONCE)
             out[part] = self._grey(s[part], t[part], width[part])
         return out
 

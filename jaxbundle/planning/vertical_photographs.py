@@ -61,7 +61,7 @@ class BlockDesign:
 
     @property
     def photographs(self) -> int:
-        """Of the whole block."""
+        """Number of photographs of the whole block."""
         return self.strips * self.photographs_per_strip
 
     @property

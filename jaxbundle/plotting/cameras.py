@@ -21,7 +21,7 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-LEAST = 0.1
+SMALLEST_RANGE = 0.1
 """Minimum range ± of the distortion axis, in µm or px, so that rounding does not look like
 distortion."""
 
@@ -60,7 +60,7 @@ def distortion_curve(adjustment, camera: str, ax=None):
     quiet(ax)
     ax.set_xlim(0, found.radius[-1] or 1.0)
     bottom, top = ax.get_ylim()
-    ax.set_ylim(min(bottom, -LEAST), max(top, LEAST))
+    ax.set_ylim(min(bottom, -SMALLEST_RANGE), max(top, SMALLEST_RANGE))
     label(ax, "x", "distance from the principal point", found.unit)
     label(ax, "y", "distortion, measured − ideal", unit)
     model = adjustment.cameras[camera]["model"]

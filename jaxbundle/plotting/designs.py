@@ -25,7 +25,7 @@ from jaxbundle.plotting.style import (
 
 EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 SIZE = 0.12
-"""Of a camera, as part of the network."""
+"""Size of a camera relative to the network."""
 
 
 def network_view(designed: Design, ax=None, after: bool = True):

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 from jaxbundle.system.programs import compile_once
 
@@ -29,7 +29,7 @@ ROUNDING = 1e-13
 """Distortion below this fraction of an image coordinate is rounding noise."""
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class DistortionProfile:
     """Distortion over the radius, all in the unit of the camera's model; σ a posteriori."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.matches import Pairs, match_graph, overlap_matrix, tracks_in_photograph
@@ -27,7 +27,7 @@ FIGURES = ("plan.png", "perspective.png", "histogram.png",
            "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
 """Patterns of the names of the figures of a result."""
 PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
-"""Those of the pairs of photographs, and of the tracks in them."""
+"""Patterns of the figures of pairs of photographs, and of the tracks in them."""
 
 
 def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:
@@ -45,7 +45,7 @@ def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Pa
     written (`jaxbundle.io.writing.folders`), `NotSolvedError` if there is no result.
     """
     need_matplotlib()
-    with replaced_folder(folder, "save_figures", FIGURES, force) as new:
+    with replace_folder(folder, "save_figures", FIGURES, force) as new:
         written = draw_figures(adjustment, new)
     return [Path(folder) / path.name for path in written]
 

@@ -21,7 +21,7 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-LARGE = 3.0
+LARGE_TAU = 3.0
 """Residuals with |τ| above this are drawn in another colour."""
 
 
@@ -48,7 +48,7 @@ def residual_vectors(adjustment, image: str, ax=None):
     v = np.nan_to_num(v)
     longest = np.hypot(*v.T).max(initial=0.0)
     factor = round_number(0.1 * diagonal / longest) if longest > 0 else 1.0
-    large = (np.abs(np.nan_to_num(tau)) > LARGE).any(1)
+    large = (np.abs(np.nan_to_num(tau)) > LARGE_TAU).any(1)
     arrows = ax.quiver(
         *xy.T, *v.T, angles="xy", scale_units="xy", scale=1 / factor, width=0.0028,
         headwidth=3.5, headlength=4.5, headaxislength=4, minlength=0,
@@ -89,7 +89,7 @@ def residual_vectors(adjustment, image: str, ax=None):
     rms = float(np.sqrt((v**2).mean())) if len(v) else 0.0
     detail = f"{len(points)} points, RMS {scale * rms:.3g} {unit}, vectors × {factor:g}"
     if large.any():
-        detail += f", |τ| > {LARGE:g} coloured"
+        detail += f", |τ| > {LARGE_TAU:g} coloured"
     title(ax, f"Image {image}: residuals ({network.residuals})", detail)
     return ax
 

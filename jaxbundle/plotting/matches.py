@@ -22,7 +22,7 @@ from jaxbundle.plotting.style import (
 
 KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
 """Colour and line of a pair that a relative orientation, a plane, a rotation explains."""
-WIDEST = 4.0
+WIDEST_LINE = 4.0
 """Width of the line of the pair with the most matches, points."""
 
 Pairs = Sequence[tuple[str, str, int, int, str]]
@@ -45,7 +45,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
         share = verified / most
         ax.plot(
             *np.stack([place[one], place[other]], 1), line, color=colour, alpha=0.25 + 0.6 * share,
-            linewidth=WIDEST * max(share, 0.1), label="" if kind in drawn else kind, zorder=2,
+            linewidth=WIDEST_LINE * max(share, 0.1), label="" if kind in drawn else kind, zorder=2,
         )  # fmt: skip
         drawn.add(kind)
     at = np.array(list(place.values()))

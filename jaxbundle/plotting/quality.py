@@ -16,7 +16,7 @@ from jaxbundle.plotting.style import (
 
 MARGIN = 0.08
 """Labels of contours keep away from the frame by this part of the image."""
-SMALL = 0.02
+SMALLEST_SIGMA = 0.02
 """Default lower end of scales of σ, in pixels; a tenth of it is the minimum."""
 
 
@@ -89,7 +89,9 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
 
     sigma = uncertainty.sigma
     finite = sigma[np.isfinite(sigma)]
-    low = max(float(finite.min(initial=np.inf)), SMALL / 10) if len(finite) else SMALL
+    low = SMALLEST_SIGMA
+    if len(finite):
+        low = max(float(finite.min(initial=np.inf)), SMALLEST_SIGMA / 10)
     high = max(float(finite.max(initial=0.0)), 1.01 * low)
     u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
     levels = np.geomspace(low, high, 13)

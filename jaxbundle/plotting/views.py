@@ -264,8 +264,8 @@ def _write_ids(ax, tables, places) -> None:
             angle = np.arctan2(*far[::-1]) if np.hypot(*far) > 0.01 else np.pi / 4
             turns = angle + np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
             boxes = [_box(x, y, wide, high, dots * GAP, turn) for turn in turns]
-            best = min(range(len(boxes)), key=lambda i: _covered(boxes[i], taken, frame))
-            if _covered(boxes[best], taken, frame) > 0:
+            best = min(range(len(boxes)), key=lambda i: _count_covered(boxes[i], taken, frame))
+            if _count_covered(boxes[best], taken, frame) > 0:
                 continue
             taken.append(boxes[best])
             left, right, low, top = boxes[best]
@@ -285,7 +285,7 @@ def _box(x, y, wide, high, gap, turn):
     return (middle_x - wide / 2, middle_x + wide / 2, middle_y - high / 2, middle_y + high / 2)
 
 
-def _covered(box, taken, frame) -> float:
+def _count_covered(box, taken, frame) -> float:
     """The number of occupied boxes that a box covers, and whether it leaves the frame."""
     left, right, low, top = box
     out = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1

@@ -14,9 +14,9 @@ ellipsoid is given. `docs/pushbroom.md` has the conventions.
 
 from jaxbundle.pushbroom import rpc as rpc
 from jaxbundle.pushbroom.accuracy import closed_form as closed_form
-from jaxbundle.pushbroom.accuracy import drawn as drawn
 from jaxbundle.pushbroom.accuracy import ground_errors as ground_errors
-from jaxbundle.pushbroom.accuracy import propagated as propagated
+from jaxbundle.pushbroom.accuracy import propagate_accuracy as propagate_accuracy
+from jaxbundle.pushbroom.accuracy import simulate_accuracy as simulate_accuracy
 from jaxbundle.pushbroom.ancillary import attitude_table as attitude_table
 from jaxbundle.pushbroom.ancillary import position_table as position_table
 from jaxbundle.pushbroom.corrections import Corrections as Corrections
@@ -34,7 +34,7 @@ from jaxbundle.pushbroom.locate import locate_lines as locate_lines
 from jaxbundle.pushbroom.locate import locate_point as locate_point
 from jaxbundle.pushbroom.locate import locate_points as locate_points
 from jaxbundle.pushbroom.noise import Noise as Noise
-from jaxbundle.pushbroom.noise import disturbed as disturbed
+from jaxbundle.pushbroom.noise import add_errors as add_errors
 from jaxbundle.pushbroom.orbit import state_orbit as state_orbit
 from jaxbundle.pushbroom.project import Projected as Projected
 from jaxbundle.pushbroom.project import Status as Status
@@ -44,7 +44,7 @@ from jaxbundle.pushbroom.project import project_near as project_near
 from jaxbundle.pushbroom.project import project_points as project_points
 from jaxbundle.pushbroom.rpc import Rpc as Rpc
 from jaxbundle.pushbroom.rpc import RpcStatus as RpcStatus
-from jaxbundle.pushbroom.rpc_bias import compensated as compensated
+from jaxbundle.pushbroom.rpc_bias import apply_bias as apply_bias
 from jaxbundle.pushbroom.rpc_bias import fit_bias as fit_bias
 from jaxbundle.pushbroom.rpc_fit import RpcCheck as RpcCheck
 from jaxbundle.pushbroom.rpc_fit import RpcFit as RpcFit

@@ -27,12 +27,12 @@ from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import Vector, difference
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_point
-from jaxbundle.pushbroom.noise import Noise, disturbed, draw, no_errors, sigmas
+from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas, zero_errors
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
-TINY = 1e-300
+SMALLEST_DENOMINATOR = 1e-300
 """Replaces zero in a denominator."""
 
 
@@ -54,7 +54,7 @@ class GroundAccuracy(eqx.Module):
         return float(np.sqrt(np.mean(self.rms**2)))
 
 
-def propagated(
+def propagate_accuracy(
     image: PushbroomImage,
     surface: Surface,
     lines: Float[np.ndarray, " n"],
@@ -73,7 +73,7 @@ def propagated(
     return GroundAccuracy(covariance, rms, ce90, circular_error(covariance))
 
 
-def drawn(
+def simulate_accuracy(
     image: PushbroomImage,
     surface: Surface,
     lines: Float[np.ndarray, " n"],
@@ -127,7 +127,8 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     angle = (np.arange(2000) + 0.5) * np.pi / 2000
     # in axes of unit variance the circle has the radius r/√(λ₁cos² + λ₂sin²)
     small, great = variances.swapaxes(0, 1) / large
-    stretch = np.maximum(great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2, TINY)
+    stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
+    stretch = np.maximum(stretch, SMALLEST_DENOMINATOR)
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 
@@ -136,7 +137,7 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
 def _covariances(image, surface, lines, pixels, sigma):
     """`sigma` by the kinds of errors that there are."""
     no_rows = jnp.zeros((0, 3))
-    nothing = no_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
+    nothing = zero_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
     zero = jax.tree.map(jnp.zeros_like, sigma)
 
     def of_place(line, pixel):
@@ -144,7 +145,7 @@ def _covariances(image, surface, lines, pixels, sigma):
         axes = east_north(surface, X0)
         move = lambda errors: horizontal(
             axes, X0, locate_point(
-                disturbed(image, nothing._replace(**errors)), surface, line, pixel
+                add_errors(image, nothing._replace(**errors)), surface, line, pixel
             ),
         )  # fmt: skip
         J = jax.jacrev(move)(zero)
@@ -157,7 +158,7 @@ def _covariances(image, surface, lines, pixels, sigma):
 @partial(compile_once, static=())
 def _draws(image, surface, lines, pixels, sigma, keys):
     def one(key):
-        wrong = disturbed(image, draw(sigma, key))
+        wrong = add_errors(image, draw(sigma, key))
         return _differences(wrong, image, surface, lines, pixels)
 
     return jax.lax.map(one, keys)

@@ -119,10 +119,10 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
     if (bad := np.diff(times) <= 0).any():
         row = int(bad.argmax()) + 1
         before, time = times[row - 1 : row + 1]
-        wrong = "is there twice" if time == before else f"comes after {before:.15g} s"
+        wrong = "occurs twice" if time == before else f"comes after {before:.15g} s"
         raise InputError(
-            f"{source(row)}: the time {time:.15g} s {wrong}; sort the rows by time and leave "
-            "every time once"
+            f"{source(row)}: the time {time:.15g} s {wrong}; sort the rows by time and keep "
+            "each time once"
         )
 
 
@@ -133,7 +133,7 @@ def extrapolation_limit(rows: Float[np.ndarray, " rows"]) -> float:
     return min(max(STEPS * step, SHORTEST), LONGEST)
 
 
-def told_extrapolation(
+def warn_of_extrapolation(
     rows: Float[np.ndarray, " rows"], times: Float[np.ndarray, " lines"], source: Source
 ) -> tuple[str, ...]:
     """A warning if the rows of a product begin after, or end before, the times of the lines.

@@ -33,7 +33,7 @@ from jaxbundle.types import AnyArray
 
 BLOCK, STEP = 256, 16
 """Pixels of a block of the map along each side, and between its nodes."""
-BESIDE = 2.0 * BLOCK
+SEARCH_MARGIN = 2.0 * BLOCK
 """Nodes are searched this many lines and pixels beyond the image, to enclose its edges."""
 
 
@@ -81,7 +81,7 @@ def block_places(
     """
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
-    found = project_points(image, search, raised.reshape(3, -1), margin=BESIDE)
+    found = project_points(image, search, raised.reshape(3, -1), margin=SEARCH_MARGIN)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():
@@ -97,7 +97,7 @@ def block_places(
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
     if occlusion and isinstance(surface, Terrain):
-        inside &= ~np.asarray(_occluded(scanner, search, surface, line, pixel, ground))
+        inside &= ~np.asarray(_are_occluded(scanner, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
@@ -145,7 +145,7 @@ def _locate(image, search, surface, line, pixel):
 
 
 @partial(compile_once, static=())
-def _occluded(image, search, surface, line, pixel, ground):
+def _are_occluded(image, search, surface, line, pixel, ground):
     """Whether the rays of image positions end before their points [3, rows, columns].
 
     A ray without heights on its way to the point hides nothing.

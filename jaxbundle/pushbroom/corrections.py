@@ -38,9 +38,9 @@ from jaxbundle.geometry.vectors import (
     difference,
     dot,
     length,
-    scaled,
+    scale_vector,
     unit,
-    unpacked,
+    unpack,
 )
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 
@@ -59,7 +59,7 @@ RATIOS = INDICES[:-1] / INDICES[1:]
 ZETAS = np.diff(INDICES) * -(INDICES[:-1] + INDICES[1:]) / INDICES[1:] ** 2
 """(n₁/n₂)² − 1, without cancellation."""
 
-NEAR = 1e-3
+SMALLEST_HEIGHT = 1e-3
 """A layer boundary this close above the ground, in metres, is ignored."""
 
 
@@ -81,10 +81,10 @@ def true_direction(seen: Vector, velocity: Vector) -> Triple:
     a, b = dot(seen, seen), dot(seen, velocity)
     c = dot(velocity, velocity) - LIGHT**2
     k = (b + jnp.sqrt(b * b - a * c)) / a
-    return scaled(1 / LIGHT, along(scaled(-1.0, velocity), seen, k))
+    return scale_vector(1 / LIGHT, along(scale_vector(-1.0, velocity), seen, k))
 
 
-def seen_direction(true: Vector, velocity: Vector) -> Triple:
+def apparent_direction(true: Vector, velocity: Vector) -> Triple:
     """The direction in which a camera with this velocity sees light from `true`."""
     return along(velocity, unit(true), LIGHT)
 
@@ -104,7 +104,7 @@ def earlier_earth(v: Vector, distance: Scalar) -> Triple:
     return cosine * v[0] - sine * v[1], sine * v[0] + cosine * v[1], v[2]
 
 
-def refracted(
+def refract(
     earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector
 ) -> tuple[Triple, Triple]:
     """The last straight part of a ray down to a `height`: its origin and direction.
@@ -118,8 +118,8 @@ def refracted(
         X = along(o, d, ray_to_ellipsoid(surface, o, d))
         n = normal(surface, X)
         k = ratio * dot(d, n)
-        bent = along(scaled(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
-        passed = (border > height + NEAR) & (residual(surface, o) > 0)
+        bent = along(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
+        passed = (border > height + SMALLEST_HEIGHT) & (residual(surface, o) > 0)
         choose = lambda new, old: tuple(jnp.where(passed, a, b) for a, b in zip(new, old))
         return (choose(X, o), choose(bent, d)), None
 
@@ -127,7 +127,7 @@ def refracted(
     *ray, _ = jnp.broadcast_arrays(*o, *unit(d), height)
     ends = tuple(ray[:3]), tuple(ray[3:])
     (start, bent), _ = jax.lax.scan(through, ends, (BORDERS, RATIOS, ZETAS))
-    return unpacked(start), unpacked(bent)
+    return unpack(start), unpack(bent)
 
 
 def require_ellipsoid(earth: Ellipsoid | None) -> Ellipsoid:
@@ -139,7 +139,7 @@ def require_ellipsoid(earth: Ellipsoid | None) -> Ellipsoid:
     return earth
 
 
-def seen_point(
+def apparent_point(
     corrections: Corrections, earth: Ellipsoid | None, P: Vector, V: Vector, X: Vector
 ) -> Triple:
     """The apparent position of the point X for a camera at P with the velocity V.
@@ -158,12 +158,12 @@ def seen_point(
     if corrections.refraction:
         height = geodetic(require_ellipsoid(earth), X)[2]
         for _ in range(2):
-            start, bent = refracted(earth, height, o, d)
+            start, bent = refract(earth, height, o, d)
             nearest = along(start, bent, dot(difference(X, start), bent))
             d = along(d, difference(X, nearest), 1.0)
     if corrections.light_time:
         d = earlier_earth(d, -distance)
     if corrections.aberration:
-        seen = seen_direction(d, inertial_velocity(P, V))
-        d = scaled(length(d) / length(seen), seen)
+        seen = apparent_direction(d, inertial_velocity(P, V))
+        d = scale_vector(length(d) / length(seen), seen)
     return along(P, d, 1.0)

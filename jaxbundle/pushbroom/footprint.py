@@ -37,13 +37,13 @@ HEIGHTS = -1000.0, 10_000.0
 """Lowest and highest height, metres, if the camera is more than twice as high."""
 TIMES, ACROSS, LEVELS = 17, 9, 4
 """Times, pixels and heights of the lattice through which the polynomials are fitted."""
-WITHIN = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
+TESTED_POSITIONS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
 """Positions in each piece where the speed is tested."""
-STEEP = 0.1
+SMALLEST_SPEED = 0.1
 """Smallest speed relative to the largest; smallest cosine between a sight and the axis."""
-WIDER = 1.2
+SLOPE_MARGIN = 1.2
 """Slopes are tested this factor beyond those of the lattice points."""
-FAR = 50.0
+LARGEST_ERROR = 50.0
 """Allowed error of the polynomials, in lines and pixels."""
 POWERS = np.array([
     (i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)
@@ -93,18 +93,19 @@ def make_footprint(
         return None
     footprint, errors = _fit(D, times, u, heights)
     period = float(image.times.time(1.0) - image.times.time(0.0))
-    if not (errors <= FAR * np.array([period, 1.0])).all():
+    if not (errors <= LARGEST_ERROR * np.array([period, 1.0])).all():
         return None
     reach = _reach(pieces, np.asarray(samples), D.reshape(-1, 3))
     if reach is None:
         return None
     xi = np.linspace(*reach, ACROSS)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
-    k, within = np.indices((len(pieces.ends) - 1, len(WITHIN))).reshape(2, -1)
-    _, speed = _speeds_at(pieces, k, WITHIN[within], xi, eta, levels, line, earth)
+    k, within = np.indices((len(pieces.ends) - 1, len(TESTED_POSITIONS))).reshape(2, -1)
+    _, speed = _speeds_at(pieces, k, TESTED_POSITIONS[within], xi, eta, levels, line, earth)
     speed = speed[np.isfinite(speed)]  # a ray that misses sees no point
     same = speed.min() * speed.max() > 0
-    return footprint if same and np.abs(speed).min() > STEEP * np.abs(speed).max() else None
+    moving = np.abs(speed).min() > SMALLEST_SPEED * np.abs(speed).max()
+    return footprint if same and moving else None
 
 
 def _heights(image, earth):
@@ -178,11 +179,11 @@ def _reach(pieces, samples, D):
     c = np.asarray(pieces.coefficients)[k]
     numbers = np.einsum("kpn,pk->kn", c, tau ** np.arange(c.shape[1])[:, None])
     rsq = np.einsum("kij,nj->kni", numbers[:, :9].reshape(-1, 3, 3), D) + numbers[:, None, 9:]
-    if (-rsq[..., 2] < STEEP * np.linalg.norm(rsq, axis=2)).any():
+    if (-rsq[..., 2] < SMALLEST_SPEED * np.linalg.norm(rsq, axis=2)).any():
         return None
     xi = -rsq[..., 0] / rsq[..., 2]
     middle, half = (xi.max() + xi.min()) / 2, (xi.max() - xi.min()) / 2
-    return middle - WIDER * half, middle + WIDER * half
+    return middle - SLOPE_MARGIN * half, middle + SLOPE_MARGIN * half
 
 
 def _cubic(c, x, y, z):

@@ -30,7 +30,7 @@ from jaxbundle.pushbroom.trajectory import (
 )
 from jaxbundle.types import AnyArray, Numbers, Scalar
 
-LONGEST = 10_000_000
+LONGEST_IMAGE = 10_000_000
 """Upper bound for lines or pixels."""
 
 
@@ -112,24 +112,25 @@ def check_size(lines: float, pixels: float, where: str) -> None:
     """Refuse an image size that is not integer, without lines, with fewer than 2 pixels, or
     impossibly large."""
     for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
-        if not least <= size <= LONGEST or size != int(size):
+        if not least <= size <= LONGEST_IMAGE or size != int(size):
             raise InputError(
-                f"{where}: {size:.15g} {name}; a whole number from {least} to {LONGEST} is expected"
+                f"{where}: {size:.15g} {name}; a whole number from {least} to "
+                f"{LONGEST_IMAGE} is expected"
             )
 
 
 def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose at the time t, in seconds; NaN outside the tables."""
-    return moved_pose(given_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
+    return move_pose(recorded_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
-def given_pose(image: PushbroomImage, t: Scalar) -> Pose:
+def recorded_pose(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose of the platform from its tables, without offsets and mounting."""
     of = image.trajectory
     return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
 
 
-def moved_pose(
+def move_pose(
     given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
 ) -> Pose:
     """The pose of the camera, `dt` seconds after the middle line."""

@@ -16,8 +16,8 @@ unless it is given), the value is NaN; splines end there. Within `extrapolate` t
 interval continue, which is a straight line for `usgscsm`.
 
 Every one of them is a polynomial of degree 7 at most (`order`, if that is higher) in each interval:
-`in_pieces` keeps its values at the nodes of Chebyshev there, from which Lagrange's formula gives it
-back. Tables of all methods are then data of one compiled program.
+`convert_to_pieces` keeps its values at the nodes of Chebyshev there, from which Lagrange's formula
+gives it back. Tables of all methods are then data of one compiled program.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ from jaxbundle.types import AnyArray, Scalar
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
 LEAST_DEGREE = 3
-"""Of a piece, for the cubic ones."""
+"""Minimum degree of a piece, for the cubic methods."""
 
 
 class Table(eqx.Module):
@@ -44,7 +44,7 @@ class Table(eqx.Module):
     `times` in seconds; `gap` the longest interpolated step between two rows, in seconds;
     `order` the degree of Lagrange's polynomial, the highest one of `usgscsm`; `extrapolate` the
     seconds beyond its ends that the table still covers. `pieces`, where given, replace `values` and
-    `method` (`in_pieces`).
+    `method` (`convert_to_pieces`).
     """
 
     times: Float[AnyArray, " rows"]
@@ -78,7 +78,7 @@ def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     return jnp.where(covers(table, i, t), value, jnp.nan)
 
 
-def in_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]]) -> Table:
+def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]]) -> Table:
     """The table with `value(t)`, its interpolation, as polynomials (`pieces`).
 
     They are exact for the methods of a table; of another smooth function, such as `slerp`, to order

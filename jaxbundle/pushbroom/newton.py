@@ -15,33 +15,33 @@ import jax
 import jax.numpy as jnp
 
 from jaxbundle.geometry.vectors import difference
-from jaxbundle.pushbroom.corrections import seen_point
+from jaxbundle.pushbroom.corrections import apparent_point
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 
 STEPS = 2
 """Steps of a round."""
 LEFT = 1e-7
 """Position tolerance of settled steps, in lines and pixels."""
-STILL = 1e-3
+LAST_CHANGE = 1e-3
 """Largest change of a corrected sight in its last round, in lines."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
-FEW = 64
+GATHERED_AT_ONCE = 64
 """Batch size of points gathered for another round."""
-MANY = 8
+LARGEST_GATHERED = 8
 """If a larger fraction of points needs another round, all points take it."""
 EDGE = 1e-5
 """A root at most this many lines beyond the end of its piece stays with it."""
-STRAY = 1000
+FARTHEST_OUTSIDE = 1000
 """A point this many lines outside the image is given up."""
 
 
 def refine(image, pieces, earth, X, t, u):
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     round_ = partial(_round, image, pieces, earth)
-    far = STRAY * line_period(image)
+    far = FARTHEST_OUTSIDE * line_period(image)
     n = t.size
-    few = min(n, FEW)
+    few = min(n, GATHERED_AT_ONCE)
 
     def open_(state):
         t, _, settled, rounds = state
@@ -58,12 +58,14 @@ def refine(image, pieces, earth, X, t, u):
         *place, settled, rounds = state
         chosen = first_of(open_(state), few)
         found = round_(*gather((X, *place), chosen))
-        return *replaced((*place, settled), found, chosen), rounds.at[chosen].add(1, mode="drop")
+        changed = replace_chosen((*place, settled), found, chosen)
+        return *changed, rounds.at[chosen].add(1, mode="drop")
 
     def again(state):
         if n == few:
             return all_again(state)
-        return jax.lax.cond(jnp.sum(open_(state)) > n // MANY, all_again, few_again, state)
+        many = jnp.sum(open_(state)) > n // LARGEST_GATHERED
+        return jax.lax.cond(many, all_again, few_again, state)
 
     state = t, u, jnp.zeros(n, bool), jnp.zeros(n, int)
     return jax.lax.while_loop(lambda s: jnp.any(open_(s)), again, state)[:3]
@@ -79,7 +81,7 @@ def gather(arrays, chosen):
     return jax.tree.map(lambda a: a.at[chosen].get(mode="clip"), arrays)
 
 
-def replaced(arrays, values, chosen):
+def replace_chosen(arrays, values, chosen):
     """Arrays [..., n] with values [..., few] at indices; those of n are dropped."""
     return jax.tree.map(lambda a, v: a.at[..., chosen].set(v, mode="drop"), arrays, values)
 
@@ -89,10 +91,10 @@ def line_period(image):
     return image.times.time(1.0) - image.times.time(0.0)
 
 
-def seen_from(image, earth, motion, X):
+def apparent_position(image, earth, motion, X):
     """The apparent position of X for a camera at P with the velocity V; `motion` is (P, V)."""
     P, V = motion
-    return seen_point(image.corrections, earth, P, V, X) if image.corrections.any else X
+    return apparent_point(image.corrections, earth, P, V, X) if image.corrections.any else X
 
 
 def motion(numbers, rates, origin):
@@ -115,7 +117,8 @@ def _round(image, pieces, earth, X, t, u):
     c = [[of_own(a) for a in power] for power in pieces.coefficients.transpose(1, 2, 0)]
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
-        X = seen_from(image, earth, motion(numbers, [r / half for r in rates], pieces.origin), X)
+        at = motion(numbers, [r / half for r in rates], pieces.origin)
+        X = apparent_position(image, earth, at, X)
         # otherwise XLA recomputes it for each of the twelve sums below
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
@@ -138,7 +141,7 @@ def _round(image, pieces, earth, X, t, u):
     settled = (step * step <= LEFT * (before + LEFT)) & (q < 0)
     if image.corrections.any:
         # the sight refers to the time at the start of the round
-        settled &= jnp.abs(tau - first) < STILL * line
+        settled &= jnp.abs(tau - first) < LAST_CHANGE * line
     # a root exactly at the end of a piece would alternate
     reach = 1 + EDGE * line
     settled &= ((tau >= -reach) | (own == 0)) & ((tau <= reach) | (own == last))

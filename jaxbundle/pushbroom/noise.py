@@ -53,8 +53,8 @@ class Errors(NamedTuple):
     position_white: Float[AnyArray, "rows2 3"]
 
 
-def no_errors(image: PushbroomImage) -> Errors:
-    """Errors of zero."""
+def zero_errors(image: PushbroomImage) -> Errors:
+    """Errors that are all zero."""
     rows = [len(t.times) for t in (image.trajectory.attitude.table, image.trajectory.position)]
     shapes = [(3,), (3,), (rows[0], 3), (3,), (3,), (rows[1], 3)]
     return Errors(*(jnp.zeros(shape) for shape in shapes))
@@ -64,7 +64,7 @@ def sigmas(image: PushbroomImage, noise: Noise) -> Errors:
     """The standard deviation of every single error."""
     return Errors(*(
         np.broadcast_to(np.asarray(sigma, float), zero.shape)
-        for sigma, zero in zip(noise, no_errors(image))
+        for sigma, zero in zip(noise, zero_errors(image))
     ))  # fmt: skip
 
 
@@ -74,7 +74,7 @@ def draw(sigma: Errors, key: AnyArray) -> Errors:
     return Errors(*(s * jax.random.normal(k, s.shape) for s, k in zip(sigma, keys)))
 
 
-def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
+def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     """The image with these errors in its trajectory; differentiable in them.
 
     **Raises:** `ValueError` for errors of the rows of a table in pieces, which no longer has
@@ -83,7 +83,7 @@ def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     for table, white in ((attitude, errors.attitude_white), (position, errors.position_white)):
         if len(white) and table.pieces is not None:
             raise ValueError("a table in pieces has no rows that errors could be added to")
-    turn = _turned_angles if attitude.values.shape[1] == 3 else _turned_quaternion
+    turn = _rotate_angles if attitude.values.shape[1] == 3 else _rotate_quaternion
     offsets = image.offsets
     return eqx.tree_at(
         lambda i: (
@@ -100,11 +100,11 @@ def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     )  # fmt: skip
 
 
-def _turned_quaternion(q, error):
+def _rotate_quaternion(q, error):
     return quaternion_multiply(q, quaternion_from_rotation_vector(error))
 
 
-def _turned_angles(angles, error):
+def _rotate_angles(angles, error):
     """The angles of R·exp([ε]×), nearest to the given ones."""
     M = matrix_from_rotation_vector(error).T @ matrix_from_omega_phi_kappa(angles)
     return omega_phi_kappa_near(M, angles)

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import difference, dot
-from jaxbundle.pushbroom.newton import line_period, motion, seen_from
+from jaxbundle.pushbroom.newton import apparent_position, line_period, motion
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.system.programs import compile_once
 
@@ -77,7 +77,7 @@ def passages(image, search, X, most, margin):
     def step_to(state, sample):
         before, rate_before, t_before, count, starts, first, risen = state
         k, t, numbers, rates, motion = sample
-        D = difference(seen_from(image, search.earth, motion, X), search.pieces.origin)
+        D = difference(apparent_position(image, search.earth, motion, X), search.pieces.origin)
         value, rate = jax.jvp(lambda n: ahead(n, D, search.along)[0], (numbers,), (rates,))
         if up is not None:
             above = dot(up, difference(motion[0], X)) > 0

@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
-from jaxbundle.geometry.vectors import turned
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.geometry.vectors import rotate
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
 from jaxbundle.system.programs import compile_once
@@ -28,14 +28,14 @@ from jaxbundle.types import AnyArray
 
 DEGREE = 3
 TOLERANCE = 1e-7
-SHORTEST = 1e-3
+SHORTEST_PIECE = 1e-3
 """Shortest piece, as a fraction of a line."""
 CHUNK = 1024
 """Fixed batch size of times for the pose: one shape to compile."""
-SHARED = 128
+MOST_SHARED = 128
 """Images with at most this many pieces share compiled programs with those of similar number; with
 more, not all ends are search times (`passages`), and halves would make them uneven."""
-SAME = 1e-6
+EQUAL_TIMES = 1e-6
 """Rows of two tables closer in time than this fraction of a line count as one."""
 
 NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
@@ -47,7 +47,7 @@ TO_HALVES = np.array([
     [[comb(k, j) * side ** (k - j) / 2**k for k in range(DEGREE + 1)] for j in range(DEGREE + 1)]
     for side in (-1.0, 1.0)
 ])  # fmt: skip
-"""Of a polynomial in τ: with τ = (τ' ∓ 1)/2, its coefficients in τ' from −1 to 1."""
+"""From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 
 class Pieces(eqx.Module):
@@ -71,8 +71,8 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     starts, ends = zip(*(span(table) for table in tables))
     first, last = max(first, *starts), min(last, *ends)
     nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
-    nodes = nodes[(nodes > first + SAME * line) & (nodes < last - SAME * line)]
-    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > SAME * line], last]
+    nodes = nodes[(nodes > first + EQUAL_TIMES * line) & (nodes < last - EQUAL_TIMES * line)]
+    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > EQUAL_TIMES * line], last]
     origin, reach, per_radian = _sight(image, earth)
     left, right, found = ends[:-1], ends[1:], []
     while len(left):
@@ -83,14 +83,14 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
         good = error <= TOLERANCE
         found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
         left, right = left[~good], right[~good]
-        if len(left) and (right - left).min() < SHORTEST * line:
+        if len(left) and (right - left).min() < SHORTEST_PIECE * line:
             raise InputError(
                 f"attitude: the trajectory at {left[0]:.9g} s does not follow from its rows within "
-                f"{SHORTEST:g} lines; look for wrong rows there"
+                f"{SHORTEST_PIECE:g} lines; look for wrong rows there"
             )
         middle = (left + right) / 2
         left, right = np.r_[left, middle], np.r_[middle, right]
-    more = rounded(len(found)) - len(found) if len(found) <= SHARED else 0
+    more = round_up(len(found)) - len(found) if len(found) <= MOST_SHARED else 0
     found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(
@@ -133,7 +133,7 @@ def _middle(image):
     pose = pose_at(image, image.middle_time)
     u = (image.pixels - 1) / 2
     slopes, per_pixel = jax.jvp(image.optics.slopes, (u,), (1.0,))
-    return pose, turned(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
+    return pose, rotate(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
 
 
 def _sight(image, earth):

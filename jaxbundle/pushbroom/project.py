@@ -11,7 +11,7 @@ method continues with the polynomials of `pieces` (`newton`).
 `project_near` is the textbook method for one point near a known image position, with the
 trajectory itself. Its derivatives are exact by the implicit function theorem.
 
-With corrections, X is replaced by its apparent position (`seen_point`).
+With corrections, X is replaced by its apparent position (`apparent_point`).
 """
 
 from enum import IntEnum
@@ -25,12 +25,12 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
-from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
+from jaxbundle.geometry.vectors import Vector, difference, dot, rotate_back
 from jaxbundle.implicit import implicit_root, solve_dense
-from jaxbundle.pushbroom.corrections import Corrections, seen_point
+from jaxbundle.pushbroom.corrections import Corrections, apparent_point
 from jaxbundle.pushbroom.footprint import Footprint, make_footprint
 from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
-from jaxbundle.pushbroom.newton import first_of, gather, refine, replaced
+from jaxbundle.pushbroom.newton import first_of, gather, refine, replace_chosen
 from jaxbundle.pushbroom.passages import (
     FINE_SEARCH,
     line_of_detectors,
@@ -45,7 +45,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 CHUNK = 2048
 """Batch size of points, which stay in the cache."""
-SEARCHED = 256
+SEARCHED_AT_ONCE = 256
 """Batch size of searched points outside the footprint."""
 NEAR_STEPS = 6
 
@@ -148,7 +148,7 @@ def project_points(
 def _project_points(image, search, X, most, margin):
     """One program for all margins: an omitted default would be compiled in."""
     find = lambda X: _found(image, search, X, most, margin)
-    return _in_chunks(find, tuple(X))
+    return _map_chunks(find, tuple(X))
 
 
 def project_from(
@@ -165,7 +165,7 @@ def project_from(
 def _project_from(image: Scanner, search, X, line, pixel):
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
     place = lambda args: refine(image, search.pieces, search.earth, args[:3], *args[3:])
-    t, u, settled = _in_chunks(place, tuple(flat))
+    t, u, settled = _map_chunks(place, tuple(flat))
     shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (*X, line, pixel)))
     found = lambda a: jnp.where(settled, a, jnp.nan).reshape(shape)
     return found(image.times.line(t)), found(u)
@@ -218,12 +218,12 @@ def misclosure_of(
 ) -> Float[Array, "2"]:
     """Slopes of the ray to X from a pose minus given ones."""
     P, R, V = pose
-    r, s, q = turned_back(R, difference(seen_point(corrections, earth, P, V, X), P))
+    r, s, q = rotate_back(R, difference(apparent_point(corrections, earth, P, V, X), P))
     xi, eta = slopes
     return jnp.stack([-r / q - xi, -s / q - eta])
 
 
-def _in_chunks(function, arrays):
+def _map_chunks(function, arrays):
     """The function of arrays [n], whose values are [..., n], by chunks."""
     n = arrays[0].shape[0]
     if n <= CHUNK:
@@ -249,9 +249,9 @@ def _found(image, search, X, most, margin):
 
     def search_on(state):
         found, known = state
-        chosen = first_of(~known, min(SEARCHED, known.size))
+        chosen = first_of(~known, min(SEARCHED_AT_ONCE, known.size))
         few = _search(image, search, gather(X, chosen), most, margin)
-        return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
+        return replace_chosen(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
     return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
 

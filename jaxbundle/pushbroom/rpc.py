@@ -29,7 +29,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpacked
+from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpack
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import require_ellipsoid
 from jaxbundle.pushbroom.surfaces import Surface
@@ -39,11 +39,11 @@ from jaxbundle.types import AnyArray, Scalar
 TERMS = 20
 STEPS = 6
 """Newton steps of the inverse; the number of digits doubles with each."""
-SETTLED = 1e-9
+LAST_STEP = 1e-9
 """A last step below this, in units of the scales, ends Newton's method."""
 MARGIN = 0.1
 """Tolerance beyond the scales (of 1) that counts as inside."""
-AHEAD = 20e3
+START_HEIGHT = 20e3
 """A line of sight begins this far above the highest height of the domain, metres."""
 ROUNDS = 3
 
@@ -64,7 +64,7 @@ class RpcStatus(IntEnum):
 _MEANING = {
     RpcStatus.INSIDE: "inside the domain",
     RpcStatus.OUTSIDE: "outside the domain of the coefficients: extrapolated",
-    RpcStatus.NOT_CONVERGED: "no place found: the polynomials lead nowhere from here",
+    RpcStatus.NOT_CONVERGED: "no place found: the iterations do not converge",
 }
 
 
@@ -89,7 +89,7 @@ class Rpc(eqx.Module):
 
 def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, given in radians and metres; see `domain` for their status."""
-    return _image(rpc, *normalised(rpc, longitude, latitude, height))
+    return _image(rpc, *normalise(rpc, longitude, latitude, height))
 
 
 def locate(
@@ -115,7 +115,7 @@ def locate(
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
     place, last = jax.lax.fori_loop(0, STEPS + 1, newton, start)
     L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
-    settled = last < SETTLED
+    settled = last < LAST_STEP
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
     found = lambda a: jnp.where(settled, a, jnp.nan)
@@ -138,7 +138,7 @@ def _twice_misclosure(place, data):
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
     """The `RpcStatus` of a point: whether it and its image are in the domain of the
     coefficients."""
-    place = normalised(rpc, longitude, latitude, height)
+    place = normalise(rpc, longitude, latitude, height)
     ratios = jnp.stack(_ratios(rpc, *place))
     inside = _inside(jnp.stack([*place, *ratios]))
     return jnp.where(jnp.isfinite(ratios).all(), inside, int(RpcStatus.NOT_CONVERGED))
@@ -167,7 +167,7 @@ def locate_on(
         return (along(o, difference(own, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-    start = (along(top, d, -AHEAD), nothing)
+    start = (along(top, d, -START_HEIGHT), nothing)
     (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=ROUNDS)
     missed = jnp.isnan(h)
     return longitude, latitude, h, jnp.where(missed, int(RpcStatus.NOT_CONVERGED), status)
@@ -186,7 +186,7 @@ def sight(
 
     ends = rpc.height_offset + jnp.abs(rpc.height_scale) * jnp.array([1.0, -1.0])
     top, bottom = jax.vmap(point)(ends)
-    return unpacked(top), unit(difference(bottom, top))
+    return unpack(top), unit(difference(bottom, top))
 
 
 @partial(compile_once, static=())
@@ -229,7 +229,7 @@ def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     )  # fmt: skip
 
 
-def normalised(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
+def normalise(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
     """(L, P, H); longitudes may differ by turns."""
     east = jnp.degrees(longitude) - rpc.longitude_offset
     east = east - 360 * jnp.round(east / 360)

@@ -36,7 +36,7 @@ from jaxbundle.types import AnyArray
 MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
 """Unknowns of each axis."""
 CONTROL = Source("control points")
-DETERMINED = 1e-6
+SMALLEST_SINGULAR_VALUE = 1e-6
 """Smallest relative singular value of the equations; below it points are collinear."""
 GRID = 12
 """Points along each side of the grid to which an affine bias is fitted."""
@@ -117,7 +117,7 @@ def fit_bias(
     _check_domain(rpc, control, source)
     terms = np.asarray(_terms(rpc, computed[:, 0], computed[:, 1])).T[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
-    if singular[-1] < DETERMINED * singular[0]:
+    if singular[-1] < SMALLEST_SINGULAR_VALUE * singular[0]:
         raise InputError(f"{source.name}: all points on one line; give others, or use 'shift'")
     # rows in the order line, sample of the first point, of the second, …
     A = np.zeros((n, 2, 2 * k))
@@ -147,7 +147,7 @@ def fit_bias(
     )
 
 
-def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
+def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
     exact).
 

@@ -8,10 +8,9 @@ and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the 
 The start is linear, a·T − y·b·T' = y (Tao and Hu, 2001, PE&RS 67(12)); Gauss-Newton steps follow,
 halved until the sum decreases and no denominator vanishes at a point.
 
-The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the four
-linear terms of the numerator, for which D is a thousand times smaller. τ is the largest that
-predicts each point from all others as well as the best τ, or within `ENOUGH` pixels (PRESS, Allen,
-1974):
+The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the four linear terms of
+the numerator, for which D is a thousand times smaller. τ is the largest that predicts each point
+from all others as well as the best τ, or within `SUFFICIENT_RESIDUAL` pixels (PRESS, Allen, 1974):
 
     PRESS(τ) = mean (vᵢ/(1 − hᵢ))²,        h = diag J·(N + τ²D²)⁻¹·Jᵀ,    N = Jᵀ·J.
 
@@ -50,7 +49,7 @@ LINEAR = 1e-3
 LADDER = 10.0 ** np.arange(-1.0, -15.25, -0.5)
 """Candidate ridges, in units of the largest singular value."""
 AS_GOOD = 1.05
-ENOUGH = 1e-5
+SUFFICIENT_RESIDUAL = 1e-5
 """Pixels."""
 START = 1e-2
 """The ridge of the linear start, in units of the largest singular value."""
@@ -305,7 +304,8 @@ def _ridge(U, s, y, scale):
         h = (U**2) @ kept
         press.append(np.sqrt(np.mean(((y - U @ (kept * part)) / (1 - h)) ** 2)))
     press = np.array(press)
-    return float(s[0] * LADDER[(press <= AS_GOOD * press.min() + ENOUGH / scale).argmax()])
+    good = press <= AS_GOOD * press.min() + SUFFICIENT_RESIDUAL / scale
+    return float(s[0] * LADDER[good.argmax()])
 
 
 def _linearise(c, T, y):

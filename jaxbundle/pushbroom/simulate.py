@@ -22,7 +22,7 @@ from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import PushbroomImage, make_image
 from jaxbundle.pushbroom.locate import locate_lines
-from jaxbundle.pushbroom.noise import Noise, disturbed, draw, sigmas
+from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas
 from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
@@ -91,7 +91,7 @@ def _measure(image, sigma, key):
 
 
 def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
-    """Like `disturbed`, with bias and drift in the rows of the tables, as written by
+    """Like `add_errors`, with bias and drift in the rows of the tables, as written by
     instruments."""
     t0 = image.middle_time
 
@@ -100,7 +100,7 @@ def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
 
     zero = jax.tree.map(jnp.zeros_like, errors)
     attitude, position = image.trajectory.attitude.table, image.trajectory.position
-    return disturbed(image, zero._replace(
+    return add_errors(image, zero._replace(
         attitude_white=rows(
             attitude, errors.attitude_bias, errors.attitude_drift, errors.attitude_white
         ),
@@ -110,7 +110,7 @@ def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
     ))  # fmt: skip
 
 
-def taken_image(
+def take_image(
     image: PushbroomImage,
     surface: Surface,
     scene: Float[AnyArray, "bands rows columns"],
@@ -163,14 +163,14 @@ def _position(flight, rate, method):
 def _attitude(flight, rate, method):
     t = _samples(flight, rate)
     angles = [
-        _drawn(flight.angles.get(name, 0.0), t, k, flight.seed)
+        _sum_signals(flight.angles.get(name, 0.0), t, k, flight.seed)
         for k, name in enumerate(("pitch", "roll", "yaw"))
     ]
     reference = "earth" if "start" in flight.track else "orbit"
     return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)
 
 
-def _drawn(description, t, axis, seed):
+def _sum_signals(description, t, axis, seed):
     """The sum of one or several signals."""
     parts = description if isinstance(description, list | tuple) else [description]
     rng = [np.random.default_rng([seed, axis, k]) for k in range(len(parts))]

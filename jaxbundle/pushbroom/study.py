@@ -19,9 +19,9 @@ from jaxbundle.choices import AttitudeError
 from jaxbundle.pushbroom.accuracy import (
     circular_error,
     closed_form,
-    drawn,
     ground_errors,
-    propagated,
+    propagate_accuracy,
+    simulate_accuracy,
 )
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.locate import locate_points
@@ -108,8 +108,8 @@ def accuracy_table(
         image = measured_image(varied)
         for sigma in sigmas:
             noise = Noise(**{f"attitude_{kind}": sigma})
-            counted = drawn(image, surface, *places, noise, draws, seed)
-            exact = propagated(image, surface, *places, noise)
+            counted = simulate_accuracy(image, surface, *places, noise, draws, seed)
+            exact = propagate_accuracy(image, surface, *places, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # above a plane, near the nadir, errors along and across are almost alike
             round_ = circular_error(np.eye(2) * level**2 / 2)

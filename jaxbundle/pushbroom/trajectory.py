@@ -34,9 +34,9 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.pushbroom.interpolation import (
     Table,
+    convert_to_pieces,
     covers,
     fraction,
-    in_pieces,
     interpolate,
     interval,
     rate,
@@ -89,8 +89,8 @@ def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
 
 
 def trajectory_in_pieces(trajectory: Trajectory) -> Trajectory:
-    """The same trajectory with its tables in pieces (`interpolation.in_pieces`), whatever their
-    methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
+    """The same trajectory with its tables in pieces (`interpolation.convert_to_pieces`), whatever
+    their methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
     position, attitude = trajectory.position, trajectory.attitude
     turned = (
         (lambda t: _slerp(attitude.table, t))
@@ -98,8 +98,8 @@ def trajectory_in_pieces(trajectory: Trajectory) -> Trajectory:
         else (lambda t: interpolate(attitude.table, t))
     )
     return Trajectory(
-        in_pieces(position, lambda t: interpolate(position, t)),
-        Attitude(in_pieces(attitude.table, turned), False, attitude.reference),
+        convert_to_pieces(position, lambda t: interpolate(position, t)),
+        Attitude(convert_to_pieces(attitude.table, turned), False, attitude.reference),
     )
 
 

@@ -24,7 +24,7 @@ from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
 
 GROSS, DOUBTFUL = 4.0, 5.0
-SETTLED = 0.004
+LAST_CHANGE = 0.004
 """Change of a factor that ends the rounds."""
 ROUNDS = 4
 FEWEST = 60
@@ -33,8 +33,8 @@ SMALLEST, LARGEST = 0.3, 8.0
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 400
-"""Of one adjustment. Photographs with the same viewing direction determine the principal distance
-of an unknown camera only weakly, and the search then needs more than a hundred."""
+"""Iterations of one adjustment. Photographs with the same viewing direction determine the principal
+distance of an unknown camera only weakly, and the search then needs more than a hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
             break
         rows = _rows(result, network)
         factor = _factors(*_of_reliability(result), kinds[rows], np.inf)
-        if np.all(np.abs(factor - 1) < SETTLED):
+        if np.all(np.abs(factor - 1) < LAST_CHANGE):
             break
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0

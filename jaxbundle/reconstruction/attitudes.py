@@ -2,7 +2,7 @@
 
 Attitudes rotated by a mounting, a firmware or another convention would spoil a network that does
 not need them. So they are first compared with the orientations from the photographs and their
-positions, and all are left out if they differ by more than `AGREE` of their σ.
+positions, and all are left out if they differ by more than `LARGEST_MEDIAN` of their σ.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.photographs.xmp import Attitude, rotation_of
 
-AGREE = 3.0
+LARGEST_MEDIAN = 3.0
 """Largest median of the differences, in units of their σ."""
 FEWEST = 3
 
@@ -56,7 +56,7 @@ def with_attitudes(
     found = np.asarray(many.matrices(network.images.angles[known]))
     cosine = (np.einsum("nij,nij->n", M, found) - 1) / 2
     off = np.arccos(np.clip(cosine, -1, 1))
-    if np.median(off / sigma) > AGREE:
+    if np.median(off / sigma) > LARGEST_MEDIAN:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
             "from those of the photographs and their positions: not used"

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph
@@ -68,10 +68,10 @@ def find_named(
         if len(unknown) == len({file for file, _ in control.seen}):
             raise InputError(
                 f"{control.points.source.name}: measured in none of the photographs, but in "
-                f"{some(unknown, 3, str)}"
+                f"{list_some(unknown, 3, str)}"
             )
         if unknown:
-            notes.append(f"control measured in missing photographs: {some(unknown)}")
+            notes.append(f"control measured in missing photographs: {list_some(unknown)}")
         for (file, id), place, s in zip(control.seen, control.xy, control.sigma):
             if file in index:
                 image.append(index[file])
@@ -96,19 +96,19 @@ def name_unused(
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):
         raise InputError(
-            f"no scale bar has both ends in two photographs ({some(lost, 3, str)}): check the "
+            f"no scale bar has both ends in two photographs ({list_some(lost, 3, str)}): check the "
             "names of the targets"
         )
-    notes = [f"scale bars that are not in two photographs: {some(lost, 3, str)}"] * bool(lost)
+    notes = [f"scale bars that are not in two photographs: {list_some(lost, 3, str)}"] * bool(lost)
     if control is not None:
         lost = [id for id in control.points.id if id not in photographs]
         if len(control.points) - len(lost) < fewest:
             raise InputError(
                 f"{control.points.source.name}: {len(control.points) - len(lost)} control points "
                 f"are measured in the photographs, {fewest} are needed; not found: "
-                f"{some(lost, 5, str)}"
+                f"{list_some(lost, 5, str)}"
             )
-        notes += [f"control points in no photograph: {some(lost, 5, str)}"] * bool(lost)
+        notes += [f"control points in no photograph: {list_some(lost, 5, str)}"] * bool(lost)
     return notes
 
 

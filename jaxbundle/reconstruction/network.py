@@ -17,7 +17,7 @@ PRIORS = {"fx": 0.2, "cx": 0.02, "cy": 0.02}
 """σ of start values, relative to the principal distance, or the longer side: large enough to
 matter only if photographs determine nothing."""
 K1_PRIOR = 0.3
-UNTIED = 8
+FEWEST_PHOTOGRAPHS = 8
 """Minimum photographs of a camera for pixels that need not be square."""
 FEWEST_CONTROL = 3
 """Minimum control points in a part to transform it into their frame."""
@@ -113,7 +113,7 @@ def _free(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
     f, size = camera.parameters["fx"], max(camera.image_size or (1, 1))
     sigma = {"fx": PRIORS["fx"] * f, "cx": PRIORS["cx"] * size, "cy": PRIORS["cy"] * size,
              "k1": K1_PRIOR}  # fmt: skip
-    if own >= UNTIED and own == of_lens:
+    if own >= FEWEST_PHOTOGRAPHS and own == of_lens:
         camera, free, sigma["fy"] = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:]), (
             sigma["fx"]
         )

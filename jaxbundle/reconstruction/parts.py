@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 from jaxbundle.tiepoints.verification import Pair
 
-SMALLEST = 3
+SMALLEST_PART = 3
 """Minimum photographs of a part; two if there are only two in all."""
 
 
-def connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
+def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
     """Groups of photographs connected by verified pairs, the largest first."""
     root = list(range(number))
 

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
 from jaxbundle.photographs.reading import SUFFIXES, photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
-GUESSED = 1.2
+DEFAULT_RATIO = 1.2
 """Default principal distance relative to the longer side."""
-SMALLEST = 64
+SHORTEST_SIDE = 64
 """Minimum pixels of the shorter side."""
 
 
@@ -47,7 +47,7 @@ def find_photographs(
         try:
             check_plain(path)
             columns, rows = photograph_size(path)
-            if min(columns, rows) < SMALLEST:
+            if min(columns, rows) < SHORTEST_SIDE:
                 raise InputError(f"{path}: {columns} × {rows} pixels are too few")
             content = read_content(path, text=False)
         except InputError as error:
@@ -60,7 +60,7 @@ def find_photographs(
         first[fingerprint] = name
         found.append(Photograph(path, name, fingerprint, read_exif(path)))
     if len(found) < 2:
-        said = some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
+        said = list_some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
         raise InputError(
             f"{len(found)} of {len(paths)} photographs can be used; two or more are needed"
             + (f": {said}" if left_out else "")
@@ -113,7 +113,7 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
 
     **Raises:** `InputError` if the given camera has another size.
     """
-    notes = _turned(photographs)
+    notes = _rotation_messages(photographs)
     if given is not None:
         return Cameras((_fits(given, photographs),), (0,) * len(photographs), (True,), True, notes)
     groups: dict[tuple, list[int]] = {}
@@ -127,7 +127,7 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
-        f = told[0] if told else GUESSED * max(exif.size)
+        f = told[0] if told else DEFAULT_RATIO * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
         cameras.append(_new_camera(id, f, exif.size))
         known.append(told is not None)
@@ -162,11 +162,11 @@ def _fits(given: Camera, photographs) -> Camera:
     return given
 
 
-def _turned(photographs) -> tuple[str, ...]:
+def _rotation_messages(photographs) -> tuple[str, ...]:
     turned = [p.name for p in photographs if p.exif.orientation != UPRIGHT]
     if not turned:
         return ()
     return (
-        f"{len(turned)} photographs have a rotated EXIF orientation ({some(turned, 3, str)}); "
+        f"{len(turned)} photographs have a rotated EXIF orientation ({list_some(turned, 3, str)}); "
         "their pixels are used in the orientation of the sensor, columns and rows likewise",
     )

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
@@ -26,7 +26,7 @@ from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
-from jaxbundle.reconstruction.parts import SMALLEST, connected, why_alone
+from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
     Photograph,
@@ -34,7 +34,7 @@ from jaxbundle.reconstruction.photographs import (
     find_photographs,
 )
 from jaxbundle.reconstruction.settings import Settings
-from jaxbundle.reconstruction.starting import believable, start_again, start_values
+from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.features import Features
@@ -76,7 +76,7 @@ class Part:
     factors: Mapping[str, float]
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
     """`parts`, the largest first; photographs in none of them, with the reason; notes;
@@ -197,7 +197,7 @@ class _Making:
                 self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
             )
         if len(features) - len(bad) < 2:
-            said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+            said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
             raise InputError(f"fewer than two photographs can be used: {said}")
         return features
 
@@ -228,7 +228,7 @@ class _Making:
         if wrong:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
-                              f"by others in triplets: {some(named, 3, str)}")  # fmt: skip
+                              f"by others in triplets: {list_some(named, 3, str)}")  # fmt: skip
         if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
             self.notes.append(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
@@ -238,8 +238,8 @@ class _Making:
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
-        least = min(SMALLEST, len(self.photographs))
-        waiting = connected(len(self.photographs), pairs)
+        least = min(SMALLEST_PART, len(self.photographs))
+        waiting = group_connected(len(self.photographs), pairs)
         parts: list[Part] = []
         failed: list[str] = []
         while waiting:
@@ -260,12 +260,12 @@ class _Making:
             parts.append(part)
             rest = [k for k in group if self.names[k] in reasons]
             among = [p for p in pairs if set(p.images) <= set(rest)]
-            again = [[rest[k] for k in g] for g in connected(
+            again = [[rest[k] for k in g] for g in group_connected(
                 len(rest), [dataclasses.replace(p, images=(rest.index(p.images[0]),
                                                            rest.index(p.images[1])))
                             for p in among])]  # fmt: skip
             for g in again:
-                if len(g) >= SMALLEST and len(g) < len(group):
+                if len(g) >= SMALLEST_PART and len(g) < len(group):
                     waiting.append(g)
                 else:
                     self.left_out |= {self.names[k]: reasons[self.names[k]] for k in g}
@@ -290,7 +290,7 @@ class _Making:
             )
         if failed:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
-        said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+        said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         return f"not solved: no photographs overlap: {said}"
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
@@ -306,14 +306,14 @@ class _Making:
         )  # fmt: skip
         network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
-        oriented, weighted, note = self._adjusted(network, measured)
+        oriented, weighted, note = self._adjust_first(network, measured)
         self._begin("")
         _refuse_folded(weighted.adjustment, measured, self.names)
         self.notes += [note] if note else []
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
-    def _adjusted(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
+    def _adjust_first(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
         guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
@@ -326,7 +326,7 @@ class _Making:
                 failed = failed or error
                 continue
             result = weighted.adjustment
-            if not believable(result):
+            if not is_plausible(result):
                 failed = failed or _not_solved(result)
                 continue
             again = start_again(network, oriented, result)
@@ -335,7 +335,7 @@ class _Making:
                     better, other_note = self._adjust(again, measured)
                 except NotSolvedError:
                     return oriented, weighted, note
-                if believable(better.adjustment):
+                if is_plausible(better.adjustment):
                     return again, better, other_note
             return oriented, weighted, note
         assert failed is not None, "start values are there, or an error says why not"

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import MATCHED_PAIRS
 from jaxbundle.tiepoints.features import Detection
 
@@ -22,4 +22,4 @@ class Settings:
 
     def __post_init__(self):
         one_of("pairs", self.pairs, MATCHED_PAIRS)
-        whole("points", self.points)
+        integer("points", self.points)

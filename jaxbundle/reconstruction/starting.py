@@ -1,8 +1,9 @@
 """Start values of a part, by several methods, until one of them leads to an adjustment.
 
-1. With the cameras from consistent pairs of photographs: misclosures above `CLOSE` of the
+1. With the cameras from consistent pairs of photographs: misclosures above `START_TOLERANCE` of the
    image are contradictions. If photographs are left out, the limit is that of an unknown lens.
-2. With other principal distances, unless the file gives one; those that explain most come first.
+2. With other principal distances, unless the file gives one; those that explain the most matches
+come first.
 
 In both cases, left out photographs are tried again with the adjusted cameras.
 """
@@ -21,7 +22,7 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.sights import TOLERANCE
 from jaxbundle.tiepoints.search import APART, OTHERS, present_size
 
-CLOSE = 0.01
+START_TOLERANCE = 0.01
 """Tolerance of start values by cameras from consistent pairs, relative to the image extent."""
 SHORTEST, LONGEST = 0.35, 12.0
 """Limits of an adjusted principal distance, relative to the longer side."""
@@ -40,7 +41,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
     **Raises:** `NotSolvedError` if there are none.
     """
     found, failed = [], None
-    for tolerance in (CLOSE, TOLERANCE):
+    for tolerance in (START_TOLERANCE, TOLERANCE):
         try:
             found.append(_orient(network, tolerance))
         except NotSolvedError as error:
@@ -52,7 +53,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
     others = []
     for changed in _with_other_distances(network, guessed):
         try:
-            others.append(_orient(changed, CLOSE))
+            others.append(_orient(changed, START_TOLERANCE))
         except NotSolvedError:
             continue
     enough = [one for one in others
@@ -99,7 +100,7 @@ def _with_distance(camera: Camera, f: float) -> Camera:
     return dataclasses.replace(camera, parameters=parameters, sigma=sigma)
 
 
-def believable(result: Adjustment) -> bool:
+def is_plausible(result: Adjustment) -> bool:
     """Whether an adjustment converged to plausible principal distances."""
     return bool(result.converged) and all(
         SHORTEST < found["fx"] / max(camera.image_size) < LONGEST
@@ -118,7 +119,7 @@ def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Ori
     }
     cameras = tuple(better.get(c.id, c) for c in network.cameras)
     try:
-        found = _orient(network.replace(cameras=cameras), CLOSE)
+        found = _orient(network.replace(cameras=cameras), START_TOLERANCE)
     except NotSolvedError:
         return None
     return found if len(found.images) < len(oriented.images) else None

@@ -1,7 +1,7 @@
 """Refinement of scanner images, alone or with photographs, by least squares."""
 
-from jaxbundle.refinement.adjusted import adjusted_photographs as adjusted_photographs
-from jaxbundle.refinement.adjusted import point_rows as point_rows
+from jaxbundle.refinement.adjusted_tables import adjusted_photographs as adjusted_photographs
+from jaxbundle.refinement.adjusted_tables import point_rows as point_rows
 from jaxbundle.refinement.freedom import FREE as FREE
 from jaxbundle.refinement.freedom import HELD as HELD
 from jaxbundle.refinement.freedom import Freedom as Freedom

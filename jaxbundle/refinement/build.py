@@ -8,8 +8,8 @@ from jaxtyping import Float
 from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.geometry.vectors import turned
-from jaxbundle.network.columns import count, some
+from jaxbundle.geometry.vectors import rotate
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.orientation.intersection import intersection
 from jaxbundle.orientation.status import Status
@@ -42,7 +42,7 @@ def choose_rays(
     warnings = []
     if lone.any():
         warnings.append(
-            f"tie points measured once are left out: {some(np.array(points.id)[lone])}"
+            f"tie points measured once are left out: {list_some(np.array(points.id)[lone])}"
         )
     used = (role != "check") & (number > 0) & ~lone
     check = (role == "check") & (number > 0)
@@ -121,7 +121,7 @@ def _sights(given: Given, rays: Rays):
 def _scanner_sights(image, places):
     def one(place):
         pose = pose_at(image, image.times.time(place[0]))
-        return pose.P, jnp.stack(turned(pose.R, (*image.optics.slopes(place[1]), -1.0)))
+        return pose.P, jnp.stack(rotate(pose.R, (*image.optics.slopes(place[1]), -1.0)))
 
     return jax.vmap(one)(places)
 

@@ -14,13 +14,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.checks import determine
 from jaxbundle.leastsquares.indexing.rows import (
     fill_places,
-    in_given_order,
     lay_out_data,
     residuals,
+    restore_order,
 )
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
@@ -28,7 +28,7 @@ from jaxbundle.refinement.inspection import Inspection, Shared
 from jaxbundle.system.programs import compile_once
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
     """Differences computed − given along the axes of the points, metres, NaN if the height is the
@@ -85,6 +85,6 @@ def _slopes(declared, plan, values, data, shared: Shared, estimate):
     def of_shared(estimate):
         now = shared.tables(estimate)
         moved = {t: jax.tree.map(put, values[t], now[t]) if t in now else values[t] for t in values}
-        return in_given_order(plan, residuals(declared, plan, moved, laid))
+        return restore_order(plan, residuals(declared, plan, moved, laid))
 
     return jax.jacfwd(of_shared)(estimate)

@@ -19,13 +19,13 @@ from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
 from jaxbundle.network.declare import declare as declare_network
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 from jaxbundle.refinement import kinds
-from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_one_size, priors
+from jaxbundle.refinement.freedom import Form, Name, make_form, names, pad_forms, priors
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage
 from jaxbundle.types import Index, present
 
 ARCSEC = math.degrees(1) * 3600
 IMAGE, SENSOR = "scanner image", "sensor"
-FAR = 2.0
+FARTHEST_POINT = 2.0
 """A point farther from its measurement than this many images is an error."""
 
 
@@ -54,7 +54,7 @@ class Given:
 
     @property
     def ids(self) -> list[str]:
-        """Of all images, photographs after scanner images."""
+        """The ids of all images, photographs after scanner images."""
         frames = () if self.frames is None else self.frames.images.id
         return [*(one.id for one in self.images), *frames]
 
@@ -73,7 +73,7 @@ class Given:
 
 def gather(images, points: GroundPoints, observations, frames: Network | None) -> Given:
     """The forms of the unknowns, the sensors, the origin."""
-    forms = of_one_size([make_form(one.image, one.earth, one.freedom) for one in images])
+    forms = pad_forms([make_form(one.image, one.earth, one.freedom) for one in images])
     sensors = list(dict.fromkeys(map(sensor_of, images)))
     sensor = np.array([sensors.index(sensor_of(one)) for one in images])
     at = {id: k for k, id in enumerate(points.id)}
@@ -137,11 +137,11 @@ class Declared:
 
     @property
     def number_of_rays(self) -> Int[np.ndarray, " points"]:
-        """Of the points used."""
+        """The number of rays of each point used."""
         points = np.concatenate([part.point for part in self.parts])
         return np.bincount(points, minlength=len(self.rays.points))
 
-    def rescaled(self, problem: Problem, values: Values) -> tuple[Problem, float]:
+    def rescale(self, problem: Problem, values: Values) -> tuple[Problem, float]:
         """The problem with S at these values, and the largest relative change of S."""
         measured, X, change = list(problem.data.measured), np.asarray(values["point"].position), 0.0
         for part in self.parts:
@@ -315,7 +315,7 @@ def _check_near(given: Given, rows, v) -> None:
     """Refuse points far from their measurement: swapped or wrong."""
     points, observations = given.points, given.observations
     size = np.array([(one.image.lines, one.image.pixels) for one in given.images])
-    far = (~(np.abs(v) <= FAR * size[observations.image[rows]])).any(1)
+    far = (~(np.abs(v) <= FARTHEST_POINT * size[observations.image[rows]])).any(1)
     if not far.any():
         return
     row, away = int(rows[far.argmax()]), v[far.argmax()]

@@ -104,10 +104,10 @@ class ChangedOptics(Optics):
     added: AnglePolynomial
 
     def slopes(self, u):
-        return changed_slopes(self.base.slopes(u), self.relative, self.added.slopes(u))
+        return change_slopes(self.base.slopes(u), self.relative, self.added.slopes(u))
 
 
-def changed_slopes(slopes, relative, added):
+def change_slopes(slopes, relative, added):
     """(ξ, η)/(1 + e) and what is added."""
     (xi, eta), (more_xi, more_eta) = slopes, added
     return xi / (1 + relative) + more_xi, eta / (1 + relative) + more_eta
@@ -160,7 +160,7 @@ def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
     return orbital_frame(up, velocity_at(of, t))
 
 
-def of_one_size(forms: list[Form]) -> list[Form]:
+def pad_forms(forms: list[Form]) -> list[Form]:
     """The forms padded to the largest size of each unknown, at least one."""
     sizes = Sizes(*map(max, zip(LEAST, *(form.sizes for form in forms))))
     return [dataclasses.replace(form, sizes=sizes) for form in forms]
@@ -174,18 +174,18 @@ def change_of(sizes: Sizes, p: Float[AnyArray, " n"]) -> Change:
     )
 
 
-def changed(
+def change_image(
     image: PushbroomImage, form: Form, change: Change, t: Scalar
 ) -> PushbroomImage:
     """The image at the time t with its unknowns changed."""
     jitter = form.spline.at(change.jitter, t)
     return dataclasses.replace(
-        image, offsets=changed_offsets(image.offsets, form.axes, change, jitter),
-        mounting=image.mounting + change.mounting, optics=changed_optics(image, change),
+        image, offsets=change_offsets(image.offsets, form.axes, change, jitter),
+        mounting=image.mounting + change.mounting, optics=change_optics(image, change),
     )  # fmt: skip
 
 
-def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "3"]) -> Offsets:
+def change_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "3"]) -> Offsets:
     """The offsets with attitude and position changed."""
     return Offsets(
         old.attitude + change.attitude + jitter,
@@ -195,7 +195,7 @@ def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, 
     )
 
 
-def changed_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
+def change_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
     """The optics with focal length and look angles changed."""
     pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
     middle, half = middle_and_half(image)
@@ -206,7 +206,7 @@ def changed_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
 
 
 def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
-    """Of the detector line, in pixels."""
+    """Middle and half length of the detector line, in pixels."""
     return (image.pixels - 1) / 2, image.pixels / 2
 
 

@@ -71,7 +71,7 @@ class Inspection:
 
     @functools.cached_property
     def shared(self) -> Shared:
-        """Where the shared unknowns are."""
+        """The location of the shared unknowns."""
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
@@ -86,7 +86,7 @@ class Inspection:
 
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
-        """Of the shared unknowns."""
+        """Cofactors of the shared unknowns."""
         return self.solution.propagate(self.shared)
 
     @property
@@ -96,7 +96,7 @@ class Inspection:
 
     @property
     def point_cofactor(self) -> Float[np.ndarray, "points 3 3"]:
-        """Of the points along their axes."""
+        """Cofactors of the points along their axes."""
         return self.solution.cofactor("point")
 
     @property
@@ -139,11 +139,11 @@ def adjust(declared: Declared, snooping: str, significance: float) -> Inspection
 
     def again(problem: Problem, values: Values) -> Solution:
         nonlocal steps
-        problem, _ = declared.rescaled(problem, values)
+        problem, _ = declared.rescale(problem, values)
         for _ in range(ROUNDS):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
-            problem, change = declared.rescaled(problem, values)
+            problem, change = declared.rescale(problem, values)
             if not (change > SAME and converged(minimum.termination)):
                 break
         found = Solution(problem, values)

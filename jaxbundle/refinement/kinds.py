@@ -36,17 +36,17 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, given_pose, moved_pose
+from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, move_pose, recorded_pose
 from jaxbundle.pushbroom.project import misclosure_of
 from jaxbundle.refinement.freedom import (
     Form,
     Sizes,
     change_of,
-    changed_offsets,
-    changed_slopes,
+    change_offsets,
+    change_slopes,
     middle_and_half,
 )
 from jaxbundle.system.programs import compile_once
@@ -69,7 +69,7 @@ class AlongAxes:
     def prepare(self, value):
         return tuple(value.position), tuple(map(tuple, value.axes))
 
-    def moved(self, block, change):
+    def move(self, block, change):
         X, axes = block
         steps = [tuple(d * x for x in axis) for d, axis in zip(change, axes)]
         return tuple(sum(parts) for parts in zip(X, *steps))
@@ -94,14 +94,14 @@ class Row(Vector):
     def prepare(self, value):
         return value
 
-    def moved(self, block, change):
+    def move(self, block, change):
         return block.at[jnp.array(self.moving)].add(jnp.stack(change)) if change else block
 
 
 class Line(NamedTuple):
     """What belongs to a measured line and pixel: the pose that the tables give, seconds from the
-    middle line, offsets, mounting and axes F of the image; how much of every unknown of the spline
-    is in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
+    middle line, offsets, mounting and axes F of the image; the coefficient of every unknown of the
+    spline in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
 
     pose: Pose
     dt: Scalar
@@ -130,17 +130,17 @@ class ScannerPoint:
         """g: the slopes of the point minus those of the pixel."""
         change = change_of(self.sizes, jnp.concatenate([own, sensor]))
         jitter = change.jitter @ line.jitter
-        offsets = changed_offsets(line.offsets, line.axes, change, jitter)
-        pose = moved_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
+        offsets = change_offsets(line.offsets, line.axes, change, jitter)
+        pose = move_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
         added = line.across @ change.look_across, line.along @ change.look_along
-        slopes = changed_slopes(line.slopes, change.focal_length, added)
+        slopes = change_slopes(line.slopes, change.focal_length, added)
         return misclosure_of(pose, slopes, X, self.corrections, self.earth)
 
 
 def line_of(image: PushbroomImage, form: Form, origin, place: Float[AnyArray, "2"]) -> Line:
     """What belongs to a measured (line, pixel), in coordinates relative to an origin; without S."""
     t = image.times.time(place[0])
-    pose, (middle, half) = given_pose(image, t), middle_and_half(image)
+    pose, (middle, half) = recorded_pose(image, t), middle_and_half(image)
     weights = form.spline.weights(t)
     powers = lambda n: jnp.array([((place[1] - middle) / half) ** k for k in range(n)])
     return Line(
@@ -157,7 +157,7 @@ def lines_of(
     """What belongs to the measured places of points X [n, 3] of an image, S where its corrections
     are `own` and `sensor`; and v."""
     n = len(places)
-    wide = np.minimum(np.arange(rounded(n)), n - 1)
+    wide = np.minimum(np.arange(round_up(n)), n - 1)
     given = np.asarray(X)[wide], np.asarray(places)[wide]
     found = _lines_of(kind, image, form, origin, own, sensor, *given)
     return jax.tree.map(lambda x: np.asarray(x)[:n], found)

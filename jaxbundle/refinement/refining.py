@@ -20,7 +20,7 @@ from jaxbundle.refinement.check_points import CheckPoints, intersect
 from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
 from jaxbundle.refinement.freedom import Name, change_of
 from jaxbundle.refinement.inspection import Inspection, adjust
-from jaxbundle.refinement.refined import refined_image
+from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
@@ -31,7 +31,7 @@ TESTS = ("none", "baarda", "pope")
 
 @dataclasses.dataclass(frozen=True)
 class Refinement:
-    """The result: `inspection` holds the numbers of it."""
+    """The result: `inspection` holds its numbers."""
 
     inspection: Inspection
     check: CheckPoints | None
@@ -59,7 +59,7 @@ class Refinement:
 
     @property
     def names(self) -> list[Name]:
-        """Of the unknowns that points share."""
+        """Names of the unknowns shared by points."""
         return [column.name for column in self.inspection.declared.columns]
 
     @property
@@ -89,12 +89,12 @@ class Refinement:
 
     @property
     def covariance(self) -> Float[np.ndarray, "m m"]:
-        """Of `estimate`, with σ0 a posteriori."""
+        """The covariance of `estimate`, with σ0 a posteriori."""
         return self.inspection.sigma0**2 * self.inspection.cofactor
 
     @property
     def correlation(self) -> Float[np.ndarray, "m m"]:
-        """Of `estimate`."""
+        """The correlations of `estimate`."""
         return correlation_matrix(self.inspection.cofactor)
 
     @property

@@ -5,9 +5,9 @@ import numpy as np
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.refining import Refinement
 
-STRONG = 0.9
+LISTED_CORRELATION = 0.9
 """Correlations above this are listed."""
-MOST = 12
+MOST_LISTED = 12
 """Largest number of listed correlations and worst image points."""
 
 
@@ -85,8 +85,8 @@ def report(result: Refinement) -> str:
     lines += ["", "Unknowns", *_unknowns(result)]
     strong = _correlations(result)
     if strong:
-        lines += ["", f"Correlations above {STRONG:g}", *strong]
-    lines += ["", "Image points with the greatest tests", *_tests(used)]
+        lines += ["", f"Correlations above {LISTED_CORRELATION:g}", *strong]
+    lines += ["", "Image points with the largest tests", *_tests(used)]
     if result.removed:
         lines += ["", "Removed as blunders"]
         lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]
@@ -114,15 +114,15 @@ def _unknowns(result):
 
 def _correlations(result):
     C, names = result.correlation, result.names
-    i, j = np.nonzero(np.triu(np.abs(C) > STRONG, 1))
-    order = np.argsort(-np.abs(C[i, j]), kind="stable")[:MOST]
+    i, j = np.nonzero(np.triu(np.abs(C) > LISTED_CORRELATION, 1))
+    order = np.argsort(-np.abs(C[i, j]), kind="stable")[:MOST_LISTED]
     return [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
 
 
 def _tests(rows):
     worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
-    for row in sorted(rows, key=worst, reverse=True)[:MOST]:
+    for row in sorted(rows, key=worst, reverse=True)[:MOST_LISTED]:
         pair = lambda values, form: " ".join(format(x, form) for x in values)
         mdb = pair(minimal_detectable(1.0, np.nan_to_num(row["r"])), "6.1f")
         yield (

@@ -93,7 +93,7 @@ def check_points_table(points: GroundPoints) -> None:
         if id in seen:
             raise InputError(
                 f"{points.source(row)}: point {id!r} occurs twice, also at "
-                f"{points.source(seen[id])}; leave it once"
+                f"{points.source(seen[id])}; keep one"
             )
         seen[id] = row
         if role != "tie" and not np.isfinite(points.X[row]).all():
@@ -121,7 +121,7 @@ def check_observations(
             raise InputError(f"{where}: σ must be positive, in lines and pixels")
         if (i, p) in seen:
             raise InputError(f"{where} is measured twice, also at "
-                             f"{observations.source(seen[i, p])}; leave one")
+                             f"{observations.source(seen[i, p])}; keep one")
         seen[i, p] = row
     for i, one in enumerate(images):
         rows = np.flatnonzero(observations.image == i)

@@ -21,13 +21,13 @@ from jaxbundle.leastsquares.quality.names import (
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Declared
 
-WEAK = 1e-2
+SMALLEST_EIGENVALUE = 1e-2
 """Smaller eigenvalues mean a σ more than ten times that of the unknown alone."""
 NULL = 1e-10
 """Eigenvalues below this are rounding."""
-PART = 0.15
+SMALLEST_PART = 0.15
 """An unknown with at least this fraction of the largest component belongs to the direction."""
-MOST = 4
+MOST_LISTED = 4
 """Largest number of unknowns listed in one direction."""
 
 
@@ -44,15 +44,16 @@ def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
     S, names = _observe(declared, found)
     if not np.isfinite(S).all():
         vague = undetermined(found.problem, found.values)
-        sentence = f"the points do not determine {', '.join(vague[:MOST])}"
+        sentence = f"the points do not determine {', '.join(vague[:MOST_LISTED])}"
         return [Weakness(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)
     weak, jitter = [], set()
     for value, vector in zip(values, vectors.T):
-        if value >= WEAK:
+        if value >= SMALLEST_EIGENVALUE:
             break
         shares = _shares(vector, names)
-        named = [name for name, share in shares if share >= PART * shares[0][1]][:MOST]
+        least = SMALLEST_PART * shares[0][1]
+        named = [name for name, share in shares if share >= least][:MOST_LISTED]
         if " jitter of " in named[0]:
             # many directions of one spline: one sentence
             jitter.add((named[0], value < NULL))

@@ -7,7 +7,7 @@ precision of an image coordinate is σ0 times its a priori σ, in the unit of th
 import numpy as np
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ROLES
 from jaxbundle.report.layout import (
@@ -244,7 +244,7 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
     if adjustment.redundancy < 1:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
     if adjustment.sigma_factors:
-        return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
+        return "not done: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
     if unit_weights(adjustment):
         return f"not meaningful: unit weights (a priori σ 1 mm);  {_interval(found, level)}"
@@ -319,9 +319,9 @@ def failure_facts(adjustment) -> list[tuple[str, str]]:
         ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
     ]
     if names:
-        rows.append(("Not determined", some(names, 40, clean)))
+        rows.append(("Not determined", list_some(names, 40, clean)))
     elif adjustment.weakness.unknowns:
-        rows.append(("Hardly determined", some(adjustment.weakness.unknowns, 40, clean)))
+        rows.append(("Hardly determined", list_some(adjustment.weakness.unknowns, 40, clean)))
     advice = [ADVICE.get(reason, ADVICE[STUCK])]
     if reason == LIMIT and taken < tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")

@@ -29,7 +29,7 @@ from jaxbundle.report.layout import (
 TESTS = {"pope": "tau", "baarda": "w"}
 SYMBOLS = {"pope": "τ", "baarda": "w"}
 MOST_RESIDUALS = 100
-WEAKEST = 8
+MOST_WEAK_ROWS = 8
 
 
 # --- residuals ------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def redundancy(adjustment) -> list[str]:
     """Redundancy numbers: their sum, their range, and the observations least controlled."""
     found = adjustment.residuals
     r = found["r"]
-    order = np.argsort(r, kind="stable")[:WEAKEST]
+    order = np.argsort(r, kind="stable")[:MOST_WEAK_ROWS]
     weak, loose = count_weak(r)
     rows = [
         ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
@@ -187,8 +187,8 @@ def removals(adjustment) -> list[str]:
         lines += ["", "They are excluded from all results in this report."]
         if any(item.others for item in adjustment.removed):
             lines += paragraph(
-                "Either of: one of these rays is wrong and the point does not tell which, so that "
-                "none of them is used; a tie point left with fewer than two rays is not used."
+                "Either of: one of these rays is wrong, but the point does not show which, "
+                "and none of them is used; a tie point left with fewer than two rays is not used."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)

@@ -4,7 +4,7 @@ from html import escape
 
 import numpy as np
 
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.report.head import (
     chi_squared,
     image_precision,
@@ -24,7 +24,7 @@ MOST_CAMERAS, MOST_PARAMETERS = 3, 20
 
 
 def one_line(adjustment) -> str:
-    """What `repr` shows."""
+    """The text of `repr`."""
     network = adjustment.network
     name = f"Adjustment {clean(network.name)!r}"
     if not adjustment.converged:
@@ -51,7 +51,7 @@ def summary(adjustment) -> list[tuple[str, str]]:
     ]
     if not adjustment.converged:
         if adjustment.undetermined:
-            rows.append(("Not determined", some(adjustment.undetermined, 8, clean)))
+            rows.append(("Not determined", list_some(adjustment.undetermined, 8, clean)))
         rows.append(("", "There is no result; report() says what to do."))
     else:
         rows += [

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import shifted_problem
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.checks import determine
 from jaxbundle.leastsquares.quality.components import rescale
 from jaxbundle.network.tables import Distances, Observations, Points
@@ -19,7 +19,7 @@ from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
     """Intersected check points: coordinates, cofactors (times σ0² for variances), differences."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.network.check import check_network
@@ -18,7 +18,7 @@ from jaxbundle.network.tables import Network
 from jaxbundle.statistics.inspection import Inspection
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class ExpectedPrecision:
     """A priori σ: of points [P, 3] (object unit; 0 where held) and projection centres [I, 3]."""

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.types import present
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class FarPoints:
     """Points with a well-determined direction and a poorly determined distance.

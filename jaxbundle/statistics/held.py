@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.arguments import number, positive, shown
+from jaxbundle.arguments import number, positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
     matrix_from_quaternion,
@@ -21,12 +21,12 @@ from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.response import Change
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
-from jaxbundle.network.columns import did_you_mean, some
+from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.further.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
 
-EVERY = "*"
+WILDCARD = "*"
 """Wildcard for all ids, or all names, of held quantities."""
 ANGLES_OF_POSES = EXTERIOR[3:]
 
@@ -51,7 +51,7 @@ def find_causes(problem: Problem, values: Values, held: Mapping[Any, Any]) -> li
     if not isinstance(held, Mapping) or not held:
         raise InputError(
             'held: σ of what is held, by name, are expected, such as {"camera:cam:K3": 1e-6}; '
-            f"not {shown(held)}"
+            f"not {show(held)}"
         )
     return [_cause(problem, values, name, given) for name, given in held.items()]
 
@@ -101,7 +101,7 @@ def split_name(name: Any) -> tuple[str, str, str]:
         parts = kind, id, parameter
     if not isinstance(parts, tuple) or len(parts) != 3 or not all(map(str, parts)):
         raise InputError(
-            f"{shown(name)}: KIND:ID:NAME is expected, such as camera:cam:K3 or point:*:Z"
+            f"{show(name)}: KIND:ID:NAME is expected, such as camera:cam:K3 or point:*:Z"
         )
     kind, id, parameter = map(str, parts)
     return kind, id, parameter
@@ -112,7 +112,7 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     text, estimated = ":".join((kind, id, parameter)), []
     tables = _tables_of(problem, kind)
     ids = [table.label(row) for table in tables for row in range(table.rows)]
-    if id != EVERY and id not in ids:
+    if id != WILDCARD and id not in ids:
         raise InputError(
             f"{text}: there is no {kind} {id!r}{did_you_mean(id, ids, listing=len(ids) <= 20)}"
         )
@@ -121,10 +121,10 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
         names = _names(problem, table)
         known += [name for name in names if name not in known]
         for row in range(table.rows):
-            if id not in (EVERY, table.label(row)):
+            if id not in (WILDCARD, table.label(row)):
                 continue
             for column, of in enumerate(names):
-                if parameter not in (EVERY, of):
+                if parameter not in (WILDCARD, of):
                     continue
                 place = table, row, column, of
                 (estimated if _is_free(table, row, column) else found).append(place)
@@ -147,7 +147,7 @@ def _tables_of(problem: Problem, kind: str) -> list[Table]:
     if not found:
         known = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
         raise InputError(
-            f"held: unknown kind {kind!r}; known: {some(known, 12, str)}"
+            f"held: unknown kind {kind!r}; known: {list_some(known, 12, str)}"
         )
     return found
 

@@ -8,10 +8,10 @@ import math
 
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 
-CONTRADICTED = 1.2
+CONTRADICTING_RATIO = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is also significant."""
-BEYOND_CHANCE = 0.001
-MANY = 0.05
+SIGNIFICANCE = 0.001
+LARGEST_REMOVED = 0.05
 """A larger fraction of removed image points, beyond chance, is reported."""
 UNRECOGNISABLE = 20.0
 """Residuals this many times their σ are most likely due to wrong axes or units."""
@@ -21,9 +21,9 @@ def contradicts(scale: float, redundancy: int) -> bool:
     """Whether a scale of 1 can be excluded."""
     low, high = (
         math.sqrt(chi2_quantile(p, redundancy) / redundancy)
-        for p in (BEYOND_CHANCE / 2, 1 - BEYOND_CHANCE / 2)
+        for p in (SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2)
     )
-    return not (min(1 / CONTRADICTED, low) <= scale <= max(CONTRADICTED, high))
+    return not (min(1 / CONTRADICTING_RATIO, low) <= scale <= max(CONTRADICTING_RATIO, high))
 
 
 def doubt_of_baarda(
@@ -45,10 +45,10 @@ def doubt_of_baarda(
         done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
         return (
             f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
-            f"large as they say: it has {done} ({took}). {_remedy(scale)}, or {pope}"
+            f"large as they imply: it has {done} ({took}). {_remedy(scale)}, or {pope}"
         )
     chance = 3 * math.sqrt(rays * by_chance)
-    if removed - by_chance * rays > max(MANY * rays, chance):
+    if removed - by_chance * rays > max(LARGEST_REMOVED * rays, chance):
         return (
             f"Baarda's test has removed many observations ({took}): there are as many blunders, or "
             f"the a priori σ are a little too small. Look at what was removed, or {pope}"
@@ -83,7 +83,7 @@ def doubt_of_fit(
     sigma, blunders = "a priori σ that are too small", "blunders (--snooping pope)"
     missing = "a camera parameter that is missing or held"
     mirrored = "image coordinates with a mirrored axis or in another unit"
-    if scale < CONTRADICTED or scale < sigma0 / 2:
+    if scale < CONTRADICTING_RATIO or scale < sigma0 / 2:
         causes = [blunders, missing, sigma]
     elif scale > UNRECOGNISABLE:
         causes = [mirrored, missing, sigma, blunders]

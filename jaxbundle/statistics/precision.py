@@ -23,10 +23,10 @@ from jaxtyping import Float
 from jaxbundle import cameras
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import check_given
-from jaxbundle.adjustment.unknowns import angles_near, named, value_of
+from jaxbundle.adjustment.unknowns import angles_near, find_unknowns, value_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
-from jaxbundle.leastsquares.problem import given_data
+from jaxbundle.leastsquares.problem import complete_data
 from jaxbundle.leastsquares.quality.precision import precision as engine_precision
 from jaxbundle.leastsquares.quality.precision import redundancy as engine_redundancy
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
@@ -83,9 +83,9 @@ def precision(
     name.
     """
     check_given(problem, data)
-    problem, wanted = problem.with_factor(), [] if names == () else named(problem, names)
+    problem, wanted = problem.with_factor(), [] if names == () else find_unknowns(problem, names)
     if problem.reduction not in FACTORS:
-        raise InputError("precision: the network is too large for its covariance; take part of it")
+        raise InputError("precision: the network is too large for its covariance; use a part of it")
     data = problem.data if data is None else data
 
     def of(tables):
@@ -93,7 +93,7 @@ def precision(
         return jnp.stack([value_of(problem, name, values) for name in wanted])
 
     found = engine_precision(
-        problem.system, problem.layout.data(predicted(problem, data)), of if wanted else None
+        problem.system, problem.layout.data(predict(problem, data)), of if wanted else None
     )
     of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
     return Precision(
@@ -111,26 +111,26 @@ def precision(
 def redundancy(problem: Problem, data: Data | None = None) -> Rows:
     """The redundancy numbers of a design, differentiable to every order in all of it.
 
-    r = 1 − diag(J·Q·Jᵀ) of every observation: 0, nothing controls it, to 1. Use it as `precision`;
-    nothing is adjusted, and image coordinates are those that the given values have.
+    r = 1 − diag(J·Q·Jᵀ) of every observation: 0 (uncontrolled) to 1. Use it as `precision`;
+    nothing is adjusted, and image coordinates are predicted from the given values.
 
     **Returns:** `Rows`: `image` [rays, 2], `control`, `exterior`, `interior`, `distance` and
     `other` in the order of `Data`; 0 where the weight is 0.
 
-    **Raises:** `InputError` where no factor of the network fits into memory.
+    **Raises:** `InputError` if no factor of the network fits into memory.
     """
     check_given(problem, data)
     problem = problem.with_factor()
     if problem.reduction not in FACTORS:
-        raise InputError("redundancy: the network is too large for its cofactors; take part of it")
+        raise InputError("redundancy: the network is too large for its cofactors; use a part of it")
     data, system = problem.data if data is None else data, problem.system
-    given = given_data(system, problem.layout.data(predicted(problem, data)))
+    given = complete_data(system, problem.layout.data(predict(problem, data)))
     found = engine_redundancy(system.declared, system.plan, given)
     found = {o: found[o][: one.number] for o, one in enumerate(system.observations)}
     return problem.layout.rows(found, data)
 
 
-def predicted(problem: Problem, data: Data) -> Data:
+def predict(problem: Problem, data: Data) -> Data:
     """The data with image coordinates predicted from the given values."""
     xy = data.image_xy
     for table in problem.layout.cameras:

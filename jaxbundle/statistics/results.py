@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.unknowns import angles_near, value_of
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.names import Name
@@ -61,7 +61,7 @@ def ask(inspection: Inspection, of: Any = WORDS) -> Results:
         return _of_function(inspection, of)
     given = (of,) if isinstance(of, str) or _is_name(of) else of
     if not isinstance(given, Sequence):
-        raise InputError(f"of: names of results are expected, not {shown(of)}")
+        raise InputError(f"of: names of results are expected, not {show(of)}")
     parts, asked, sigmas, first = [], [], [], 0
     words = given == WORDS
     for one in given:

@@ -13,14 +13,14 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.weakness import (
-    FAR,
-    VAGUE,
+    NONLINEAR_RATIO,
+    VAGUE_RATIO,
     Extents,
     find_weak,
     find_weak_unsolved,
 )
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further.base import ANGLES, LENGTHS
 from jaxbundle.network.further.rolling_shutter import READ_OUT
 from jaxbundle.statistics.inspection import Inspection
@@ -39,9 +39,9 @@ FURTHER = (
 
 @dataclasses.dataclass(frozen=True)
 class Weakness:
-    """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE` of their reference,
-    the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above 1/`FAR` of
-    their distance; `of`: the number of points."""
+    """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE_RATIO` of their
+    reference, the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above
+    1/`NONLINEAR_RATIO` of their distance; `of`: the number of points."""
 
     unknowns: tuple[str, ...] = ()
     worst: float = 0.0
@@ -56,18 +56,18 @@ class Weakness:
             kinds = [kind for kind in ADVICE_FOR if any(f" of {kind} " in n for n in self.unknowns)]
             worst = f"is up to {self.worst:.2g} of" if self.worst < 1 else "is larger than"
             found.append(
-                f"poorly determined: {some(self.unknowns, 8, str)}; a σ {worst} the "
+                f"poorly determined: {list_some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
-                f"{1 / VAGUE:g} of it the unknown is practically undetermined. "
+                f"{1 / VAGUE_RATIO:g} of it the unknown is practically undetermined. "
                 f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}"
             )
         if self.points:
             most = 2 * len(self.points) > self.of
-            where = "the images stand at one place, or nearly" if most else "rays almost parallel"
+            where = "images taken from one place, or nearly" if most else "rays almost parallel"
             found.append(
                 f"poorly determined: X, Y, Z of {len(self.points)} of {count(self.of, 'point')} "
-                f"({some(self.points)}), with a σ above {1 / FAR:g} of their distance: {where}. "
-                "Depth needs images from places farther apart."
+                f"({list_some(self.points)}), with a σ above {1 / NONLINEAR_RATIO:g} of their "
+                f"distance: {where}. Depth needs images from places farther apart."
             )
         return tuple(found)
 

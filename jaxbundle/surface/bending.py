@@ -25,7 +25,7 @@ from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage
 
-REACHES = 4, 2
+NODE_REACHES = 4, 2
 """Nodes on each side of the centre for the polynomial. The wide one reduces the errors of the
 nodes, which are those of the matches around it, to an eighth; the narrow one is for surfaces
 that the wide one does not fit."""
@@ -35,15 +35,15 @@ MOST_MISFIT = 0.12
 """Maximum RMS of the nodes relative to the polynomial, pixels of their level."""
 STEP = 4.0
 """Pixels of the base for second differences of positions."""
-UNSURE = 0.3
+LARGEST_SIGMA = 0.3
 """σ of a correction relative to it."""
 UNKNOWN = 2.0
 """Multiple of the mean squares of the corrections added if a correction is unknown."""
-MOST = 0.5
+LARGEST_CORRECTION = 0.5
 """Maximum correction, pixels: larger ones mean that the polynomial does not fit the surface."""
 NEAR, SURE = 1.5, 0.7
 """Maximum shift of a node by least squares matching, pixels, and its minimum ρ."""
-TOGETHER = 4096
+NODES_AT_ONCE = 4096
 
 
 class Bend(NamedTuple):
@@ -56,7 +56,7 @@ class Bend(NamedTuple):
 
 def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
     """Derivatives of the widest fitting polynomial around the nearest node."""
-    wide, narrow = (_polynomials(guide, uv, reach) for reach in REACHES)
+    wide, narrow = (_polynomials(guide, uv, reach) for reach in NODE_REACHES)
     derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
     return Bend(derivatives, wide.known | narrow.known)
 
@@ -150,8 +150,8 @@ def response(
     k = np.arange(-half, half + 1, dtype=float)
     y, x = (a.ravel() for a in np.meshgrid(k, k, indexing="ij"))
     squares = np.stack([x * x / 2, x * y, y * y / 2])
-    for first in range(0, len(uv), TOGETHER):
-        part = slice(first, first + TOGETHER)
+    for first in range(0, len(uv), NODES_AT_ONCE):
+        part = slice(first, first + NODES_AT_ONCE)
         T, gx, gy = _with_gradient(grey, np.rint(uv[part]).astype(int), half)
         one = np.ones_like(T)
         G = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, one, T], 2)
@@ -163,12 +163,12 @@ def response(
         N = np.swapaxes(G, 1, 2) @ G + 1e-9 * np.eye(8)
         c = np.linalg.solve(N, np.einsum("npi,np->ni", G, away)[:, :, None])[:, :, 0] * scale
         found = np.einsum("nij,nj->ni", A[part], c[:, :2])
-        small = np.isfinite(found).all(1) & (np.linalg.norm(found, axis=1) < MOST)
+        small = np.isfinite(found).all(1) & (np.linalg.norm(found, axis=1) < LARGEST_CORRECTION)
         out[part] = np.where(small[:, None], found, 0.0)
     return out
 
 
-def corrected(
+def correct_bending(
     pair: tuple[OrientedImage, OrientedImage], guide: Guide, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, " n"], match, half: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
@@ -184,7 +184,7 @@ def corrected(
     squares = off[:, :, None] * off[:, None]
     # without a fitting polynomial the effect of bending may be as large as elsewhere
     unknown = squares[rows].mean(0) if len(rows) else np.zeros((2, 2))
-    doubt = np.where(good[:, None, None], UNSURE**2 * squares, UNKNOWN * unknown)
+    doubt = np.where(good[:, None, None], LARGEST_SIGMA**2 * squares, UNKNOWN * unknown)
     return match.uv - off, match.covariance + doubt
 
 

@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
-ENOUGH = 5
+FEWEST_POINTS = 5
 """Minimum tie points of an image for its depths."""
-ROOM = 0.35
+DEPTH_MARGIN = 0.35
 """Margin of the depths beyond those of the tie points, relative to their range."""
 NEAREST_ANGLE, FARTHEST_ANGLE = 1.2, 0.003
 """Default angles of intersection of two images, radians."""
@@ -37,17 +37,19 @@ class Bounds:
         return np.where((inside[:, :1] < inside[:, 1:]), inside, whole)
 
 
-def by_points(view: OrientedImage, X: Float[np.ndarray, "n 3"]) -> tuple[float, float] | None:
+def bounds_from_points(
+    view: OrientedImage, X: Float[np.ndarray, "n 3"]
+) -> tuple[float, float] | None:
     """Bounds of q of the points in an image with a margin; None if they are too few."""
     X = X[is_inside(view, view.project(X))]
-    if len(X) < ENOUGH:
+    if len(X) < FEWEST_POINTS:
         return None
     low, high = np.percentile(view.parameter(X), [1, 99])
-    room = ROOM * (high - low) + 0.05 * abs(high)
+    room = DEPTH_MARGIN * (high - low) + 0.05 * abs(high)
     return max(low - room, 0.2 * low if low > 0 else -np.inf), high + room
 
 
-def by_geometry(
+def bounds_from_geometry(
     view, others: Sequence
 ) -> tuple[float, float] | None:
     """Bounds of q of photographs for usual angles of intersection, around the point where most

@@ -13,9 +13,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.surface.cloud import Cloud
 
 NEIGHBOURS = 8
-FARTHEST = 3.0
+LARGEST_DISTANCE = 3.0
 """Maximum distance of neighbours, in median spacings of the second cloud."""
-TOGETHER = 1 << 16
+POINTS_AT_ONCE = 1 << 16
 
 
 def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
@@ -29,9 +29,10 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
     k = min(NEIGHBOURS, len(other))
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
-    for first in range(0, len(cloud), TOGETHER):
-        part = slice(first, min(first + TOGETHER, len(cloud)))
-        distance[part], sigma[part] = _to_planes(cloud, other, tree, k, part, FARTHEST * spacing)
+    for first in range(0, len(cloud), POINTS_AT_ONCE):
+        part = slice(first, min(first + POINTS_AT_ONCE, len(cloud)))
+        found = _to_planes(cloud, other, tree, k, part, LARGEST_DISTANCE * spacing)
+        distance[part], sigma[part] = found
     v = distance[np.isfinite(distance)]
     if not len(v):
         raise InputError("the clouds have nothing in common: check their coordinate systems")

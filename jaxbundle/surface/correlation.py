@@ -21,11 +21,11 @@ from jaxbundle.surface.segments import Segments, Windows, positions
 from jaxbundle.surface.views import OrientedImage
 from jaxbundle.system.configuration import available_cores
 
-TOGETHER = 256
+POINTS_AT_ONCE = 256
 """Number of points whose strips fit into the cache."""
 STRIP = 512
 """Lines of a coarser image computed together."""
-FLAT = 1e-3
+SMALLEST_CONTRAST = 1e-3
 """Standard deviation of a window, grey values, below which it has no contrast."""
 
 
@@ -109,7 +109,7 @@ def correlate(
     sign = np.where(forward, 1.0, -1.0)[:, None]
 
     def of_rows(first):
-        rows = slice(first, first + TOGETHER)
+        rows = slice(first, first + POINTS_AT_ONCE)
         template = _template(pyramids[0], uv[rows], sign[rows] * shape.along[rows],
                              np.sign(sign[rows]), half, level)  # fmt: skip
         strip = _strip(pyramids[1], place[rows], sign[rows] * scale * shape.other_along[rows],
@@ -117,7 +117,7 @@ def correlate(
         return slide(template, strip)
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        parts = list(pool.map(of_rows, range(0, len(uv), TOGETHER)))
+        parts = list(pool.map(of_rows, range(0, len(uv), POINTS_AT_ONCE)))
     rho = np.concatenate(parts) if parts else np.zeros((0, steps), np.float32)
     return np.where(shape.usable[:, None], rho, np.nan), q
 
@@ -142,7 +142,7 @@ def slide(
             cross += product
     total, square = (_sliding_sum(a.sum(1, dtype=np.float64), w) for a in (s, s * s))
     spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
-    flat = (norm[:, None] <= FLAT * w) | (spread <= FLAT * w)
+    flat = (norm[:, None] <= SMALLEST_CONTRAST * w) | (spread <= SMALLEST_CONTRAST * w)
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(flat, -1.0, cross / (norm[:, None] * spread))
     return np.where(lost | ~np.isfinite(norm)[:, None], np.nan, rho)

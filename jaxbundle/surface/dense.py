@@ -30,16 +30,16 @@ from jaxbundle.system.configuration import available_cores
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
-EVEN = 40
+MEAN_WINDOW = 40
 """Half the side of the windows whose means are subtracted from the grey values."""
 LEAST_SPREAD = 25.0
 """Minimum standard deviation of compared grey values, of 256."""
 MOST_COSTS = 4e8
 """Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory, and
 paths from below are also followed."""
-UNIQUE = 5
+UNIQUENESS = 5
 """Percent by which the best cost must be below the second."""
-SPECKLE = 80
+SMALLEST_REGION = 80
 """Pixels of the smallest region of similar disparities that is kept."""
 HALF, WIDE = 4, 7
 """Half the side of the windows of least squares; of those where the texture is weak."""
@@ -47,7 +47,7 @@ WEAK, FEW = 0.05, 0.02
 """σ of a disparity, pixels, above which the texture is weak; the share of weak pixels below which
 no larger windows are tried."""
 MOST_RATIO = 5.0
-"""Of the contrasts of two windows that may be alike."""
+"""Maximum ratio of the contrasts of two windows that may be alike."""
 ROUNDS = 2
 BAND, MARGIN = 128, 32
 """Rows refined together, and rows above and below covered by their windows."""
@@ -57,11 +57,10 @@ which is a change of disparities by more than `JUMP`. Found on rendered roofs.""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
 """Pixels of a block for the scatter; the quantile of the blocks used."""
 COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
-"""At a resolution so much coarser, windows of half this side are compared with others of the image
-itself; their correlation from which a texture repeats itself; the part of the image which a surface
-of such a texture must have."""
-NEAR = 0.7
-"""Pixels: by so much disparities of one surface differ within a window, about."""
+"""Reduction factor; half the side of windows compared with others of the same image; correlation
+from which the texture repeats itself; minimum part of the image for a surface of such a texture."""
+SURFACE_TOLERANCE = 0.7
+"""Approximate difference of disparities of one surface within a window, pixels."""
 MOST_CHANGE = 1.0
 """Maximum change of a disparity by least squares, pixels."""
 LEAST_CORRELATION, SURE = 0.5, 0.9
@@ -70,8 +69,8 @@ LEAST_SIGMA, MOST_SIGMA = 0.008, 0.5
 """σ of a disparity, pixels: added by interpolation and sampling, and the limit above which the
 texture does not determine it."""
 INNER, SIGNIFICANT = 2, 3.0
-"""By how much the window is larger than its middle, which must have texture of its own: more than
-the variance of noise by so many σ of it; else a window tells of what is beside its pixel."""
+"""Margin of the window around its middle, which must have texture of its own: variance above that
+of noise by this many σ. Otherwise the window shows the surroundings of its pixel."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
 
@@ -110,7 +109,7 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
 def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows columns"]]:
     """Grey values around 128 without differences of exposure and light."""
     cv2 = need_opencv()
-    mean = lambda a: cv2.blur(a.astype(np.float32), (2 * EVEN + 1,) * 2)
+    mean = lambda a: cv2.blur(a.astype(np.float32), (2 * MEAN_WINDOW + 1,) * 2)
     found, spread = [], 0.0
     for a, there in ((left, inside), (right, right_inside)):
         away = np.where(there, a - mean(a * there) / np.maximum(mean(there), 1e-6), 0)
@@ -127,8 +126,8 @@ def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     number = max(16, -(-(span + 1) // 16) * 16)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
-        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
-        speckleWindowSize=SPECKLE, speckleRange=2,
+        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUENESS,
+        speckleWindowSize=SMALLEST_REGION, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
         else cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip
@@ -284,7 +283,7 @@ def _solve(left, warped, half) -> _Solved:
     LR = g[..., 2]
     textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
     inner = _variance(left, half // INNER)
-    Q, p = _solved(N, g, textured)
+    Q, p = _invert_normal(N, g, textured)
     rest = np.maximum(LL - np.einsum("...i,...i->...", p, g), 0)
     s2 = rest / (n - 4)
     # half of s² is the noise of the left image
@@ -298,14 +297,14 @@ def _solve(left, warped, half) -> _Solved:
 
 
 def _variance(a, half):
-    """Of the grey values of windows."""
+    """Variance of the grey values of windows."""
     cv2 = need_opencv()
     side = (2 * half + 1, 2 * half + 1)
     mean = lambda x: cv2.boxFilter(x, cv2.CV_64F, side, borderType=cv2.BORDER_REFLECT_101)
     return mean(a * a) - mean(a) ** 2
 
 
-def _solved(N, g, textured):
+def _invert_normal(N, g, textured):
     """N⁻¹ and N⁻¹·g of symmetric 3 × 3; NaN where there is no texture or one direction has none."""
     a, b, c = N[..., 0, 0], N[..., 0, 1], N[..., 0, 2]
     d, e, f = N[..., 1, 1], N[..., 1, 2], N[..., 2, 2]
@@ -320,7 +319,8 @@ def _solved(N, g, textured):
 
 
 def _gradient(a, axis):
-    """Of the cubic spline through the pixels' neighbours (fourth order central difference)."""
+    """Derivative of the cubic spline through the pixels' neighbours (fourth order central
+    difference)."""
     kernel = np.array([1, -8, 0, 8, -1], np.float32) / 12
     return ndimage.correlate1d(a, kernel, axis=axis, mode="nearest")
 
@@ -348,7 +348,7 @@ def _smooth(disparity, known, half):
     """Means of the similar disparities in a window."""
     cv2 = need_opencv()
     far = np.where(known, disparity, -1e3).astype(np.float32)
-    smooth = cv2.bilateralFilter(far, 2 * half + 1, NEAR, float(half))
+    smooth = cv2.bilateralFilter(far, 2 * half + 1, SURFACE_TOLERANCE, float(half))
     return np.where(known, smooth, np.nan).astype(np.float32)
 
 

@@ -21,13 +21,13 @@ from jaxbundle.surface.orientation import orientation_covariance
 from jaxbundle.surface.rectification import Rectified, disparity_range, rectify
 from jaxbundle.surface.views import FrameView
 
-TOGETHER = 1 << 19
+PIXELS_AT_ONCE = 1 << 19
 """Pixels looked up together."""
 ONE_SURFACE = 1.0
 """Maximum difference of the four neighbours for interpolation of disparities, pixels."""
 MOST_DISPARITIES = 320
 SPREAD = 9
-AGREE = 4.0
+LARGEST_DIFFERENCE = 4.0
 """Maximum difference of values of several pairs, in σ of the difference."""
 
 
@@ -57,8 +57,8 @@ def dense_cloud(
     v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
     uv = np.stack([u, v], 1).astype(float)
     parts = [
-        _points((base, *partners), pairs, uv[k : k + TOGETHER])
-        for k in range(0, len(uv), TOGETHER) if pairs
+        _points((base, *partners), pairs, uv[k : k + PIXELS_AT_ONCE])
+        for k in range(0, len(uv), PIXELS_AT_ONCE) if pairs
     ]
     if not parts:
         none = np.zeros
@@ -144,11 +144,11 @@ def combine(
     q, sigma = np.where(known, q, np.nan), np.where(known, sigma, np.nan)
     with np.errstate(invalid="ignore"):
         apart = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
-        votes = (apart < AGREE).sum(1)
+        votes = (apart < LARGEST_DIFFERENCE).sum(1)
     best = np.where(known, votes, -1).argmax(0)
     columns = np.arange(q.shape[1])
     with np.errstate(invalid="ignore"):
-        use = known & (apart[best, :, columns].T < AGREE)
+        use = known & (apart[best, :, columns].T < LARGEST_DIFFERENCE)
     number = use.sum(0)
     weight = np.where(use, 1 / np.where(use, sigma, 1) ** 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -17,7 +17,7 @@ from jaxbundle.surface.views import OrientedImage
 
 PIECE = 1500
 """Side of a piece of the base image, pixels."""
-TOGETHER = 1 << 17
+POINTS_AT_ONCE = 1 << 17
 """Points intersected together."""
 MOST_DISPARITIES = 200
 
@@ -83,8 +83,8 @@ def _piece(base, other, guide, bounds, window, step):
     d = d + slopes[0] * (ab - place)[:, 0] + slopes[1] * (ab - place)[:, 1]
     uv, ab, d, sigma = uv[keep], ab[keep], d[keep] + pair.lowest, sigma[keep]
     parts = [
-        _intersect(base, other, pair, *(a[k : k + TOGETHER] for a in (uv, ab, d, sigma)))
-        for k in range(0, len(uv), TOGETHER)
+        _intersect(base, other, pair, *(a[k : k + POINTS_AT_ONCE] for a in (uv, ab, d, sigma)))
+        for k in range(0, len(uv), POINTS_AT_ONCE)
     ]
     if not parts:
         return None

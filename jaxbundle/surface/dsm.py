@@ -15,9 +15,9 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from jaxbundle.arguments import positive
-from jaxbundle.display import data_set, shows_itself
+from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surface.cloud import Cloud
 
 MOST_CELLS = 2e9
@@ -33,7 +33,7 @@ surfaces."""
 NO_DATA = -9999.0
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Dsm:
     """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
@@ -103,7 +103,7 @@ def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) 
     given = ((path, dsm.height, "height"), (sigma_path, dsm.sigma, "sigma of height"))
     for target, values, name in given:
         if target is not None:
-            with written_raster(target, columns, rows, 1, "float32", **profile) as raster:
+            with write_raster(target, columns, rows, 1, "float32", **profile) as raster:
                 raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32)[None])
                 raster.describe([name])
 

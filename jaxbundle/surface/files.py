@@ -16,15 +16,15 @@ from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.reconstruct import Surface
 
 COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
-NEEDED = COLUMNS[:3]
-TOGETHER = 1 << 16
+REQUIRED_COLUMNS = COLUMNS[:3]
+POINTS_AT_ONCE = 1 << 16
 
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
     """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
     names = np.array([*map(_quote, cloud.images), ""], dtype=object)
-    starts = range(0, len(cloud), TOGETHER)
-    lines = (_lines(cloud, names, slice(k, k + TOGETHER)) for k in starts)
+    starts = range(0, len(cloud), POINTS_AT_ONCE)
+    lines = (_lines(cloud, names, slice(k, k + POINTS_AT_ONCE)) for k in starts)
     write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
 
 
@@ -54,7 +54,7 @@ def read_cloud_csv(path: str | Path) -> Cloud:
     **Raises:** `InputError` naming file, line and column.
     """
     table = read_csv(Path(path))
-    X = np.stack([table.numbers(name, required=True) for name in NEEDED], axis=1)
+    X = np.stack([table.numbers(name, required=True) for name in REQUIRED_COLUMNS], axis=1)
     n = len(X)
     column = lambda name, default: (
         table.numbers(name) if name in table.values else np.full(n, default)

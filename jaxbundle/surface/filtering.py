@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from jaxbundle.arguments import one_of, positive, whole
+from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.choices import CUBE_POINTS
 from jaxbundle.errors import InputError
 from jaxbundle.surface.cloud import Cloud
@@ -27,7 +27,7 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
     point. Cubes begin at multiples of their side.
 
     **Raises:** `InputError`."""
-    size, least = positive("size of the cubes", size), whole("least number of points", least)
+    size, least = positive("size of the cubes", size), integer("least number of points", least)
     one_of("place", place, CUBE_POINTS)
     if not len(cloud):
         return cloud
@@ -54,14 +54,14 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
     return found.take(count >= least)
 
 
-def drop_lonely(
+def drop_isolated(
     cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0
 ) -> Cloud:
     """Without the points whose mean distance to their nearest `neighbours` is more than the median
     of all by `limit` robust standard deviations.
 
     **Raises:** `InputError`."""
-    neighbours, limit = whole("neighbours", neighbours), positive("limit", limit)
+    neighbours, limit = integer("neighbours", neighbours), positive("limit", limit)
     if len(cloud) <= neighbours:
         return cloud
     distance, _ = cKDTree(cloud.X).query(cloud.X, neighbours + 1)
@@ -85,7 +85,7 @@ def drop_weak(
         with np.errstate(invalid="ignore"):
             keep &= (cloud.sigma <= limit).all(1)
     if least_rays is not None:
-        keep &= cloud.rays >= whole("least number of rays", least_rays)
+        keep &= cloud.rays >= integer("least number of rays", least_rays)
     return cloud.take(keep)
 
 

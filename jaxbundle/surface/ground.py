@@ -24,7 +24,7 @@ from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.project import make_search, project_near, project_points
 from jaxbundle.pushbroom.rpc import Rpc, locate, project
 from jaxbundle.pushbroom.surfaces import Height, Plane
-from jaxbundle.surface.views import in_lanes
+from jaxbundle.surface.views import run_in_lanes
 from jaxbundle.system.programs import compile_once
 
 
@@ -67,7 +67,7 @@ class _GroundView:
         self.size = (grey.shape[1], grey.shape[0])
 
     def points(self, uv, q):
-        return in_lanes(self._point, self._frame, uv - np.array(self.shift), q)
+        return run_in_lanes(self._point, self._frame, uv - np.array(self.shift), q)
 
     def parameter(self, X):
         return X[:, 2]
@@ -86,10 +86,10 @@ class RpcView(_GroundView):
     _point = staticmethod(lambda frame, uv, q: _rpc_points(frame, uv, q))
 
     def project(self, X):
-        return in_lanes(_rpc_project, self._frame, X) + np.array(self.shift)
+        return run_in_lanes(_rpc_project, self._frame, X) + np.array(self.shift)
 
     def derivative(self, X):
-        return in_lanes(_rpc_derivative, self._frame, X)
+        return run_in_lanes(_rpc_derivative, self._frame, X)
 
     def range(self) -> tuple[float, float]:
         """The range of heights of the polynomials."""
@@ -108,7 +108,7 @@ class ScannerView(_GroundView):
     _point = staticmethod(lambda frame, uv, q: _scanner_points(frame, uv, q))
 
     def project(self, X):
-        return in_lanes(
+        return run_in_lanes(
             lambda frame, X: self._places(_ground(frame, X)), self._frame, X
         ) + np.array(self.shift)
 
@@ -118,7 +118,7 @@ class ScannerView(_GroundView):
 
     def derivative(self, X):
         places = np.nan_to_num(self.project(X) - np.array(self.shift))
-        return in_lanes(_scanner_derivative, self._frame, X, places)
+        return run_in_lanes(_scanner_derivative, self._frame, X, places)
 
 
 class _Scanner(eqx.Module):
@@ -126,7 +126,7 @@ class _Scanner(eqx.Module):
     around: Neighbourhood | None
     earth: Ellipsoid | None = eqx.field(static=True)
 
-    def fixed(self, X):
+    def to_trajectory(self, X):
         """A point in the coordinates of the trajectory."""
         if self.around is None or self.earth is None:
             return X
@@ -173,13 +173,13 @@ def _scanner_points(frame, uv, q):
 
 @compile_once
 def _ground(frame, X):
-    return jax.vmap(frame.fixed)(X).T
+    return jax.vmap(frame.to_trajectory)(X).T
 
 
 @compile_once
 def _scanner_derivative(frame, X, places):
     def pixel(X, place):
-        line, u = project_near(frame.image, frame.fixed(X), place[1], place[0], frame.earth)
+        line, u = project_near(frame.image, frame.to_trajectory(X), place[1], place[0], frame.earth)
         return jnp.stack([u, line])
 
     return jax.vmap(jax.jacfwd(pixel))(X, places)

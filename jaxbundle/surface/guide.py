@@ -27,15 +27,15 @@ COARSE_STEPS = 128
 """Maximum positions at the coarsest level, if the image is large enough for a coarser one."""
 MOST_STEPS = 512
 """Maximum positions compared for a node."""
-HALF = 4
+HALF_WINDOW = 4
 """Half the side of the windows, pixels of the level."""
-REACH = 2.0
+SEARCH_MARGIN = 2.0
 """Pixels of the coarser level searched beyond the neighbours' range."""
-WEAKEST = 0.35
+SMALLEST_CORRELATION = 0.35
 """Minimum correlation of a node."""
-APART = 2.0
+LARGEST_DEVIATION = 2.0
 """Maximum distance of a node from the median of its neighbours, pixels of the level."""
-SMOOTH = 0.7
+LARGEST_SLOPE = 0.7
 """Change of position from node to node on one plane, relative to their distance."""
 MOST_NODES = 60_000
 """Maximum nodes of a guide; then the finest levels are left to the points."""
@@ -158,7 +158,7 @@ def _search_all(base, others, pyramids, uv, q, level, shape):
 
 def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, common):
     """ρ at common parameters, interpolated along each segment."""
-    rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF,
+    rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF_WINDOW,
                        steps=steps)  # fmt: skip
     spacing = 2.0**level * np.linalg.norm(shape.other_along, axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -173,10 +173,10 @@ def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, co
 
 def _search_near(base, others, pyramids, uv, bounds, level, shape, guide):
     """Positions around the coarser guide at the nodes."""
-    reach = REACH * 2.0 ** (level + 1)
+    reach = SEARCH_MARGIN * 2.0 ** (level + 1)
     q0, q, normal, rate = guide.around(uv, reach)
     q = np.clip(q, bounds[:, :1], bounds[:, 1:])
-    found, rho, _ = search(base, others, pyramids, uv, q, normal, level, HALF)
+    found, rho, _ = search(base, others, pyramids, uv, q, normal, level, HALF_WINDOW)
     lost = ~np.isfinite(found)
     return uv, shape, np.where(lost, q0, found), rate, np.where(lost, np.nan, rho), normal
 
@@ -201,7 +201,7 @@ def search(base, others, pyramids, uv, q, normal, level, half):
         common = q[rows, :1] + share * (q[rows, 1:] - q[rows, :1])
         curves = []
         for k, o in enumerate(others):
-            segment, shape = _taken(parts[k], rows), _taken(shapes[k], rows)
+            segment, shape = _take(parts[k], rows), _take(shapes[k], rows)
             curves.append(_at_common(base, o, (pyramids[0], pyramids[1][k]), uv[rows], segment,
                                      shape, shape.usable, level, int(steps), common))  # fmt: skip
         peak, best, second = top(combine(curves))
@@ -210,7 +210,7 @@ def search(base, others, pyramids, uv, q, normal, level, half):
     return out
 
 
-def _taken(record, rows):
+def _take(record, rows):
     """The rows of a record of arrays."""
     fields = {f.name: getattr(record, f.name)[rows] for f in dataclasses.fields(record)}
     return type(record)(**fields)
@@ -220,12 +220,12 @@ def _smooth(base, level, uv, shape, q, rate, rho, _):
     """A guide from matches: poor or isolated nodes follow their neighbours."""
     step = SPACING * 2.0**level
     q, rate, rho = (np.asarray(a, float).reshape(shape) for a in (q, rate, rho))
-    known = np.isfinite(q) & (rho > WEAKEST)
+    known = np.isfinite(q) & (rho > SMALLEST_CORRELATION)
     rate = np.where((rate > 0) & np.isfinite(rate), rate, np.nan)
     rate = np.where(np.isfinite(rate), rate, np.nanmedian(rate))
     middle = _median(np.where(known, q, np.nan))
     with np.errstate(invalid="ignore"):
-        known &= np.abs(q - middle) * rate <= APART * 2.0**level
+        known &= np.abs(q - middle) * rate <= LARGEST_DEVIATION * 2.0**level
     filled = np.where(known, q, middle)
     filled = _nearest_filled(np.where(np.isfinite(filled), filled, np.nan), q)
     X = base.points(uv, filled.ravel()).reshape(*shape, 3)
@@ -261,7 +261,7 @@ def _normals(base, uv, X, q, rate, step):
     bent = np.zeros(q.shape, bool)
     for axis in (0, 1):
         change = np.abs(np.diff(q, axis=axis)) * (rate[1:] if axis == 0 else rate[:, 1:])
-        off = change > SMOOTH * step
+        off = change > LARGEST_SLOPE * step
         width = [(0, 0), (0, 0)]
         width[axis] = (1, 0)
         bent |= np.pad(off, width)

@@ -15,7 +15,7 @@ from jaxbundle.io.networks.orientation_covariance import (
     read_orientation_covariance,
 )
 from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.photographs.reading import SUFFIXES, read_photograph
@@ -38,7 +38,7 @@ def read_views(
     messages = []
     if not known.all():
         left = [images.id[k] for k in np.flatnonzero(~known)]
-        messages.append(f"without orientation, left out: {some(left, 5, str)}")
+        messages.append(f"without orientation, left out: {list_some(left, 5, str)}")
         network = network.replace(images=images.take(known))
     if known.sum() < 2:
         raise InputError(
@@ -88,13 +88,13 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
             [p for p in files if p.stem.lower() == key]
         )
         if len(same) > 1:
-            raise InputError(f"--photos {folder}: {name}: there are {some(same, 3, str)}")
+            raise InputError(f"--photos {folder}: {name}: there are {list_some(same, 3, str)}")
         found += same
         missing += [name] * (not same)
     if missing:
         raise InputError(
-            f"--photos {folder}: no photograph {some(missing, 5, str)}; the ids of the images are "
-            "the names of their files"
+            f"--photos {folder}: no photograph {list_some(missing, 5, str)}; the ids of the images "
+            "are the names of their files"
         )
     return found
 

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.measure.least_squares_matching import MatchingStatus
-from jaxbundle.surface.bending import corrected, sharpen
+from jaxbundle.surface.bending import correct_bending, sharpen
 from jaxbundle.surface.correlation import Pyramid
 from jaxbundle.surface.guide import Guide, search
 from jaxbundle.surface.intersection import Intersected, intersect
@@ -37,17 +37,17 @@ LEAST_CORRELATION = 0.6
 LEAST_SIGMA, MOST_SIGMA = 0.012, 0.5
 """Pixels: σ added to a match by interpolation and sampling, and the limit above which the texture
 does not determine it."""
-UNIQUE = 0.95
+LARGEST_SECOND = 0.95
 """Maximum ratio of ρ of the second best separate position to that of the best."""
 CONSISTENT = 1.5
 """Maximum distance of a point from the guide of the other image, pixels."""
-STRAYED = 2.5
+LARGEST_SHIFT = 2.5
 """Maximum distance of least squares matching from the position of the correlation, pixels."""
 BLOCK_SIDE, SMOOTH = 16, 0.45
 """Points per side of a block for the scatter; the quantile of the blocks used, in
 the smoother direction."""
 SIGNIFICANCE = 1e-3
-"""Of the test of a point's residuals."""
+"""Level of the test of a point's residuals."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Settings:
     least_angle: float = np.radians(1.0)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Matches:
     """Points from a base image: their pixels, points, and rejected ones by reason.
@@ -103,7 +103,7 @@ def match_points(
     q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, half)
     with np.errstate(invalid="ignore"):
         found = np.isfinite(q) & (rho >= settings.least_correlation)
-        double = found & (second > UNIQUE * rho)
+        double = found & (second > LARGEST_SECOND * rho)
     lost["low correlation"] += int((~found).sum())
     lost["not unique"] += int(double.sum())
     rows = np.flatnonzero(found & ~double)
@@ -118,12 +118,12 @@ def match_points(
         shape = windows(base, other, X, normal)
         start = positions(base, other, uv, q[:, None])[:, 0]
         match = refine(base, other, uv, start, shape.A, settings.fine)
-        place, uncertain = corrected((base, other), sharp, uv, q, match, settings.fine)
+        place, uncertain = correct_bending((base, other), sharp, uv, q, match, settings.fine)
         uncertain = uncertain + LEAST_SIGMA**2 * np.eye(2)
         places[:, k], covariance[:, k], rhos[:, k] = place, uncertain, match.rho
         good = shape.usable & (match.status == int(MatchingStatus.CONVERGED))
         good &= match.rho >= settings.least_correlation
-        good &= np.linalg.norm(match.uv - start, axis=1) <= STRAYED
+        good &= np.linalg.norm(match.uv - start, axis=1) <= LARGEST_SHIFT
         with np.errstate(invalid="ignore"):
             good &= np.sqrt(np.trace(match.covariance, axis1=1, axis2=2)) < MOST_SIGMA
         good &= _agrees(base, other, guides[k], X)

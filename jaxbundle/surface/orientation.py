@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
-from jaxbundle.surface.views import FrameView, OrientedImage, in_lanes, pixel_of
+from jaxbundle.surface.views import FrameView, OrientedImage, pixel_of, run_in_lanes
 from jaxbundle.system.programs import compile_once
 
 PORTION = 1 << 16
@@ -50,7 +50,7 @@ def _of_portion(views, X, used):
     scale = np.trace(N, axis1=1, axis2=2)[:, None, None]
     Q = np.linalg.pinv(N / scale) / scale
     S = {
-        k: Q @ np.swapaxes(J[:, k], 1, 2) @ by_orientation(view, X)
+        k: Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(view, X)
         for k, view in enumerate(views) if isinstance(view, FrameView) and is_uncertain(view)
     }  # fmt: skip
     C = np.zeros((len(X), 3, 3))
@@ -78,10 +78,12 @@ def _covariance(one: FrameView, other: FrameView) -> Float[np.ndarray, "k l"]:
     return C
 
 
-def by_orientation(view: FrameView, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 k"]:
+def derivative_by_orientation(
+    view: FrameView, X: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2 k"]:
     """∂(u, v)/∂(X0, Y0, Z0, ω, φ, κ, parameters) of points, pixels per object unit, radian, unit of
     the parameter."""
-    return in_lanes(_derivative, view.frame, X)
+    return run_in_lanes(_derivative, view.frame, X)
 
 
 @compile_once

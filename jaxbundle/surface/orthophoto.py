@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surface.dsm import Dsm
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
@@ -41,7 +41,7 @@ def orthophoto(
     inside = is_inside(view, uv)
     d = line_of_sight(view.derivative(P))
     d = d * np.where(d[:, 2:] < 0, -1.0, 1.0)
-    seen = inside & ~_hidden(dsm, X[known], d)
+    seen = inside & ~_are_hidden(dsm, X[known], d)
     safe = np.where(inside[:, None], uv, 0.0)
     grey = ndimage.map_coordinates(np.asarray(view.grey, np.float32), [safe[:, 1], safe[:, 0]],
                                    order=1, mode="nearest")  # fmt: skip
@@ -73,12 +73,12 @@ def write_orthophoto(
     stored = np.nan_to_num(np.clip(np.rint(values), 1, np.iinfo(dtype).max)).astype(dtype)
     rows, columns = values.shape
     transform = Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y)
-    with written_raster(path, columns, rows, 1, dtype, transform=transform, nodata=0,
+    with write_raster(path, columns, rows, 1, dtype, transform=transform, nodata=0,
                         crs=dsm.system, compress="deflate") as raster:  # fmt: skip
         raster.write(stored[None])
 
 
-def _hidden(dsm, X, d):
+def _are_hidden(dsm, X, d):
     """Whether the surface rises above the lines of sight, towards their image."""
     top = np.nanmax(dsm.height)
     with np.errstate(divide="ignore", invalid="ignore"):

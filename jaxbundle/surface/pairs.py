@@ -9,7 +9,7 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.surface.bounds import Bounds, angle_at
 from jaxbundle.surface.views import OrientedImage, is_inside
 
-LOOKS = 9
+GRID_POINTS = 9
 """Points per side of the base image for testing the overlap."""
 LEAST_OVERLAP = 0.1
 NARROWEST, BEST, WIDEST = np.radians([1.0, 14.0, 60.0])
@@ -31,7 +31,7 @@ def choose_partners(
 
 def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     """Overlap times a weight of the angle of intersection, 0 to 1; 0: no pair."""
-    u, v = (np.linspace(0.05, 0.95, LOOKS) * (n - 1) for n in view.size)
+    u, v = (np.linspace(0.05, 0.95, GRID_POINTS) * (n - 1) for n in view.size)
     uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
     q = bounds(uv)
     best = 0.0
@@ -47,7 +47,7 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     return best
 
 
-def given_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:
+def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:
     """Pairs as texts BASE,OTHER[,OTHER…] of image names, as indices.
 
     **Raises:** `InputError`."""

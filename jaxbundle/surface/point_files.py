@@ -13,7 +13,7 @@ import numpy as np
 from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes, write_text
-from jaxbundle.io.writing.replacing import replaced_file
+from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.files import read_cloud_csv, write_cloud_csv
 
@@ -172,7 +172,7 @@ def _write_las(cloud, path):
     for k, name in enumerate(SIGMAS):
         las[name] = cloud.sigma[:, k].astype(np.float32)
     las["rays"] = np.minimum(cloud.rays, 255).astype(np.uint8)
-    with replaced_file(path) as temporary, open(temporary, "wb") as file:
+    with replace_file(path) as temporary, open(temporary, "wb") as file:
         las.write(file, do_compress=path.suffix.lower() == ".laz")
 
 

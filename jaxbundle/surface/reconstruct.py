@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.surface.bounds import Bounds, by_geometry, by_points
+from jaxbundle.surface.bounds import Bounds, bounds_from_geometry, bounds_from_points
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
 from jaxbundle.surface.dense_cloud import dense_cloud
@@ -23,7 +23,7 @@ from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
 from jaxbundle.surface.views import FrameView, OrientedImage
 
-KEPT = 6
+MOST_PYRAMIDS = 6
 """Maximum pyramids in memory."""
 POINTS = 40_000
 """Points of a base image by default."""
@@ -31,7 +31,7 @@ DENSE_NODES = 25_000
 """Maximum nodes of the guides of dense matching, which only give the range of depths."""
 MOST_POINTS = 16_000_000
 """Maximum points of a dense cloud by default; they take 2.5 GB."""
-SAMPLE = 1 << 20
+SAMPLED_PIXELS = 1 << 20
 """Number of pixels sampled for the darkest and the brightest."""
 
 Tell = Callable[[str, int, int], None]
@@ -62,9 +62,9 @@ def find_bounds(
         others = [o for o in views if o is not view]
         # a view between the heights is not bounded by them
         among = heights is not None and low <= view.X0[2] <= high
-        q = by_points(view, tie) if len(tie) and (heights is None or among) else None
+        q = bounds_from_points(view, tie) if len(tie) and (heights is None or among) else None
         if q is None:
-            wide = by_geometry(view, others)
+            wide = bounds_from_geometry(view, others)
             if wide is None:
                 raise InputError(
                     f"{view.name}: all images are at one position: a surface needs a base"
@@ -113,7 +113,7 @@ class _Pyramids:
         if k in self.kept:
             self.kept[k] = self.kept.pop(k)
         else:
-            while len(self.kept) >= KEPT:
+            while len(self.kept) >= MOST_PYRAMIDS:
                 self.kept.pop(next(iter(self.kept)))
             self.kept[k] = make_pyramid(self.views[k].grey, self.levels)
         return self.kept[k]
@@ -263,7 +263,7 @@ def _colour(view, uv):
         return view.colours()[place[:, 1], place[:, 0]]
     grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
     if grey.dtype != np.uint8:
-        every = max(1, view.grey.size // SAMPLE)
+        every = max(1, view.grey.size // SAMPLED_PIXELS)
         low, high = np.percentile(view.grey.ravel()[::every], [0.5, 99.5])
         grey = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
     return np.repeat(grey[:, None], 3, axis=1)

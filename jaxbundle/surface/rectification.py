@@ -21,9 +21,9 @@ from jaxbundle.surface.views import FrameView
 
 ROOM, LEAST_ROOM = 0.15, 8.0
 """Margin of disparities beyond those of the points: relative to their range, and pixels."""
-WIDEST = 1.25
+LARGEST_ANGLE = 1.25
 """Radians from the axis of the rectified camera to the farthest ray."""
-LARGEST = 5.0
+LARGEST_SIZE_RATIO = 5.0
 """Pixels of the rectified image, as a multiple of those of the base image."""
 
 
@@ -81,13 +81,13 @@ def rectify(
     R = np.stack([x, np.cross(z, x), z])
     edge = base.edge()
     d = (base.points(edge, np.ones(len(edge))) - base.X0) @ R.T
-    if not (d[:, 2] > np.cos(WIDEST)).all():
+    if not (d[:, 2] > np.cos(LARGEST_ANGLE)).all():
         return None
     f = _resolution(base)
     low, high = (f * d[:, :2] / d[:, 2:]).min(0), (f * d[:, :2] / d[:, 2:]).max(0)
     first = np.floor(low)
     columns, rows = (int(n) for n in np.ceil(high) - first + 1)
-    if columns * rows > LARGEST * base.size[0] * base.size[1]:
+    if columns * rows > LARGEST_SIZE_RATIO * base.size[0] * base.size[1]:
         return None
     depth = (X - base.X0) @ z
     depth = depth[depth > 0]
@@ -99,8 +99,8 @@ def rectify(
     span = int(np.ceil(d_high + room)) - lowest
     origin = first - [span, 0]
     shape = (rows, columns + span)
-    left = _looked_up(base, R, f, origin, shape)
-    right = _looked_up(other, R, f, origin - [lowest, 0], shape)
+    left = _look_up(base, R, f, origin, shape)
+    right = _look_up(other, R, f, origin - [lowest, 0], shape)
     return Rectified(left, right, origin, lowest, base.X0, R, f, length), span
 
 
@@ -128,7 +128,7 @@ def _resolution(view: FrameView) -> float:
     return float(np.sqrt(np.sqrt(np.linalg.det(J @ J.T))))
 
 
-def _looked_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
+def _look_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
     """Grey values at the rays of a rectified camera, NaN outside the image."""
     rows, columns = shape
     coefficients = ndimage.spline_filter(np.asarray(view.grey, np.float32), 3, np.float32)

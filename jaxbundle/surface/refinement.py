@@ -22,9 +22,9 @@ from jaxbundle.system.programs import compile_once
 
 LANES = 256
 """Windows matched together."""
-SPARE = 5
+WINDOW_MARGIN = 5
 """Margin of the part of the other image around the window at the start, pixels."""
-STRETCH = 1.4
+LARGEST_STRETCH = 1.4
 """Maximum ratio of lengths of a window in the other image."""
 OVER_NOISE, TOGETHER = 1.5, 4096
 """Minimum ratio of the squared gradients of half a window to those of noise: three σ above 1."""
@@ -57,7 +57,7 @@ def refine(
     **Arguments:** `start`: positions in the other image, within a few pixels; `A`: start of the
     affine transformation, from the base to the other image.
     """
-    n, reach = len(uv), int(np.ceil(STRETCH * half)) + SPARE
+    n, reach = len(uv), int(np.ceil(LARGEST_STRETCH * half)) + WINDOW_MARGIN
     usable = is_inside(base, uv, half)
     usable &= is_inside(other, start, reach + 1)
     usable &= np.isfinite(A).all((1, 2))
@@ -92,7 +92,7 @@ def has_texture(
     """Whether windows have texture on all sides of their points, by the squares of its gradients
     relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof.
 
-    Smoothed noise of variance σ² has σ²/4πs², twice of which are σ0²; central differences of it
+    Smoothed noise of variance σ² has σ²/4πs², twice this is σ0²; central differences of it
     have σ²/2 on each axis.
     """
     k = np.arange(-half - 1, half + 2)

@@ -20,16 +20,16 @@ from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, visible_range, windows
 
 POINTS = 400
-REACH = 16
+SEARCH_WIDTH = 16
 """Pixels searched across the epipolar lines."""
-HALF = 6
+HALF_WINDOW = 6
 LEVELS = 2
-WORTH_SAYING = 0.1
+SMALLEST_REPORTED = 0.1
 """Minimum shift that is reported, pixels."""
-ENOUGH = 12
+FEWEST_MATCHES = 12
 """Minimum matches for the rest."""
-GOOD = 0.6
-LIKELY = 0.75
+SMALLEST_CORRELATION = 0.6
+LIKELY_CORRELATION = 0.75
 """Minimum ρ of a match."""
 
 
@@ -41,11 +41,11 @@ def align(
     grey = base.grey
     spread = max(8, int(np.sqrt(grey.size / POINTS)))
     uv = interest_points(grey, "corners", spread)
-    q = visible_range(base, other, uv, bounds(uv), margin=2 * HALF)
+    q = visible_range(base, other, uv, bounds(uv), margin=2 * HALF_WINDOW)
     seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
     chosen = np.flatnonzero(seen)[:: max(1, -(-int(seen.sum()) // POINTS))]
     uv, q = uv[chosen], q[chosen]
-    if len(uv) < ENOUGH:
+    if len(uv) < FEWEST_MATCHES:
         return None
     shape = windows(base, other, base.points(uv, q.mean(1)))
     along = np.median(shape.other_along[shape.usable], axis=0)
@@ -53,14 +53,14 @@ def align(
     first = np.array(other.shift, float)
     levels = len(pyramids[0].levels) - 1
     best, step = 0.0, 2.0**levels
-    tries = np.arange(-REACH, REACH + 1, step)
+    tries = np.arange(-SEARCH_WIDTH, SEARCH_WIDTH + 1, step)
     for level in range(levels, -1, -1):
         scores = []
         for t in tries:
             other.shift = tuple(first + t * across)
             _, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, level,
-                               HALF)  # fmt: skip
-            scores.append(float(np.mean(np.nan_to_num(rho) > LIKELY)))
+                               HALF_WINDOW)  # fmt: skip
+            scores.append(float(np.mean(np.nan_to_num(rho) > LIKELY_CORRELATION)))
         best = float(tries[int(np.argmax(scores))])
         step /= 2
         tries = best + step * np.arange(-2, 3)
@@ -77,17 +77,17 @@ def align(
 
 def _rest(base, other, pyramids, uv, q, across) -> float | None:
     """The median distance of matches from their epipolar lines."""
-    found, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, 0, HALF)
+    found, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, 0, HALF_WINDOW)
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(found) & (rho > GOOD)
+        good = np.isfinite(found) & (rho > SMALLEST_CORRELATION)
     uv, found = uv[good], found[good]
-    if len(uv) < ENOUGH:
+    if len(uv) < FEWEST_MATCHES:
         return None
     shape = windows(base, other, base.points(uv, found))
     start = positions(base, other, uv, found[:, None])[:, 0]
-    match = refine(base, other, uv, start, shape.A, HALF)
-    good = (match.status == int(MatchingStatus.CONVERGED)) & (match.rho > GOOD)
-    if good.sum() < ENOUGH:
+    match = refine(base, other, uv, start, shape.A, HALF_WINDOW)
+    good = (match.status == int(MatchingStatus.CONVERGED)) & (match.rho > SMALLEST_CORRELATION)
+    if good.sum() < FEWEST_MATCHES:
         return None
     return float(np.median((match.uv - start)[good] @ across))
 
@@ -101,7 +101,7 @@ def align_all(views: Sequence, bounds: Sequence[Bounds]) -> tuple[str, ...]:
         pair = f"{views[k].name} and {views[0].name}"
         if found is None:
             said.append(f"{pair}: too few matches to align them across the epipolar lines")
-        elif abs(found) > WORTH_SAYING:
+        elif abs(found) > SMALLEST_REPORTED:
             said.append(f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
                         "off the second")  # fmt: skip
     return tuple(said)

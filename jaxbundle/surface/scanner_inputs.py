@@ -26,7 +26,7 @@ from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.ground import Neighbourhood, RpcView, ScannerView, neighbourhood
 
 IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
-BESIDE = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
+COMPANION_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
 ENDINGS = ("_rpc", "_RPC")
 BANDS = (0.3, 0.59, 0.11)
 """Weights of red, green and blue."""
@@ -74,7 +74,7 @@ def read_ground_views(
 def is_ground_image(path: Path) -> bool:
     """Whether a file may be a scanner image or one with rational polynomials."""
     name = path.name
-    if path.suffix.lower() in IMAGES or any(name.endswith(end) for end in BESIDE):
+    if path.suffix.lower() in IMAGES or any(name.endswith(end) for end in COMPANION_ENDINGS):
         return True
     if path.suffix.lower() in (".json", ".dim", ".imd"):
         return True
@@ -183,7 +183,7 @@ def _orientation(path: Path, folder: Path | None):
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if path.suffix.lower() in IMAGES:
-        beside = [path.with_name(path.stem + end) for end in BESIDE]
+        beside = [path.with_name(path.stem + end) for end in COMPANION_ENDINGS]
         source = next((p for p in beside if p.is_file()), path)
         if source is path and path.suffix.lower() not in RASTERS:
             raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
@@ -216,7 +216,7 @@ def _raster_of(path: Path, folder: Path | None) -> Path:
 
 
 def _middle(orientation) -> Neighbourhood:
-    """Of the first image."""
+    """The neighbourhood of the middle of the first image."""
     if isinstance(orientation, Rpc):
         return neighbourhood(np.radians(float(orientation.longitude_offset)),
                              np.radians(float(orientation.latitude_offset)))  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-ENOUGH = 100
+FEWEST_VALUES = 100
 """Minimum values for a factor."""
 WEIGHTS = 1.0, -3.0, 3.0, -1.0
 
@@ -19,7 +19,7 @@ WEIGHTS = 1.0, -3.0, 3.0, -1.0
 def robust_factor(ratio: Float[np.ndarray, " n"], otherwise: float = 1.0) -> float:
     """The variance factor of errors in units of their σ, by their median; `otherwise` for few."""
     ratio = ratio[np.isfinite(ratio)]
-    if len(ratio) <= ENOUGH:
+    if len(ratio) <= FEWEST_VALUES:
         return otherwise
     return float(np.median(ratio**2) / stats.chi2.median(1))
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight, over_plane
 
-LOOKS = 17
+SIGHT_POINTS = 17
 """Number of points along a line of sight tested for visibility in the other image."""
 LEAST_STRETCH, MOST_STRETCH = 0.25, 4.0
 """Limits of the ratio of lengths in the other image and in the base for comparing windows."""
@@ -66,13 +66,14 @@ def visible_range(
     base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, "n 2"], margin: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
-    """The part of a range of q visible in the other image, to about 1/`LOOKS` of it; NaN: none."""
-    x = np.linspace(0, 1, LOOKS)
+    """The part of a range of q visible in the other image, to about 1/`SIGHT_POINTS` of it; NaN:
+    none."""
+    x = np.linspace(0, 1, SIGHT_POINTS)
     sampled = q[:, :1] + x * (q[:, 1:] - q[:, :1])
     places = other.project(_points(base, uv, sampled))
-    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, LOOKS)
+    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, SIGHT_POINTS)
     first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
-    last = np.minimum(LOOKS - np.argmax(inside[:, ::-1], axis=1), LOOKS - 1)
+    last = np.minimum(SIGHT_POINTS - np.argmax(inside[:, ::-1], axis=1), SIGHT_POINTS - 1)
     rows = np.arange(len(q))
     found = np.stack([sampled[rows, first], sampled[rows, last]], axis=1)
     return np.where(np.any(inside, axis=1)[:, None], found, np.nan)

@@ -36,9 +36,9 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.system.programs import compile_once
 
 LANES = 1 << 13
-FEW = 1 << 9
+FEWEST_POINTS = 1 << 9
 """Points of one call; fewer are padded to one of these sizes: two programs suffice."""
-BEYOND = 1.02
+RAY_MARGIN = 1.02
 """A ray farther from the axis than the farthest of the image, times this, is outside."""
 
 Points = Float[np.ndarray, "n 3"]
@@ -107,7 +107,7 @@ class FrameView:
         self.frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
         edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
-        self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
+        self._farthest = RAY_MARGIN * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
 
     def edge(self) -> Places:
         """Positions along and across the whole image, including its edges."""
@@ -115,7 +115,7 @@ class FrameView:
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
     def points(self, uv, q):
-        return in_lanes(_points, self.frame, uv, q)
+        return run_in_lanes(_points, self.frame, uv, q)
 
     def parameter(self, X):
         return 1 / np.linalg.norm(X - self.X0, axis=1)
@@ -124,11 +124,11 @@ class FrameView:
         d = X - self.X0
         with np.errstate(invalid="ignore", divide="ignore"):
             angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
-        uv = in_lanes(_project, self.frame, X)
+        uv = run_in_lanes(_project, self.frame, X)
         return np.where((angle <= self._farthest)[:, None], uv, np.nan)
 
     def derivative(self, X):
-        return in_lanes(_derivative, self.frame, X)
+        return run_in_lanes(_derivative, self.frame, X)
 
     def bounds(self, uv, low, high):
         d = self.points(uv, np.ones(len(uv))) - self.X0
@@ -188,10 +188,10 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
         )  # fmt: skip
 
 
-def in_lanes(program: Callable, frame, *arrays):
+def run_in_lanes(program: Callable, frame, *arrays):
     """The program for arrays [n, …], in blocks of `LANES`, padded."""
     n = len(arrays[0])
-    lanes = LANES if n > FEW else FEW
+    lanes = LANES if n > FEWEST_POINTS else FEWEST_POINTS
     parts = []
     for first in range(0, max(n, 1), lanes):
         chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))

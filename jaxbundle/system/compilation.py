@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 
 from jaxbundle.system.programs import compile_once
 
-QUICK = {"xla_backend_optimization_level": 0}
+QUICK_OPTIONS = {"xla_backend_optimization_level": 0}
 
 
 def quick_jit(function: Callable, static: Sequence[int] | int = ()) -> Callable:
     """`compile_once` for functions rarely called from the host."""
-    return compile_once(function, static, compiler_options=QUICK)
+    return compile_once(function, static, compiler_options=QUICK_OPTIONS)

@@ -12,7 +12,7 @@ from jaxbundle.system.temporaries import watch_cache
 
 _folders: list[str] = []
 """The last one is that of kept programs."""
-WORTH_KEEPING = 0.02
+SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
 
@@ -22,9 +22,9 @@ def use_cores(number: int | None = None) -> None:
     before the first JAX computation."""
     import jax
 
-    from jaxbundle.arguments import whole
+    from jaxbundle.arguments import integer
 
-    cores = available_cores() if number is None else whole("number", number)
+    cores = available_cores() if number is None else integer("number", number)
     jax.config.update("jax_num_cpu_devices", cores)
 
 
@@ -59,7 +59,7 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     watch_cache(folder)
     _folders.append(os.fspath(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
     return True
 
 
@@ -95,7 +95,7 @@ def join_processes(
     """
     import jax
 
-    from jaxbundle.arguments import whole
+    from jaxbundle.arguments import integer
 
     expected = (
         "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
@@ -103,9 +103,9 @@ def join_processes(
     )
     for name, value in (("processes", processes), ("process", process)):
         if value is not None:
-            whole(name, value, least=0)
-    whole("lost_after_seconds", lost_after_seconds)
-    whole("wait_seconds", wait_seconds)
+            integer(name, value, least=0)
+    integer("lost_after_seconds", lost_after_seconds)
+    integer("wait_seconds", wait_seconds)
     if address is not None:
         parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
         if not parts or not 0 < int(parts[2]) < 65536:

@@ -1,4 +1,4 @@
-"""The packaged examples, which can be written to a folder.
+"""The packaged examples.
 
 Their files are those of `examples/` in the repository: the wheel has copies of them in
 `jaxbundle/examples` (pyproject.toml), the source tree has them next to the package.

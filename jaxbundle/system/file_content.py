@@ -17,14 +17,14 @@ SYSTEM = ("/proc/", "/sys/")
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
 """Folders of the open files of the process."""
 CHUNK = 2**20
-DEEPEST = 64
+DEEPEST_NESTING = 64
 """Maximum nesting of a document."""
-LARGEST = 2**1023
+LARGEST_INTEGER = 2**1023
 """Largest integer that is exactly a float."""
 TOO_LARGE = "too large a number; finite numbers are expected"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
-DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST - 1}}}")
+DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST_NESTING - 1}}}")
 
 
 def check_plain(path: str | Path) -> None:
@@ -126,8 +126,8 @@ def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str):
 def _beyond(document: Any) -> str:
     """Violations of the limits in a document, in words; empty if there are none."""
     level = [document]
-    for _ in range(DEEPEST):
-        if any(isinstance(v, int) and abs(v) > LARGEST for v in level):
+    for _ in range(DEEPEST_NESTING):
+        if any(isinstance(v, int) and abs(v) > LARGEST_INTEGER for v in level):
             return TOO_LARGE
         level = [
             part for value in level if isinstance(value, dict | list)
@@ -135,7 +135,7 @@ def _beyond(document: Any) -> str:
         ]  # fmt: skip
         if not level:
             return ""
-    return f"nested too deeply: more than {DEEPEST} levels"
+    return f"nested too deeply: more than {DEEPEST_NESTING} levels"
 
 
 def _line_beyond(text: str) -> int | str:
@@ -147,6 +147,6 @@ def _line_beyond(text: str) -> int | str:
             return number
         for bracket in re.findall(r"[][{}]", bare):
             depth += 1 if bracket in "[{" else -1
-            if depth > DEEPEST:
+            if depth > DEEPEST_NESTING:
                 return number
     return ""

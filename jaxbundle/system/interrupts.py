@@ -6,8 +6,8 @@ during an import it becomes another error; and while the main thread compiles or
 C++, which takes minutes for a large network, it is not raised at all.
 
 So nothing is raised. The handler removes temporary files and ends the process. Python calls it
-between two steps of the main thread. If it is not called within `GRACE`, because
-the main thread is in C++ or in an `unbroken` block, a thread woken by the signal does the same.
+between two steps of the main thread. If it is not called within `GRACE`, because the main thread is
+in C++ or in a `defer_interrupts` block, a thread woken by the signal does the same.
 
 Importing jaxbundle installs nothing: only the command line calls `handle_interrupts`.
 """
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 GRACE = 0.3
 """Seconds for the main thread to handle a signal."""
 
-PATIENCE = 10.0
-"""Seconds to finish unbroken blocks; a hanging disk delays the exit no longer."""
+LONGEST_DEFERRAL = 10.0
+"""Seconds to finish a block of `defer_interrupts`; a hanging disk delays the exit no longer."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":
@@ -86,7 +86,7 @@ def set_status(status: int) -> None:
 def _handle(number: int, frame: object) -> None:
     if _temporaries is None:  # Then nothing is.
         _say_and_exit(number)
-    if not _temporaries.put_off(lambda: _end(number)):
+    if not _temporaries.defer(lambda: _end(number)):
         _end(number)
 
 
@@ -98,7 +98,8 @@ def _watch(reader: int) -> None:
     while number not in WORDS:
         number = os.read(reader, 1)[0]
     time.sleep(GRACE)
-    last = threading.Timer(2 * PATIENCE, _say_and_exit, (number,))  # The disk does not answer.
+    # The disk does not answer.
+    last = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
     last.daemon = True
     last.start()
     _end(number)
@@ -110,7 +111,7 @@ def _end(number: int) -> None:
         _say_and_exit(number)
     _ending.acquire()
     _become_deaf()
-    _temporaries.remove_temporaries(PATIENCE)
+    _temporaries.remove_temporaries(LONGEST_DEFERRAL)
     _say_and_exit(number)
 
 

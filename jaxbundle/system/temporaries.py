@@ -15,7 +15,7 @@ _temporaries: dict[str, bool] = {}
 _caches: set[str] = set()
 _lock = threading.RLock()
 _inside: list[int] = []
-"""The thread in blocks `unbroken`, once for each of them."""
+"""The thread inside `defer_interrupts`, once per nested block."""
 _put_off: list[Callable[[], None]] = []
 
 
@@ -36,7 +36,7 @@ def temporary(path: str | os.PathLike, content: bool = True) -> Iterator[Path]:
 
 
 @contextmanager
-def unbroken() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """An interrupt of the command line waits for the end of this block: for a few system calls that
     belong together, such as two renames, never for long work."""
     _lock.acquire()
@@ -50,8 +50,9 @@ def unbroken() -> Iterator[None]:
             _put_off[0]()
 
 
-def put_off(action: Callable[[], None]) -> bool:
-    """Whether this thread is in a block `unbroken`; then the action is called at its end."""
+def defer(action: Callable[[], None]) -> bool:
+    """Whether this thread is inside `defer_interrupts`; then the action is called at the end of the
+    block."""
     if threading.get_ident() not in _inside:
         return False
     _put_off.append(action)
@@ -65,8 +66,8 @@ def watch_cache(folder: str | os.PathLike) -> None:
 
 
 def remove_temporaries(patience: float) -> None:
-    """Remove temporary files; the process must end at once, since no `unbroken` block can begin
-    after this. A thread in such a block may finish it, within the given seconds."""
+    """Remove temporary files; the process must end at once, since no `defer_interrupts` block can
+    begin after this. A thread in such a block may finish it, within the given seconds."""
     _lock.acquire(timeout=patience)
     for name, content in reversed(list(_temporaries.items())):
         _remove(name, content)

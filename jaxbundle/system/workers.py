@@ -1,7 +1,7 @@
-"""Tasks done by processes of their own: what one of them dies of spoils its task alone.
+"""Tasks in separate processes: a crash affects only its own task.
 
 A process is a fresh interpreter that is handed a task at a time through a pipe. It ends when the
-pipe is closed, and so with the process that started it, however that ends.
+pipe is closed, and hence with the process that started it, however that ends.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-PATIENCE = 5.0
+EXIT_TIMEOUT = 5.0
 """Seconds for a process without work to end."""
 
 
@@ -24,7 +24,7 @@ class Failed:
 
 
 class Workers:
-    """So many processes at most, started when they are needed, that call one function; a context.
+    """At most this many processes, started on demand, that call one function; a context.
 
     `function` is importable; it, its tasks and results are pickled.
     """
@@ -42,11 +42,11 @@ class Workers:
             connection.close()
             if connection in self._busy:
                 process.terminate()
-            process.join(PATIENCE)
+            process.join(EXIT_TIMEOUT)
         self._idle, self._busy = [], {}
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Every task with its result or `Failed`, as they come to an end."""
+        """Every task with its result or `Failed`, in the order of completion."""
         left = list(tasks)[::-1]
         while left or self._busy:
             while left and len(self._busy) < self._number:
@@ -63,7 +63,7 @@ class Workers:
                     result = connection.recv()
                 except (EOFError, OSError):
                     process.join()
-                    yield task, Failed(f"the process that worked on it died ({_ended(process)})")
+                    yield task, Failed(f"its worker process died ({_describe_end(process)})")
                     continue
                 self._idle.append((connection, process))
                 yield task, result
@@ -77,13 +77,13 @@ class Workers:
         return ours, process
 
 
-def _ended(process) -> str:
+def _describe_end(process) -> str:
     code = process.exitcode
     return f"signal {-code}" if code is not None and code < 0 else f"status {code}"
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
-    """The life of a process: Ctrl-C is for the one that started it."""
+    """The loop of a process; Ctrl-C is handled by the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
@@ -94,4 +94,4 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
                 result = Failed(f"{type(error).__name__}: {error}")
             connection.send(result)
     except (EOFError, OSError):
-        os._exit(0)  # nobody is there any more
+        os._exit(0)  # the parent process is gone

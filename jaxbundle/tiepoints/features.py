@@ -11,14 +11,14 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxbundle.arguments import one_of, whole
+from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import FEATURES
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.photographs.opencv import need_opencv
 
 CELLS = 16
 """Cells of the grid along the longer side."""
-AMPLE = 1.6
+SEARCH_FACTOR = 1.6
 """Searched features, as a multiple of those kept."""
 TILE = 2400
 """Side of the tiles in which a large photograph is searched, reduced pixels."""
@@ -36,10 +36,10 @@ class Detection:
 
     def __post_init__(self):
         one_of("features", self.kind, FEATURES)
-        whole("features: number", self.number)
+        integer("features: number", self.number)
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Features:
     """`xy`: pixels of the original; `size`: diameter, in them; `angle`: radians from x to y;
@@ -83,7 +83,7 @@ def find_features(
 
 
 def _detector(cv2, settings: Detection):
-    ample = int(AMPLE * settings.number)
+    ample = int(SEARCH_FACTOR * settings.number)
     if settings.kind == "sift":
         return cv2.SIFT_create(nfeatures=ample, contrastThreshold=0.02)
     if settings.kind == "orb":

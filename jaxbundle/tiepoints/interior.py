@@ -36,13 +36,13 @@ distortion is not yet known."""
 ROUNDS, STEPS = 4, 8
 USUAL, DOUBT = 1.0, 0.06
 """The usual principal distance relative to the longer side, and the relative reduction of the sum
-required to accept one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2
-times as much."""
-WIDE = 0.12
+required to accept one that differs by a factor of e; for another factor x·(1 + x)/2 times as much,
+x = |ln| of it."""
+WIDE_ANGLE = 0.12
 """Angle of intersection, radians, above which wider angles are not better."""
-FARTHEST = 0.35
+LARGEST_K1 = 0.35
 """Larger |k1| is rejected."""
-KNOWN = 1.35
+LARGEST_RATIO = 1.35
 """A principal distance tried, or from the file, may be wrong by this factor."""
 
 
@@ -77,7 +77,7 @@ def estimate_interior(
     if len(pairs) > PAIRS:
         first = tried if known else tried[1::3]
         _, _, part, _, angle = _orient([_with(camera, f) for f in first], xy1, xy2, limit)
-        worth = (part * np.sqrt(np.minimum(angle, WIDE))).max(0)
+        worth = (part * np.sqrt(np.minimum(angle, WIDE_ANGLE))).max(0)
         chosen = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
         xy1, xy2 = ([side[k] for k in chosen] for side in (xy1, xy2))
     M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)
@@ -89,8 +89,8 @@ def estimate_interior(
     if not len(use):
         return Start(_with(camera, f), 0, np.nan)
     f, k1, e = _adjust(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
-    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < FARTHEST
-    sane &= 1 / KNOWN < f / tried[best] < KNOWN
+    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < LARGEST_K1
+    sane &= 1 / LARGEST_RATIO < f / tried[best] < LARGEST_RATIO
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
     return Start(better, len(use), float(np.median(np.abs(e))))
 
@@ -117,7 +117,7 @@ def _orient(cameras, xy1, xy2, limit):
     one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
     M, b, part, angle = many.orient_pairs(one, two, limit / f)
     filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
-    e = np.asarray(many.in_lanes(_sampson, many.LANES, M, b, *filled)[0])
+    e = np.asarray(many.run_in_lanes(_sampson, many.LANES, M, b, *filled)[0])
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
     costs = np.where(part > 0, np.log1p((e / limit) ** 2).mean(1), np.log1p(100.0))
     by_camera = lambda a: a.reshape(len(cameras), len(xy1), *a.shape[1:])

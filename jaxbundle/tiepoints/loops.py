@@ -15,8 +15,8 @@ left out. A pair that alone connects photographs has no loop: it stays, unless i
 and its photographs are already connected: any two photographs of a long row of windows match, even
 distant ones as if they were neighbours, and such pairs are consistent.
 
-A photograph most of whose pairs are left out so shows mostly what moves or repeats itself, and its
-other pairs may do so unnoticed: only those with half the matches of its best pair, or more, stay.
+A photograph with most of its pairs left out shows mostly moving or repeated objects, and its other
+pairs may show them unnoticed: only those with at least half the matches of its best pair stay.
 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """
@@ -33,11 +33,11 @@ TURN, GAP = np.radians(5.0), 0.15
 ASIDE, NARROW = 0.5, 0.03
 """Maximum distance of a base of unknown length from the angle between the two others; and angle of
 intersection, radians, below which its direction is uncertain."""
-FEW = 1 / 3
+ACCEPTED_SHARE = 1 / 3
 """Share of accepted pairs of a photograph below which only its best are used."""
-COMMON = 8
+FEWEST_COMMON = 8
 """Minimum common features of two pairs for the ratio of their bases."""
-MOST = 12
+MOST_LOOPS = 12
 """Maximum loops examined per pair, those with the most matches."""
 
 
@@ -77,7 +77,7 @@ def _without_weak(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tup
     for k in {k for pair in pairs for k in pair.images}:
         of = [p for p in pairs if k in p.images]
         left = [p for p in of if p.images in taken]
-        if len(left) < FEW * len(of):
+        if len(left) < ACCEPTED_SHARE * len(of):
             most = max(map(len, left), default=0)
             weak += [p for p in left if 2 * len(p) < most]
     for pair in sorted(weak, key=len):
@@ -118,7 +118,7 @@ class _Loops:
             return []
         i, j = of
         fewest = lambda k: min(len(self.pairs[_pair(i, k)]), len(self.pairs[_pair(j, k)]))
-        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST]
+        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST_LOOPS]
 
     def closes(self, of: tuple[int, int], k: int) -> bool | None:
         """Whether a loop closes; None if the bases are unknown."""
@@ -136,7 +136,7 @@ class _Loops:
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
-            between = _between(ij.b, ij.M.T @ jk.b, ik.b)
+            between = _is_between(ij.b, ij.M.T @ jk.b, ik.b)
             return None if between or ik.angle < NARROW else False
         of_jk = at_i - at_k if np.isnan(at_j) else at_j
         of_ik = at_j + at_k if np.isnan(at_i) else at_i
@@ -152,10 +152,10 @@ class _Loops:
         _, rows, columns = np.intersect1d(a, b, return_indices=True)
         ratio = depth[rows] / far[columns]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        return float(np.log(np.median(ratio))) if len(ratio) >= COMMON else np.nan
+        return float(np.log(np.median(ratio))) if len(ratio) >= FEWEST_COMMON else np.nan
 
 
-def _between(one, other, b) -> bool:
+def _is_between(one, other, b) -> bool:
     """Whether a direction is a sum of two others with positive factors, to `ASIDE`."""
     from scipy.optimize import nnls
 

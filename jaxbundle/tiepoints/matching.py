@@ -25,12 +25,12 @@ PORTION = 1024
 """Features processed at once for distances to all others."""
 OF_SIFT = 128
 """Numbers of a descriptor of SIFT."""
-SAME = 1e-3
+EQUAL_DESCRIPTORS = 1e-3
 """Descriptors whose distance is below this are the same."""
 REPEATED = 0.22
 """Distance below which two features of a photograph may be repetitions: that of most true
 matches of SIFT."""
-FEW = 800
+LARGEST_FEATURES = 800
 """Number of largest features that decide whether two photographs may overlap."""
 
 
@@ -72,7 +72,7 @@ def match_features(
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
     back, _, third = nearest(b[best[rows]], a)
-    clarity = distance[rows] / np.maximum(np.minimum(second[rows], third), SAME)
+    clarity = distance[rows] / np.maximum(np.minimum(second[rows], third), EQUAL_DESCRIPTORS)
     kept = np.flatnonzero((back == rows) & (clarity < ratio))
     kept = kept[np.argsort(clarity[kept], kind="stable")]
     rows = rows[kept]
@@ -90,7 +90,8 @@ def single_matches(
 def number_alike(one: Features, other: Features) -> int:
     """The number of matches of the largest features: a quick check whether two photographs overlap
     (Wu, 2013, preemptive matching)."""
-    return len(match_features(one.take(slice(FEW)), other.take(slice(FEW)))[0])
+    largest = slice(LARGEST_FEATURES)
+    return len(match_features(one.take(largest), other.take(largest))[0])
 
 
 def _root(descriptor):

@@ -9,13 +9,13 @@ from jaxtyping import Float
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import number_alike
 
-MANY = 60
+ALL_PAIRS_UP_TO = 60
 """Maximum number of photographs with all pairs matched."""
 NEXT = 5
 """Neighbours of a photograph on each side in a sequence."""
-NEAREST = 20
-"""Neighbours of a photograph, by position or by similarity."""
-ALIKE = 4
+NEIGHBOURS = 20
+"""Number of neighbours of a photograph, by position or by similarity."""
+FEWEST_MATCHES = 4
 """Minimum matches of the largest features for a candidate pair."""
 
 
@@ -35,7 +35,7 @@ def candidate_pairs(
     n = len(features)
     known = place is not None and np.isfinite(place).all()
     if way == "auto":
-        way = "all" if n <= MANY else "place" if known else "alike"
+        way = "all" if n <= ALL_PAIRS_UP_TO else "place" if known else "alike"
     if way == "all":
         return list(combinations(range(n), 2))
     if way == "sequence":
@@ -48,7 +48,7 @@ def candidate_pairs(
 def _nearest(place):
     from scipy.spatial import cKDTree
 
-    _, rows = cKDTree(place).query(place, k=min(NEAREST + 1, len(place)))
+    _, rows = cKDTree(place).query(place, k=min(NEIGHBOURS + 1, len(place)))
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(rows) for j in row.tolist() if i != j}
     return sorted(pairs)
 
@@ -58,9 +58,9 @@ def _alike(features, run):
     number = list(run(lambda pair: number_alike(features[pair[0]], features[pair[1]]), every))
     of = [[] for _ in features]
     for (i, j), found in zip(every, number):
-        if found >= ALIKE:
+        if found >= FEWEST_MATCHES:
             of[i].append((found, j))
             of[j].append((found, i))
     pairs = {(min(i, j), max(i, j)) for i, best in enumerate(of)
-             for _, j in sorted(best, reverse=True)[:NEAREST]}  # fmt: skip
+             for _, j in sorted(best, reverse=True)[:NEIGHBOURS]}  # fmt: skip
     return sorted(pairs)

@@ -30,13 +30,13 @@ FINEST = 7.0
 level, with about this size."""
 LEVELS = 6
 LANES = 128
-WEAK = 0.75
+SMALLEST_CORRELATION = 0.75
 """Minimum correlation of a match."""
 SHIFT = 3.0
 """Maximum distance of a match from its feature, pixels of its level."""
-WORST = 0.4
+LARGEST_SIGMA = 0.4
 """Maximum σ of a match, pixels of its level."""
-REACH = 7
+CORRELATED_OVER = 7
 """Pixels over which residuals within a window are correlated."""
 LEAST_SIGMA = 0.01
 """Minimum σ, pixels of its level: interpolation and sampling add as much."""
@@ -94,7 +94,7 @@ def measure_tracks(
     )
     others = np.flatnonzero(~first & inside & inside[window_of])
     start[:, :, 2] -= corner
-    found = _matched(windows[track[others]], pieces, others, start)
+    found = _match_in_portions(windows[track[others]], pieces, others, start)
     return _collect(track, image, xy, size, first, level, corner, colour, others, found)
 
 
@@ -176,13 +176,13 @@ def _pieces(picture, corner, side):
 
 @partial(compile_once, static=())
 def _match(windows: Array, pieces: Array, start: Array):
-    found = jax.vmap(partial(match_least_squares, reach=REACH))(
+    found = jax.vmap(partial(match_least_squares, reach=CORRELATED_OVER))(
         windows.astype(np.float32), pieces.astype(np.float32), start
     )
     return found.affine, found.covariance, found.correlation, found.status
 
 
-def _matched(windows, pieces, others, start):
+def _match_in_portions(windows, pieces, others, start):
     """A, covariance, correlation and status of the matches."""
     parts = []
     for begin in range(0, len(others), LANES):
@@ -202,8 +202,8 @@ def _collect(track, image, xy, size, first, level, corner, colour, others, found
     place = affine[:, :, 2] + corner[others]
     away = np.linalg.norm(place - xy[others] / scale[others, None], axis=1)
     own = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
-    good = (status == int(MatchingStatus.CONVERGED)) & (rho > WEAK) & (away < SHIFT)
-    good &= (own < WORST).all(1)
+    good = (status == int(MatchingStatus.CONVERGED)) & (rho > SMALLEST_CORRELATION) & (away < SHIFT)
+    good &= (own < LARGEST_SIGMA).all(1)
     own = np.hypot(own, LEAST_SIGMA)
     rows = others[good]
     place_of = xy.copy()

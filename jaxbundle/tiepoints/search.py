@@ -18,26 +18,26 @@ from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import Matches, distances_within, match_features, single_matches
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.verification import ENOUGH, Pair, verify_pairs
+from jaxbundle.tiepoints.verification import SUFFICIENT_MATCHES, Pair, verify_pairs
 
 Tell = Callable[[str, int, int], None]
 TOLERANCE = 0.0012
 """Maximum Sampson distance of an agreeing match, relative to the longer side."""
-WIDEST = 0.6
+WIDEST_SHARE = 0.6
 """Pairs that determine the principal distance: those with at least this part of the largest number
 of matches, and others with fewer, which have longer bases."""
 MOST_ALIKE = 5
-"""Of the former."""
+"""Minimum number of the former."""
 OF_THE_LENS = ("fx", "fy", "k1")
 OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
 """Other principal distances to try, relative to the longer side, unless they differ by less
 than this factor."""
-MORE, MORE_THAN_TOLD = 1.05, 1.25
+REQUIRED_RATIO, MORE_THAN_TOLD = 1.05, 1.25
 """Required ratio of the numbers of explained matches; also to replace that from a file, which may
 be wrong for cropped or reduced photographs."""
-PLENTY = 0.85
+SUFFICIENT_SHARE = 0.85
 """Share of explained matches above which others are not tried."""
-TRIED = 24
+COMPARED_PAIRS = 24
 """Number of pairs for this comparison."""
 
 
@@ -128,18 +128,18 @@ def start_cameras(
         own = [c for c in range(len(cameras)) if lens[c] == number]
         found = [_once(m) for m in matches if {of[k] for k in m.images} <= set(own)]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
-        xy = _centre(cameras, of, features, _various(found))
+        xy = _centre(cameras, of, features, _choose_pairs(found))
         begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
         start = estimate_interior(begin, xy, told)
         if start.pairs:
-            clear = sorted(found, key=lambda m: -len(m.rows))[:TRIED]
-            explained = lambda camera, clear=clear, own=own: _explained(
+            clear = sorted(found, key=lambda m: -len(m.rows))[:COMPARED_PAIRS]
+            explained = lambda camera, clear=clear, own=own: _count_explained(
                 _with_lens(cameras, own, camera), of, features, clear
             )
             now, every = explained(start.camera), sum(len(m.rows) for m in clear)
-            least = (MORE_THAN_TOLD if told else MORE) * now
-            if now < PLENTY * every and least < every:
-                start = _most_explained(start, begin, xy, explained, least)
+            least = (MORE_THAN_TOLD if told else REQUIRED_RATIO) * now
+            if now < SUFFICIENT_SHARE * every and least < every:
+                start = _choose_principal_distance(start, begin, xy, explained, least)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)
         if start.pairs:
@@ -154,7 +154,7 @@ def start_cameras(
 def _once(matches: Matches) -> Matches:
     """The unique matches, if they are enough."""
     use = matches.single
-    return matches.take(use) if use.sum() >= ENOUGH else matches
+    return matches.take(use) if use.sum() >= SUFFICIENT_MATCHES else matches
 
 
 def _centre(cameras, of, features, matches):
@@ -170,14 +170,14 @@ def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
     return [with_it(c) if k in own else c for k, c in enumerate(cameras)]
 
 
-def _explained(cameras, of, features, matches) -> int:
+def _count_explained(cameras, of, features, matches) -> int:
     """The number of matches explained by relative orientations of pairs that close around
     three photographs, as hardly any do with a wrong principal distance."""
     pairs = verify(cameras, of, features, matches, lambda *_: None)
     return sum(map(len, without_contradicted(cameras, of, features, pairs)[0]))
 
 
-def _most_explained(start: Start, begin: Camera, xy, explained, least: float) -> Start:
+def _choose_principal_distance(start: Start, begin: Camera, xy, explained, least: float) -> Start:
     """The start, or that from another principal distance that explains clearly more matches."""
     size = max(present_size(begin))
     f = start.camera.parameters["fx"]
@@ -197,14 +197,14 @@ def _middle(camera: Camera):
     return (np.array(present_size(camera)) - 1) / 2
 
 
-def _various(own):
+def _choose_pairs(own):
     """The pairs with the most matches, and as many others with enough, by photograph in turn."""
     own = sorted(own, key=lambda found: -len(found.rows))
     if not own:
         return []
     most = len(own[0].rows)
-    first = [found for found in own if len(found.rows) >= WIDEST * most][:MOST_ALIKE]
-    enough = [found for found in own if ENOUGH <= len(found.rows) < WIDEST * most]
+    first = [found for found in own if len(found.rows) >= WIDEST_SHARE * most][:MOST_ALIKE]
+    enough = [found for found in own if SUFFICIENT_MATCHES <= len(found.rows) < WIDEST_SHARE * most]
     others = CANDIDATES - MOST_ALIKE
     step = max(1, len(enough) // others)
     return first + enough[: others * step : step]

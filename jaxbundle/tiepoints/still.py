@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import Matches
 
-STILL = 0.001
+LARGEST_MOTION = 0.001
 """Maximum motion of a still feature, relative to the longer side."""
-LITTLE = 5.0
+SMALL_MOTION = 5.0
 """A small motion: below this multiple of it."""
-ALIKE = 1.25, 0.2
+FEATURE_TOLERANCES = 1.25, 0.2
 """Ratio of the sizes of equal features, and difference of their directions, radians."""
 LEAST, CLEAR = 16, 0.4
 """Minimum moved matches of a pair, and at least as many as still ones; and maximum of those with
@@ -39,7 +39,7 @@ def without_marks(
     shown: dict[tuple, set[int]] = {}
     for m, (rows, motion) in zip(matches, still):
         moved = int((motion > 1).sum())
-        little = int(((motion > 1) & (motion < LITTLE)).sum())
+        little = int(((motion > 1) & (motion < SMALL_MOTION)).sum())
         number = int(rows.sum())
         if number and moved >= max(LEAST, number) and little <= CLEAR * number:
             for cell in _cells(m, features, sizes, rows):
@@ -67,8 +67,8 @@ def _still(
     if sizes[i] != sizes[j] or not len(m.rows):
         return np.zeros(len(m.rows), bool), np.full(len(m.rows), np.inf)
     a, b = features[i].take(m.rows[:, 0]), features[j].take(m.rows[:, 1])
-    motion = np.linalg.norm(a.xy - b.xy, axis=1) / (STILL * max(sizes[i]))
-    ratio, turn = ALIKE
+    motion = np.linalg.norm(a.xy - b.xy, axis=1) / (LARGEST_MOTION * max(sizes[i]))
+    ratio, turn = FEATURE_TOLERANCES
     same = np.abs(np.log(a.size / b.size)) < np.log(ratio)
     same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < turn
     return same & (motion < 1), motion
@@ -77,6 +77,6 @@ def _still(
 def _cells(m: Matches, features, sizes, rows) -> list[tuple]:
     """Size of the photographs, column and row of the cells of matches."""
     i = m.images[0]
-    side = LITTLE * STILL * max(sizes[i])
+    side = SMALL_MOTION * LARGEST_MOTION * max(sizes[i])
     at = np.floor(features[i].xy[m.rows[rows, 0]] / side).astype(int)
     return [(sizes[i], *cell) for cell in at.tolist()]

@@ -17,7 +17,7 @@ from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 
 LENGTH = 16
-ABANDONED = 600.0
+ABANDONED_AFTER = 600.0
 """Seconds after which no process writes a file any more."""
 RULES = "4"
 """Version of features and matches: files of others are not used."""
@@ -74,7 +74,7 @@ class Store:
             for path in self.folder.glob("*.part*"):
                 # from a killed run, unless so new that another run may be writing it
                 with suppress(OSError):
-                    if time.time() - path.stat().st_mtime > ABANDONED:
+                    if time.time() - path.stat().st_mtime > ABANDONED_AFTER:
                         path.unlink()
 
     def _load(self, name):

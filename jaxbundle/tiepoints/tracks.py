@@ -15,7 +15,7 @@ from jaxbundle.tiepoints.verification import Pair
 
 CELLS = 10
 """Cells along the longer side of a photograph."""
-NEAR = 0.0015
+MERGING_DISTANCE = 0.0015
 """Tracks nearer than this part of the longer side, in two photographs, are one point."""
 
 
@@ -106,7 +106,7 @@ def _cells(xy, sizes):
         column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
         cell.append(row * nx + column)
         shape.append((nx, ny))
-        fine = np.floor(places / (NEAR * max(columns, rows))).astype(int)
+        fine = np.floor(places / (MERGING_DISTANCE * max(columns, rows))).astype(int)
         near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
     return cell, near, shape
 

@@ -7,9 +7,10 @@ homography, that explains nearly all of them as well is reported: two photograph
 or of a plane, which do not start a model.
 
 Unique matches come first (`Matches.single`): in a row of windows, matches of each window to its
-neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
-used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
-`ENOUGH` unique matches the others are left out: windows follow one another along an epipolar line.
+neighbour are consistent with a wrong orientation, shifted by their distance. All matches are used
+only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
+`SUFFICIENT_MATCHES` unique matches the others are left out: windows follow one another along an
+epipolar line.
 
 Agreeing matches must be distributed over both photographs, not in one corner: a common sign
 in two scenes does not prove that they are the same.
@@ -38,9 +39,9 @@ from jaxbundle.system.compilation import quick_jit
 
 LEAST, PART = 16, 0.2
 """Minimum number of agreeing matches, and their minimum share of all."""
-CLEAR = 0.6
+DISTINCT = 0.6
 """Share of the most distinct matches used to find the orientation."""
-ENOUGH = 60
+SUFFICIENT_MATCHES = 60
 """Sufficient number of unique matches."""
 EXTENT = 0.05
 """Minimum standard deviation of agreeing matches across their longest direction, relative to
@@ -49,9 +50,9 @@ SLOTS, LANES = 192, 8
 ROUNDS, STEPS = 2, 8
 TURNS = 40
 """Number of pairs of matches for trial rotations."""
-LOOSE = 3.0
+FIRST_TOLERANCE = 3.0
 """The first choice of matches, in tolerances."""
-EXPLAINED = 0.9
+EXPLAINED_SHARE = 0.9
 """Share of the matches that a simpler relation must explain."""
 KINDS = ("relative", "plane", "rotation")
 
@@ -104,13 +105,13 @@ def verify_pairs(
     found: list = [None] * len(xy1)
     if not usable:
         return found
-    sure = _agreed({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
+    sure = _find_agreeing({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
     others = {k: np.arange(len(xy1[k])) for k in usable
               if k not in sure and (~single[k]).sum() >= LEAST}  # fmt: skip
-    agreed = {**_agreed(others, xy1, xy2, tolerance), **sure}
+    agreed = {**_find_agreeing(others, xy1, xy2, tolerance), **sure}
     for k in sure:
         good, M, b = agreed[k]
-        if (good & single[k]).sum() >= ENOUGH:
+        if (good & single[k]).sum() >= SUFFICIENT_MATCHES:
             agreed[k] = good & single[k], M, b
     turned = {
         k: turn for k in usable if k not in agreed
@@ -127,40 +128,40 @@ def verify_pairs(
     return found
 
 
-def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
+def _find_agreeing(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
     """The agreeing matches of pairs with the orientation from some of them (`rows`), M and b, if
     enough of these agree. Otherwise only the most distinct ones are tried: for photographs far
     apart most matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
     found = _by_some(rows, _clear_rows, xy1, xy2, tolerance)
-    again = {k: r for k, r in rows.items() if k not in found and CLEAR * len(r) > many.SLOTS}
+    again = {k: r for k, r in rows.items() if k not in found and DISTINCT * len(r) > many.SLOTS}
     return {**_by_some(again, lambda _: np.arange(many.SLOTS), xy1, xy2, tolerance), **found}
 
 
 def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
-    """As `_agreed`, from the number of matches given by `clear`."""
+    """As `_find_agreeing`, from the number of matches given by `clear`."""
     if not rows:
         return {}
     keys = np.array(list(rows))
     few = [rows[k][clear(len(rows[k]))] for k in rows]
     M, b, part, _ = many.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)], [xy2[k][r] for k, r in zip(rows, few)],
-        LOOSE * tolerance[keys],
+        FIRST_TOLERANCE * tolerance[keys],
     )  # fmt: skip
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
-    for limit in (LOOSE, 1.0):
+    for limit in (FIRST_TOLERANCE, 1.0):
         poses = _improve(poses, rows, xy1, xy2, tolerance, limit)
     found = {}
     for k, (M, b) in poses.items():
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
         enough = len(use) >= max(LEAST, PART * len(rows[k]))
-        if enough and all(_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
+        if enough and all(_is_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
             found[k] = good, M, b
     return found
 
 
-def _extended(some, every) -> bool:
+def _is_extended(some, every) -> bool:
     """Whether some points extend over more than a spot or a line among all."""
     return np.linalg.eigvalsh(np.cov(some.T))[0] > (EXTENT * every.std()) ** 2
 
@@ -170,8 +171,8 @@ def prepare() -> None:
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
     weights = np.ones((LANES, SLOTS))
-    many.in_lanes(_refine, LANES, M, b, xy, xy, weights)
-    many.in_lanes(_simpler, LANES, M, b, xy, xy, weights)
+    many.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
+    many.run_in_lanes(_simpler, LANES, M, b, xy, xy, weights)
 
 
 def _by_rotation(xy1, xy2, tolerance):
@@ -200,7 +201,7 @@ def _triad(a, b):
 
 def _clear_rows(number):
     """The most distinct matches, all of a few."""
-    return many.spread(max(int(CLEAR * number), min(number, many.SLOTS)))
+    return many.spread(max(int(DISTINCT * number), min(number, many.SLOTS)))
 
 
 def _agree(M, b, xy1, xy2, tolerance):
@@ -235,7 +236,7 @@ def _improve(poses, of, xy1, xy2, tolerance, limit):
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
     weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
     start = [np.stack([poses[k][i] for k in keys]) for i in (0, 1)]
-    M, b = many.in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
+    M, b = many.run_in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
 
 
@@ -262,15 +263,15 @@ def _kinds(found, xy1, xy2, tolerance):
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
     weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
     M, b = (np.stack([f[i] for f in found]) for i in (1, 2))
-    angle, turn, plane = many.in_lanes(
+    angle, turn, plane = many.run_in_lanes(
         _simpler, LANES, M, b, filled(xy1), filled(xy2), weights
     )  # fmt: skip
     kinds = []
     for k, (good, *_) in enumerate(found):
         number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]
         by_rotation, by_plane = (float((e[k, :number] < near).mean()) for e in (turn, plane))
-        kind = "plane" if by_plane > EXPLAINED else "relative"
-        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED else kind))
+        kind = "plane" if by_plane > EXPLAINED_SHARE else "relative"
+        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED_SHARE else kind))
     return kinds
 
 

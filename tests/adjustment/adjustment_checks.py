@@ -1,6 +1,6 @@
-"""What the tests of the adjustment share: synthetic networks, and dense algebra as an oracle.
+"""Shared by the tests of the adjustment: synthetic networks, and dense algebra as an oracle.
 
-A network is a ring of images around a box of points, every image turned about its axis, every
+A network is a ring of images around a box of points, every image rotated about its axis, every
 fifth ray missing. Lengths are in metres, the camera of 20 mm stands 4 m away, σ is 5 µm.
 """
 
@@ -21,9 +21,9 @@ from jaxbundle.leastsquares.datum.conditions import datum_directions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
 from jaxbundle.leastsquares.indexing.rows import (
     fill_places,
-    in_given_order,
     lay_out_data,
     residuals,
+    restore_order,
 )
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.problem import pad_data, pad_values
@@ -57,14 +57,14 @@ def camera(id="cam", model="brown", free=SELF_CALIBRATION, sigma=None):
 
 
 def free_parameters(model):
-    """Everything of a model that may be free."""
+    """All parameters of a model that may be free."""
     model = cameras.get_model(model)
     return tuple(name for name in model.parameters if name not in model.never_free)
 
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What a synthetic network was made from."""
+    """The true values of a synthetic network."""
 
     position: np.ndarray
     matrix: np.ndarray
@@ -292,15 +292,15 @@ def residuals_of(problem, values):
 
 
 def rows_of_change(declared, plan, values, data):
-    """v/σ in the order given, filled places and all, as a function of a flat change of the groups,
-    which is nothing to the engine but residuals ∘ retract; and the change 0."""
+    """v/σ in the order given, with padding, as a function of a flat change of the groups, which
+    uses nothing of the engine but residuals ∘ retract; and the change 0."""
     plan, laid = fill_places(plan, lay_out_data(plan, data))
     zero, unravel = ravel_pytree(zero_tangent(plan))
     free = ravel_pytree({g: group.free for g, group in plan.groups.items()})[0]
 
     def function(change):
         moved = retract(declared, plan, values, unravel(change * free))
-        return in_given_order(plan, residuals(declared, plan, moved, laid))
+        return restore_order(plan, residuals(declared, plan, moved, laid))
 
     return function, zero
 
@@ -387,6 +387,6 @@ def bordered_inverse(N, B, free):
 
 
 def standard_deviations(Q):
-    """0 for what is held, in a minimal datum up to rounding of either sign."""
+    """0 for held unknowns, in a minimal datum up to rounding of either sign."""
     variance = np.diag(Q)
     return np.sqrt(np.where(variance > 1e-14 * variance.max(), variance, 0))

@@ -12,7 +12,7 @@ from scipy import optimize
 import jaxbundle
 from jaxbundle import cameras
 from jaxbundle.batch import input as batch_input
-from jaxbundle.batch.input import bucket, once
+from jaxbundle.batch.input import bucket, single_list
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)
@@ -23,7 +23,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def often(number: int):
-    """So many examples, always the same."""
+    """This number of examples, always the same."""
     return settings(max_examples=number, deadline=None, derandomize=True, database=None)
 
 
@@ -232,7 +232,7 @@ def frontal(p, views, tilt=0.0):
 
 
 def test_views_parallel_to_the_board_determine_no_focal_length(three, solved):
-    """Then X/Z·fx stays the same with other fx and Z: fx and fy, and nothing but by them."""
+    """X/Z·fx stays the same with other fx and Z: fx and fy are undetermined, and nothing else."""
     p = three[1][0]
     steps = 0.0, 0.02, 0.35
     xy = np.stack([frontal(p, VIEWS, tilt) for tilt in steps])
@@ -250,7 +250,7 @@ def test_views_parallel_to_the_board_determine_no_focal_length(three, solved):
 
 
 def test_a_principal_point_is_weak_too(three):
-    """Where fx and fy are given, bad measurements of views hardly tilted leave it unknown."""
+    """With given fx and fy, bad measurements of slightly tilted views leave it unknown."""
     p = three[1][0]
     xy = frontal(p, VIEWS, 0.02)[None] + np.random.default_rng(0).normal(0, 5, (1, VIEWS, 40, 2))
     given = dict(zip(NAMES, p))
@@ -293,11 +293,11 @@ def test_perfect_images_give_the_camera_itself(three):
 def test_object_points_may_be_repeated_for_every_view(three):
     xy, X = three[0], np.stack([BOARD, 2 * BOARD, 3 * BOARD])
     views = xy.shape[1]
-    np.testing.assert_array_equal(once(BOARD, xy), BOARD)
-    np.testing.assert_array_equal(once(BOARD[None], xy), BOARD)
-    np.testing.assert_array_equal(once(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
-    np.testing.assert_array_equal(once(X, xy), X)
-    np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
+    np.testing.assert_array_equal(single_list(BOARD, xy), BOARD)
+    np.testing.assert_array_equal(single_list(BOARD[None], xy), BOARD)
+    np.testing.assert_array_equal(single_list(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
+    np.testing.assert_array_equal(single_list(X, xy), X)
+    np.testing.assert_array_equal(single_list(X[:, None].repeat(views, 1), xy), X)
 
 
 @pytest.mark.further

@@ -1,4 +1,4 @@
-"""What errors of held quantities and of measurements do to the results: against networks that are
+"""Effects of errors of held quantities and of measurements on the results, compared with networks
 adjusted again with the held value, or the measurement, shifted."""
 
 import dataclasses
@@ -64,7 +64,7 @@ def shifted(problem, name, h):
 
 
 def differences(problem, name, h):
-    """Central differences of what is adjusted, per unit of what is held, times `h`."""
+    """Central differences of adjusted quantities, per unit of held ones, times `h`."""
     ends = [results_of(solved(problem, shifted(problem, name, s * h)).values)
             for s in (1, -1)]  # fmt: skip
     return [(a - b) / 2 for a, b in zip(*ends)]
@@ -120,7 +120,7 @@ def test_errors_of_several_things_add_in_squares_and_a_common_one_by_amount():
     ],
 )
 def test_a_budget_where_the_network_floats(network, name, step):
-    """Also where it floats about a held point: the datum goes with it."""
+    """Also if it floats about a held point: the datum moves with the point."""
     problem = make(network)
     found = adjust(problem.network)
     budget = jaxbundle.sensitivity(found, {name: step}, of=("cameras", "points"))

@@ -30,8 +30,8 @@ from jaxbundle.network.datum_words import open_directions_in_words
 
 
 def with_control(network, sigma):
-    """The first points controlled, each with its own σ of X, Y, Z (inf: that axis is not); always
-    four, so that all share their programs."""
+    """The first points as control, each with its own σ of X, Y, Z (inf: no control along that
+    axis); always four, so that all share their programs."""
     role, sigmas = list(network.points.role), network.points.sigma.copy()
     role[:4], sigmas[:4] = ["control"] * 4, np.inf
     sigmas[: len(sigma)] = sigma
@@ -124,7 +124,8 @@ def test_words():
 
 
 def test_an_open_datum_is_refused_unless_asked_for():
-    """And named about what is known: about its one fixed point a network can only turn and grow."""
+    """And described relative to what is known: about its one fixed point a network can only rotate
+    and scale."""
     network = CASES["a fixed point"][0]
     open_ones = r"leave open rotation X, rotation Y, rotation Z, scale \(4 of 7\)"
     with pytest.raises(InputError, match=open_ones):

@@ -1,4 +1,4 @@
-"""What cannot be solved ends by its name, never as settled."""
+"""Unsolvable problems end with the name of the defect, never as converged."""
 
 import dataclasses
 

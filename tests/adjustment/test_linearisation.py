@@ -71,7 +71,7 @@ def test_blocks_are_those_of_the_dense_product(name):
 
 @pytest.mark.parametrize("name", LINEARISED)
 def test_damped_step(name):
-    """Held to the damped matrix, which adds a positive definite part everywhere."""
+    """Compared with the damped matrix, which adds a positive definite part everywhere."""
     dense = linearised(name)
     gradient, N, damped, step, _ = blocks_of(name)
     free, size = dense.free, np.linalg.norm(dense.J, axis=0)

@@ -15,7 +15,7 @@ from adjustment_checks import adjusted, camera, solved, synthetic, vtpv
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.problem import given_data, pad_values, without_filling
+from jaxbundle.leastsquares.problem import complete_data, pad_values, without_filling
 from jaxbundle.leastsquares.quality.derivatives import attach_derivatives
 
 pytestmark = pytest.mark.slow
@@ -29,7 +29,7 @@ def attached(problem, values, data, sensitivity="exact"):
     """The solution `values` for `data` as a function of them."""
     system = problem.system
     tables = pad_values(system, problem.layout.tables(values))
-    given = given_data(system, problem.layout.data(data))
+    given = complete_data(system, problem.layout.data(data))
     found = attach_derivatives(system.declared, system.plan, tables, given, sensitivity)
     return problem.layout.values(without_filling(system, found))
 
@@ -95,8 +95,8 @@ def test_derivatives_by_everything_that_was_given():
 
 
 def test_a_fixed_point_takes_the_datum_with_it():
-    """Free but for a point that is held: where that goes, all goes, and the minimum stays. (The
-    rotations and the scale that are open are those about the point.)"""
+    """Free but for one held point: if that moves, all points move with it, and the minimum stays.
+    (The rotations and the scale that are open are those about the point.)"""
     problem, minimum = adjusted("one fixed point")
     start, shift = problem.data.start, jnp.array([0.3, -0.2, 0.1])
     moved = dataclasses.replace(start, point=start.point.at[0].add(shift))

@@ -1,4 +1,5 @@
-"""The minimum: reached from afar, the same by both methods, in any unit and at any place."""
+"""The minimum is reached from far away, and is the same by both methods, in any unit and at any
+place."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Gross errors in batches: found, removed, or at least a status; axes that are not those meant."""
+"""Gross errors in batches: found, removed, or at least a status; axes that are not as expected."""
 
 import dataclasses
 
@@ -86,7 +86,8 @@ def test_a_camera_far_worse_than_the_others_is_a_misfit(clean):
 
 
 def test_a_weak_camera_is_judged_by_its_residuals_too(clean):
-    """Three views with normal errors of some pixels determine nothing: why is said."""
+    """Three views with normal errors of some pixels determine nothing; the message gives the
+    cause."""
     for noise, status in ((1.2, "weak"), (6, "misfit")):
         xy, visible = clean[:3].copy(), np.ones((3, VIEWS, 40), bool)
         xy[1] += np.random.default_rng(1).normal(0, noise, xy[1].shape)
@@ -131,7 +132,7 @@ def test_snooping_is_the_calibration_without_the_corner(clean, shifted, plain, s
 
 
 def test_what_fits_after_all_comes_back(clean):
-    """A few large errors in one view spoil their neighbours, which are not lost."""
+    """A few large errors in one view distort their neighbours, which are not lost."""
     xy = clean.copy()
     xy[BAD, 2, [0, 1, 8]] += [60, -45]
     found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, snooping="pope")
@@ -171,7 +172,7 @@ def test_a_view_of_something_else_goes_by_snooping(clean):
 
 
 def test_nothing_is_screened_where_most_is_outside():
-    """Then the size or the axes are not those meant."""
+    """In this case the size or the axes are wrong."""
     size, visible = np.array(SIZE, float), np.ones((2, 1, 5), bool)
     xy = np.array([[[[100, 100], [-1e3, 5], [2600, 5], [5, 1e9], [5, 5]]]] * 2)
     xy[1, 0, 4] = 4000

@@ -52,7 +52,7 @@ def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs):
     first, second, third, fourth, fifth = found.rows
     assert "camera right" in fifth["error"] and found.adjustments[4] is None
     assert second["views"] == 2 * VIEWS - 1 and third["views"] == 2 * VIEWS - 2
-    assert list(third["epochs_not_used"]) == ["3"] and "not of the same moment" in str(third)
+    assert list(third["epochs_not_used"]) == ["3"] and "not simultaneous" in str(third)
     assert len(fourth["removed"]) == VIEWS
     truth = [*BASE, *np.radians(ANGLES)]
     for row in found.rows[:4]:
@@ -87,7 +87,7 @@ def test_without_snooping_they_are_misfits(rigs):
 
 
 def test_arrays_of_rigs_in_a_file(rigs, tmp_path):
-    """Killed in between and again: the same lines; other settings are refused."""
+    """Killed and restarted: the same lines; other settings are refused."""
     path, file = tmp_path / "rigs.npz", tmp_path / "rigs.jsonl"
     np.savez(path, object_points=POINTS, image_points=rigs[[0, 4]], image_size=render.LENS.size,
              ids=["r1", "r2"], cameras=["left", "right"])  # fmt: skip
@@ -107,7 +107,7 @@ def test_arrays_of_rigs_in_a_file(rigs, tmp_path):
 
 
 def test_folders_of_rigs(command, tmp_path, monkeypatch):
-    """Photographs of one moment by their numbers; a folder with one camera spoils itself alone."""
+    """Simultaneous photographs by their numbers; a folder with one camera fails alone."""
     monkeypatch.chdir(tmp_path)
     views = taken.poses(6)
     for name, lens, poses in (("left", render.LENS, views), ("right", RIGHT, right_of(views))):
@@ -152,8 +152,8 @@ def moving(seed: int, line: float, speed, turn):
 
 @pytest.mark.further
 def test_a_rolling_shutter_in_a_batch():
-    """Cameras held in the hand: with priors of their motion the truth within its σ, without the
-    rolling shutter far off."""
+    """Hand-held cameras: with priors of their motion the result is within its σ of the truth,
+    without the rolling shutter far off."""
     line, speed, turn = 3e-5, [0.3, 0.3, 0.1], [0.3] * 3
     made = [moving(seed, line, speed, turn) for seed in range(2)]
     xy = np.array([views for views, _ in made])[:, None]

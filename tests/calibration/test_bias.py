@@ -8,7 +8,7 @@ from test_calibrate import simulated
 
 from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.bias import cells_of_four, find_bias
-from jaxbundle.calibration.linearised import linearise_image_points
+from jaxbundle.calibration.observation_equations import linearise_image_points
 from jaxbundle.cameras import get_model
 
 FEW = ("fx", "fy", "cx", "cy", "k1", "p1", "p2")

@@ -25,7 +25,7 @@ TRUTH = dict(zip(OPENCV.parameters, render.LENS.parameters))
 
 
 def simulated(lens=render.LENS, board=taken.BOARD, noise=NOISE, seed=0, views=VIEWS, points=None):
-    """Corners with noise instead of photographs; `points`: where they really are."""
+    """Corners with noise instead of photographs; `points`: their true coordinates."""
     rng = np.random.default_rng(seed)
     X = board.points if points is None else points
     middle = board.points.mean(0)[:2]
@@ -158,7 +158,8 @@ def test_start_values_of_a_correction():
 
 
 def test_circles_lose_their_eccentricity():
-    """The centres of large circles' images are measured; only with their diameter is it right."""
+    """The centres of the images of large circles are measured; only with their diameter is the
+    result correct."""
     board = Board(9, 6, 0.03, "circles", diameter=0.025)
     views = simulated(board=board, noise=0.0)
     t = np.linspace(0, 2 * np.pi, 60, endpoint=False)

@@ -46,7 +46,7 @@ def close(number, seed=2):
 
 
 def views_of(lens, number=8, noise=NOISE, seed=0):
-    """Corners with noise; what lies outside of the photograph is not seen."""
+    """Corners with noise; points outside the photograph are invisible."""
     rng = np.random.default_rng(seed)
     xy = np.array([lens.image_of(M, X0, BOARD.points) for M, X0 in close(number)])
     xy = xy + noise * rng.normal(size=xy.shape)
@@ -104,7 +104,7 @@ def fisheye():
 
 @pytest.mark.further
 def test_which_model_suffices(fisheye):
-    """Of a camera that is equidistant: neither the stereographic one, nor more parameters."""
+    """For an equidistant camera: neither the stereographic model, nor more parameters."""
     found = compare_models(
         fisheye, models=["stereographic", "kannala-brandt", "equidistant"], folds=2,
         sigma_image=NOISE,
@@ -138,8 +138,8 @@ def test_what_cannot_be_compared(fisheye):
 
 
 def bumpy(p, r, s, q):
-    """An equidistant lens with what no radial and decentring distortion follows: its elements are
-    decentred, its field is curved here and there. Bumps of some pixels, 0.3 rad wide."""
+    """An equidistant lens whose distortion no radial and decentring model fits: decentred elements
+    and a locally curved field. Bumps of some pixels, 0.3 rad wide."""
     fx, fy, cx, cy = p
     X, Y, Z = r, -s, -q
     rho2 = X * X + Y * Y
@@ -234,7 +234,7 @@ def test_the_command_compares_models(fisheye, command, tmp_path, monkeypatch):
 
 
 def test_simulated_views_are_what_cv2_projects():
-    """The board seen from Z > 0 with Y up; what is outside the image is not there."""
+    """The board seen from Z > 0 with Y up; points outside the image are missing."""
     camera = Camera("cam", "opencv", dict(fx=400.0, fy=402.0, cx=240.0, cy=178.0, k1=-0.2),
                     image_size=SIZE)  # fmt: skip
     middle = BOARD.points.mean(0)

@@ -47,7 +47,7 @@ def test_opencv_said_again_has_the_figures_of_opencv():
 
 @pytest.mark.further
 def test_a_rig_of_such_cameras():
-    """The same mounting as of `opencv`."""
+    """The same mounting as with `opencv`."""
     found = []
     for model in ("opencv", AGAIN):
         alone = {

@@ -1,4 +1,4 @@
-"""How good is a calibration: Monte Carlo of projections, halves, coverage, words."""
+"""The quality of a calibration: Monte Carlo of projections, halves, coverage, words."""
 
 import dataclasses
 import json

@@ -193,7 +193,7 @@ def test_maps_and_coverage_of_a_rig(rig, tmp_path):
 
 
 def test_redundancy_numbers_say_how_much_of_an_error_a_residual_shows():
-    """∂v/∂l = −r of one coordinate that is falsified a little."""
+    """∂v/∂l = −r for a small error of one coordinate."""
     rig = as_rig(pair())
     found = adjust_rig(rig)
     r = rig.in_order(found.solution.reliability.redundancy)
@@ -220,10 +220,10 @@ def flawed():
 
 
 def test_what_only_the_mounting_shows_is_removed(flawed):
-    """Epochs that are not of one moment, then single points: named, and without effect."""
+    """Epochs that are not simultaneous, then single points: named, and without effect."""
     found = calibrate_rig(flawed.cameras, snooping="pope")
     assert {epoch for epoch, _ in found.left_out} == {"3", "8"} and len(found.epochs) == VIEWS - 2
-    assert "photographs not of the same moment" in found.left_out[0][1]
+    assert "photographs not simultaneous" in found.left_out[0][1]
     mounting = found.mountings["right"]
     assert (np.abs(mounting.base - BASE) < 3.5 * mounting.sigma[:3]).all()
     ids = taken.BOARD.ids
@@ -250,7 +250,7 @@ def test_what_only_the_mounting_shows_is_removed(flawed):
 
 
 def test_without_snooping_every_epoch_stays_and_is_named(flawed):
-    """`--snooping none`: nothing is removed by the program."""
+    """With `--snooping none` the program removes nothing."""
     found = calibrate_rig(flawed.cameras, snooping=None)
     assert found.left_out == () and {"3", "8"} <= {*found.epochs} and len(found.epochs) == VIEWS
     assert {epoch for epoch, _ in found.contradicting} >= {"3", "8"} and not found.removed

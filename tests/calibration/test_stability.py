@@ -1,4 +1,4 @@
-"""Calibrations of one camera at several epochs: what is stated against what was simulated."""
+"""Calibrations of one camera at several epochs: stated against simulated values."""
 
 import dataclasses
 import json
@@ -78,7 +78,7 @@ def test_a_slope_with_temperature():
 
 def test_scatter_about_a_slope():
     """Seven epochs on a line with scatter: the line's τ is the scatter alone, the slope's σ and its
-    probability are honest where there is no trend."""
+    probability are correct if there is no trend."""
     at, tau, none, steep = np.array([3.0, 8, 12, 15, 22, 26, 31]), 0.4, [], []
     random = np.random.default_rng(7)
     for seed in range(60):

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from jaxbundle.cameras import convert_camera, get_model
 from jaxbundle.cameras.convert_exact import (
     exact_parameters,
-    inverted_radial,
+    invert_radial,
     normalised_correction,
 )
 from jaxbundle.cameras.convert_fit import images_of, rays_of
@@ -106,7 +106,7 @@ def test_normalised_correction_is_the_same_correction():
 
 def test_inverted_radial_is_right_to_the_seventh_order():
     q = np.array([0.1, -0.05, 0.03])
-    k = inverted_radial(q)
+    k = invert_radial(q)
     r = np.array([0.05, 0.1])
     apply = lambda k, r: r * (1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6)
     error = np.abs(apply(k, apply(q, r)) - r)

@@ -1,4 +1,4 @@
-"""The implicit inverse: convergence, exact derivatives of every order, NaN instead of nonsense."""
+"""The implicit inverse: convergence, exact derivatives of every order, NaN outside the domain."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""A user's own model: one function and names; the rest follows as for those that are built in."""
+"""A user's own model: one function and names; the rest follows as for built-in models."""
 
 import dataclasses
 
@@ -202,7 +202,7 @@ UNUSABLE = {
         own(lambda p, x, y: (x * (1 + jnp.sqrt(x * x + y * y)), y)),
         "no finite value and derivatives on the optical axis",
     ),
-    "mirrored": (own(lambda p, x, y: (x, -y)), "mirrored or turned.*axes 'up'"),
+    "mirrored": (own(lambda p, x, y: (x, -y)), "mirrored or rotated.*axes 'up'"),
     "inverse": (own(division, inverse=lambda p, x, y: (x, y)), "inverse is not the inverse"),
 }  # fmt: skip
 

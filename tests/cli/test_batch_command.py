@@ -41,7 +41,7 @@ def cameras(tmp_path_factory):
 
 
 def ended(process: subprocess.Popen, file: Path, lines: int, how: signal.Signals, wait: float):
-    """The run is ended by a signal, a moment after so many lines more are in the file.
+    """The run is ended by a signal, shortly after this number of further lines is in the file.
 
     Meanwhile no other run can write the file."""
     number = lambda: file.read_bytes().count(b"\n") if file.exists() else 0

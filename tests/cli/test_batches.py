@@ -1,4 +1,4 @@
-"""What is taken for a result of an input that is there, and what is not."""
+"""Which lines count as the result of an existing input."""
 
 import json
 import os
@@ -133,7 +133,7 @@ def test_a_file_of_an_earlier_version_is_understood(start):
     for row in old:
         del row["settings"], row["data"]
     file.write_text("".join(json.dumps(row) + "\n" for row in old))
-    with pytest.raises(InputError, match="does not say what it was made of"):
+    with pytest.raises(InputError, match="does not say what it was computed from"):
         again()
     # What is not asked for is left alone.
     elsewhere = old[0] | {"key": "elsewhere.npz#1"}

@@ -1,4 +1,4 @@
-"""`jaxbundle calibrate` as a person meets it."""
+"""`jaxbundle calibrate` from the command line."""
 
 import json
 import shutil

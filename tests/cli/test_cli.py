@@ -1,4 +1,4 @@
-"""The command line as a person meets it: exit status, one line of error, nothing half-written."""
+"""The command line as a user sees it: exit status, one line of error, nothing half-written."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ def run(*arguments, cwd=ROOT):
 
 @pytest.fixture
 def project(tmp_path):
-    """A copy of the example that may be spoilt."""
+    """A copy of the example that may be damaged."""
     folder = tmp_path / "network"
     shutil.copytree(EXAMPLE, folder)
     return folder

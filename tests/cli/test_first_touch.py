@@ -1,5 +1,5 @@
-"""The first touch: help, the version and errors of usage come without waiting for JAX; a terminal
-is told what the wait of a first adjustment is for."""
+"""The first touch: help, the version and errors of usage come without waiting for JAX; on a
+terminal a message explains the wait of a first adjustment."""
 
 import json
 import subprocess

@@ -1,6 +1,6 @@
 """An interrupt of the command line: one line, its status, nothing half-written, at any moment.
 
-The processes here import no JAX: what they do stands for what it does at such a moment.
+The processes here import no JAX: their work stands for that of JAX at such a moment.
 """
 
 import os
@@ -16,7 +16,7 @@ from jaxbundle import cli
 BEGIN = """
 import gc, hashlib, os, signal, sys, threading
 from jaxbundle.system.interrupts import advise, handle_interrupts, set_status
-from jaxbundle.system.temporaries import temporary, unbroken, watch_cache
+from jaxbundle.system.temporaries import temporary, defer_interrupts, watch_cache
 interrupt = lambda number=signal.SIGINT: signal.raise_signal(number)
 """
 STARTED = BEGIN + "handle_interrupts()\n"
@@ -110,8 +110,8 @@ with temporary("new"), temporary("empty", content=False), temporary(".result.jso
 
 def test_what_belongs_together_is_done_whole(tmp_path):
     code = """
-with unbroken():
-    with unbroken():
+with defer_interrupts():
+    with defer_interrupts():
         open("first", "w").close()
         interrupt()
     open("second", "w").close()
@@ -122,11 +122,11 @@ open("third", "w").close()
 
 
 def test_what_belongs_together_and_does_not_end_holds_nobody(tmp_path):
-    """A disk that does not answer between two renames: after `PATIENCE` all is as without it."""
+    """If a disk does not answer between two renames, the process ends after `LONGEST_DEFERRAL`."""
     code = """
 from jaxbundle.system import interrupts
-interrupts.PATIENCE = 0.2
-with temporary("half"), unbroken():
+interrupts.LONGEST_DEFERRAL = 0.2
+with temporary("half"), defer_interrupts():
     open("half", "w").close()
     interrupt()
     threading.Event().wait(20)
@@ -170,7 +170,7 @@ import jaxbundle
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 try:
-    with unbroken(), temporary(".result.json") as path:
+    with defer_interrupts(), temporary(".result.json") as path:
         path.write_text("half")
         interrupt()
 except KeyboardInterrupt:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from batch_cameras import images_of, write_cameras
 
-from jaxbundle.batch.joined import add_parts
+from jaxbundle.batch.processes import add_parts
 from jaxbundle.batch.run import run_batch
 
 ROOT = Path(__file__).parents[2]

@@ -53,7 +53,7 @@ def searched(monkeypatch):
 
 
 def test_a_folder_a_camera(command, tmp_path, monkeypatch):
-    """By processes of their own, from the command; a bad folder has its line, the others theirs."""
+    """In separate processes, from the command; a bad folder has its line, the others theirs."""
     monkeypatch.chdir(tmp_path)
     folder_of(tmp_path / "first", range(1, 8))
     (tmp_path / "first" / "text.jpg").write_text("no photograph")
@@ -118,8 +118,8 @@ def test_no_photograph_is_searched_twice_and_a_changed_one_is_noticed(searched, 
 
 
 def test_charuco_boards_with_missing_corners(searched, tmp_path):
-    """Every photograph shows another part of the board: less than half of it to all but a corner;
-    the camera within its σ."""
+    """Every photograph shows another part of the board: from less than half of it to all but a
+    corner; the camera is within its σ."""
     board = Board(10, 7, 0.027, "charuco")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = cv2.aruco.CharucoBoard((10, 7), 0.027, 0.75 * 0.027, dictionary)
@@ -149,5 +149,5 @@ def test_what_a_process_dies_of_spoils_its_task_alone():
         found = dict(workers.run([0, signal.SIGKILL, 9999]))
         found |= dict(workers.run([signal.SIGCONT]))
     assert found[0] is None and found[signal.SIGCONT] is None
-    assert found[signal.SIGKILL] == Failed("the process that worked on it died (signal 9)")
+    assert found[signal.SIGKILL] == Failed("its worker process died (signal 9)")
     assert "ValueError" in found[9999].why or "OSError" in found[9999].why

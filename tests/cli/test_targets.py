@@ -1,4 +1,4 @@
-"""What the command line writes is checked before the adjustment, and replaces what was there."""
+"""What the command line writes is checked before the adjustment, and replaces existing files."""
 
 import json
 import os

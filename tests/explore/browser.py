@@ -1,5 +1,5 @@
-"""A headless Chromium that is told what to do through two pipes (--remote-debugging-pipe): pages
-keep their policy, and what is asked from outside and said on the console is known."""
+"""A headless Chromium controlled through two pipes (--remote-debugging-pipe): pages keep their
+policy; requests to other hosts and console messages are recorded."""
 
 import base64
 import itertools
@@ -50,7 +50,7 @@ class Browser:
         os.close(self.write)
 
     def call(self, method: str, **values):
-        """What a command of the protocol gives."""
+        """The result of a command of the protocol."""
         number = next(self.number)
         told = {"id": number, "method": method, "params": values}
         if self.session is not None:
@@ -84,7 +84,7 @@ class Browser:
         return message
 
     def open(self, address: str) -> None:
-        """Go to a page, and wait until it is there."""
+        """Go to a page, and wait until it is loaded."""
         self.call("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
 

@@ -1,4 +1,4 @@
-"""The explorer: who may ask, and that what it answers is what the library computes."""
+"""The explorer: access, and answers equal to those of the library."""
 
 import base64
 import dataclasses
@@ -76,7 +76,7 @@ attitude_interpolation = "linear"
 
 
 class Doubling:
-    """The least view: it doubles a number."""
+    """A minimal view: it doubles a number."""
 
     def page(self, given, live):
         x = number(given, "x", 1.0)
@@ -176,7 +176,7 @@ def test_what_cannot_be_answered_is_one_line_of_json(doubling, path, body, statu
 def test_a_fault_is_told_on_the_terminal(doubling):
     doubling.lines.clear()
     ask(doubling, "answer", {"x": 13})
-    assert doubling.lines == ["a fault of the program: ZeroDivisionError: a fault"]
+    assert doubling.lines == ["internal error: ZeroDivisionError: a fault"]
     assert ask(doubling, "answer", {"x": 1})[0] == 200
 
 
@@ -262,7 +262,8 @@ def test_before_a_move_sigma_are_those_of_the_adjustment(network, convergent4):
 
 
 def test_a_station_turns_to_its_points(network, convergent4):
-    """The middle of its points is imaged in the direction it was; not moved, nothing changes."""
+    """The centroid of its points is imaged in the same direction as before; without a move nothing
+    changes."""
     id = convergent4.problem.network.images.id[0]
     pose = [float(convergent4.images[name][0]) for name in
             ("X0", "Y0", "Z0", "omega", "phi", "kappa")]  # fmt: skip
@@ -456,7 +457,7 @@ def test_a_choice_that_means_nothing_is_refused(scanner, given, words):
 
 
 def test_inputs_are_recognised(tmp_path):
-    from jaxbundle.cli.explore_given import recognise
+    from jaxbundle.cli.explore_inputs import recognise
 
     examples = ROOT / "examples"
     assert recognise(str(examples / "convergent4" / "project.toml")) == "network"

@@ -1,4 +1,4 @@
-"""What the tests of geometry share: batches, Jacobians in both modes, numerical differences."""
+"""Shared by the tests of geometry: batches, Jacobians in both modes, numerical differences."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""A full disk, without one."""
+"""A simulated full disk."""
 
 import resource
 import signal
@@ -9,7 +9,7 @@ import jax
 
 @contextmanager
 def files_end_at(size: int):
-    """No file grows beyond so many bytes: the system refuses the write, as a full disk does.
+    """No file grows beyond this number of bytes: the system refuses the write, as a full disk does.
 
     JAX keeps no programs meanwhile: it would keep their beginnings.
     """

@@ -1,4 +1,4 @@
-"""Files with something done to them: cut, garbled, given numbers nobody expects."""
+"""Damaged files: cut, garbled, with unexpected numbers."""
 
 import shutil
 import tempfile
@@ -21,7 +21,7 @@ what_is_done = given(
 
 
 def often(number: int):
-    """So many examples, always the same."""
+    """This number of examples, always the same."""
     return settings(max_examples=number, deadline=None, derandomize=True, database=None)
 
 
@@ -40,7 +40,7 @@ def read_or_refused(read, valid: Path, which: int, how: str, odd: str, a: float,
 
 
 def garbled(data: bytes, how: str, a: float, b: float, odd: str) -> bytes:
-    """The contents of a file with something done to it; a, b in [0, 1] say where."""
+    """The damaged contents of a file; a, b in [0, 1] give the place."""
     i, j = sorted((int(a * len(data)), int(b * len(data))))
     match how:
         case "cut":

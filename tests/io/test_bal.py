@@ -94,7 +94,7 @@ def test_a_count_of_thousands_of_digits(tmp_path):
 @pytest.mark.parametrize("suffix, pack", [(".gz", gzip.compress), (".bz2", bz2.compress),
                                           ("", bytes)])  # fmt: skip
 def test_no_more_is_unpacked_than_the_counts_allow(tmp_path, counts, suffix, pack):
-    """100 MB of blanks: what is held while the file is refused stays far below."""
+    """100 MB of blanks: the memory used while the file is refused stays far below."""
     path = tmp_path / f"problem.bal{suffix}"
     blanks = 10**8 if suffix else 10**6
     path.write_bytes(pack(counts.encode() + b"\n" + b" " * blanks))

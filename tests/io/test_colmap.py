@@ -272,7 +272,7 @@ def test_a_binary_file_cut_anywhere(tmp_path, part):
     data = path.read_bytes()
     for size in [0, 7, 8, 20, *np.linspace(30, len(data) - 1, 12).astype(int)]:
         path.write_bytes(data[:size])
-        with pytest.raises(InputError, match=f"{part}.bin, .*(cut off|bytes follow)"):
+        with pytest.raises(InputError, match=f"{part}.bin, .*(truncated|bytes follow)"):
             read_colmap(tmp_path)
     path.write_bytes(data + b"x")
     with pytest.raises(InputError, match="1 bytes follow the last entry"):

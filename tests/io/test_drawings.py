@@ -107,7 +107,7 @@ def test_dxf_says_what_to_install(tmp_path, monkeypatch):
 
 def disturbed(model):
     """One image point of point 2 displaced by 5 px, which is seen in three images, and one of point
-    4 by 1 px, seen in two; the others are where they belong."""
+    4 by 1 px, seen in two; the others are exact."""
     net = network(model)
     camera, rays = net.cameras[0], net.observations
     step = np.array(camera.pixel_size) if model == "brown" else np.ones(2)

@@ -1,4 +1,4 @@
-"""`convert`: what is recognised, what a conversion costs and loses, and what is refused."""
+"""`convert`: formats recognised, accuracy and losses of conversions, refusals."""
 
 import dataclasses
 import os
@@ -142,7 +142,7 @@ def test_camera_files(brown, tmp_path):
     given = CAMERAS["opencv"]
     assert camera.parameters == pytest.approx(given.parameters, rel=1e-15)
     assert camera.image_size == given.image_size
-    with pytest.raises(InputError, match="holds cameras alone"):
+    with pytest.raises(InputError, match="contains only cameras"):
         convert(tmp_path / "two.toml", tmp_path / "x.ply")
     with pytest.raises(InputError, match="no camera '7'"):
         convert(tmp_path / "two.toml", tmp_path / "y.yaml", camera="7")

@@ -41,7 +41,7 @@ def test_a_tail_of_zeros_is_refused_early(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in BINARY])
 def test_a_number_of_400_digits_is_read_or_refused_with_its_file(kind, tmp_path):
-    """Numbers of every file in turn; what is said names a file, and is no error of arithmetic."""
+    """Numbers of every file in turn; the message names a file, and is not an arithmetic error."""
     (tmp_path / "valid").mkdir()
     valid = made(kind, tmp_path / "valid")
     for name in sorted(path.name for path in valid.iterdir()):

@@ -1,4 +1,4 @@
-"""Folders of results: never over what is not their own, whole whatever ends the program."""
+"""Folders of results never overwrite foreign files, and are complete however the program ends."""
 
 import errno
 import json
@@ -16,7 +16,7 @@ from jaxbundle.io import read_network
 from jaxbundle.io.networks.bundler import write_bundler
 from jaxbundle.io.results.coordinates import write_coordinates
 from jaxbundle.io.writing import folders
-from jaxbundle.io.writing.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
+from jaxbundle.io.writing.folders import INSIDE, MARKER, check_folder, read_marker, replace_folder
 from jaxbundle.system.temporaries import remove_temporaries
 
 OLD = {"report.txt": "old", "network/points.csv": "1", "histogram.png": "h"}
@@ -24,7 +24,7 @@ NEWER = {"report.txt": "newer", "network/points.csv": "2", "network/deep/x": "3"
 
 
 def write(folder, files, by="adjust", force=False, names=tuple(NEWER)):
-    with replaced_folder(folder, by, names, force) as new:
+    with replace_folder(folder, by, names, force) as new:
         for name, text in files.items():
             (new / name).parent.mkdir(parents=True, exist_ok=True)
             (new / name).write_text(text)
@@ -157,7 +157,7 @@ def test_a_link_to_a_folder_stays_one(out):
 
 
 def test_a_folder_that_cannot_be_moved_to_from_beside(out, monkeypatch):
-    """A mount point: what is beside is on another disk."""
+    """A mount point: its parent folder is on another disk."""
     rename = Path.rename
 
     def refuse(path, target):
@@ -174,17 +174,17 @@ def test_a_folder_that_cannot_be_moved_to_from_beside(out, monkeypatch):
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit(143), MemoryError, ValueError])
 def test_what_fails_leaves_no_trace(out, error):
     with pytest.raises(type(error) if isinstance(error, BaseException) else error):
-        with replaced_folder(out, "adjust", NEWER) as new:
+        with replace_folder(out, "adjust", NEWER) as new:
             (new / "report.txt").write_text("half")
             raise error
     with pytest.raises(InputError, match=f"^{out}/a/report.txt: odd$"):
-        with replaced_folder(out / "a" / "b", "adjust", NEWER, force=True) as new:
+        with replace_folder(out / "a" / "b", "adjust", NEWER, force=True) as new:
             raise InputError(f"{new.parent.parent / 'report.txt'}: odd")
     assert content(out) == OLD and {*os.listdir(out.parent)} == {"out"}
 
 
 def in_child(action) -> int:
-    """Do something in another process; what it ended with."""
+    """Run something in another process; its exit status."""
     child = os.fork()
     if not child:
         try:
@@ -203,7 +203,7 @@ def test_a_full_disk_leaves_the_old_result_whole(out):
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_kill_at_any_rename_leaves_old_or_new(tmp_path, inside):
     """Killed before the n-th rename, for every n: the old files or the new ones are all there, in
-    the folder once the next command has settled it, with the user's own files untouched."""
+    the folder once the next command has recovered it, with the user's own files untouched."""
     real, mine, outcomes = os.rename, {"notes.txt": "mine", "network/mine": "mine"}, []
     for n in range(20):
         out = tmp_path / str(n) / "out"
@@ -246,7 +246,7 @@ def test_an_interrupt_of_the_command_line_leaves_no_trace(out, place):
     """It ends the process without an exception, and removes what is temporary."""
 
     def action():
-        with replaced_folder(out.parent / place, "adjust", NEWER) as new:
+        with replace_folder(out.parent / place, "adjust", NEWER) as new:
             (new / "report.txt").write_text("half")
             remove_temporaries(1)
             os._exit(7)
@@ -256,7 +256,7 @@ def test_an_interrupt_of_the_command_line_leaves_no_trace(out, place):
 
 
 def test_two_runs_do_not_write_one_folder(out):
-    with replaced_folder(out, "adjust", NEWER):
+    with replace_folder(out, "adjust", NEWER):
         with pytest.raises(InputError, match=f"^{out}: another run is writing it"):
             write(out, NEWER)
     assert content(out) == {}
@@ -330,7 +330,7 @@ def test_two_files_that_belong_together_are_both_replaced_or_none(tmp_path, name
 
 
 def test_a_list_of_names_that_is_there_is_renewed(tmp_path):
-    """Else the names of other images would be taken for those of this network."""
+    """Otherwise names of other images would be taken for those of this network."""
     (tmp_path / "list.txt").write_text("x\ny\nz\n")
     write_bundler(exchange_cases.network("snavely", ("0", "1", "2")), tmp_path / "bundle.out")
     assert read_network(tmp_path / "bundle.out").images.id == ("0", "1", "2")

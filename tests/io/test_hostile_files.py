@@ -1,8 +1,7 @@
 """Whatever is in a file, reading it ends in a network, a camera or one line of complaint.
 
-Valid files of every format are cut, garbled, and given numbers nobody expects; what comes out must
-be an `InputError` or something that could be read. Warnings are errors here, so an overflow is a
-failure as well.
+Valid files of every format are cut, garbled, and given unexpected numbers; the outcome must be an
+`InputError` or readable data. Warnings are errors here, so an overflow is a failure as well.
 """
 
 import json

@@ -10,7 +10,7 @@ from garbling import often, read_or_refused, what_is_done
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
-from jaxbundle.io.writing.locks import locked
+from jaxbundle.io.writing.locks import hold_lock
 
 
 def rows(path: Path):
@@ -42,7 +42,7 @@ def test_lines_are_kept_and_dropped(tmp_path):
     "my notes\n", "my notes", '{"key": "a", "sta\n', '{"a": 1}', '{"precious": [1, 2', '{"key": 1}',
 ])  # fmt: skip
 def test_a_file_of_something_else_is_not_taken_for_a_torn_line(tmp_path, text):
-    """It stays as it is, also where it does not end with a line feed."""
+    """It stays unchanged, even if it does not end with a line feed."""
     file = tmp_path / "notes.txt"
     file.write_text(text)
     with pytest.raises(InputError, match="line 1: not a result"):
@@ -69,33 +69,33 @@ def test_one_at_a_time(tmp_path):
     file, link = tmp_path / "results.jsonl", tmp_path / "link.jsonl"
     link.symlink_to(file)
     for _ in range(2):
-        with locked(file):
+        with hold_lock(file):
             JsonLines(file).append([{"key": "a", "status": "converged"}])
             JsonLines(file).drop("a")  # another file of the same name
             for same in (file, link):
-                with pytest.raises(InputError, match="another run is writing"), locked(same):
+                with pytest.raises(InputError, match="another run is writing"), hold_lock(same):
                     pass
-            with locked(tmp_path / "other.jsonl"):
+            with hold_lock(tmp_path / "other.jsonl"):
                 pass
         assert sorted(os.listdir(tmp_path)) == ["link.jsonl", "results.jsonl"]
     (tmp_path / ".results.jsonl.lock").write_text("")  # of a killed run
-    with locked(link):
+    with hold_lock(link):
         pass
     assert sorted(os.listdir(tmp_path)) == ["link.jsonl", "results.jsonl"]
 
 
 def test_no_lock_to_be_had_is_said(tmp_path):
     with pytest.raises(InputError, match="there is no folder .*nowhere"):
-        with locked(tmp_path / "nowhere" / "results.jsonl"):
+        with hold_lock(tmp_path / "nowhere" / "results.jsonl"):
             pass
-    with locked("/dev/null"):
+    with hold_lock("/dev/null"):
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
 def test_a_pipe_takes_lines():
     read, write = os.pipe()
     with open(read, "rb") as end:
-        with locked(f"/dev/fd/{write}"):
+        with hold_lock(f"/dev/fd/{write}"):
             JsonLines(f"/dev/fd/{write}").append([{"key": "a"}])
         os.close(write)
         assert json.loads(end.read()) == {"key": "a"}
@@ -120,7 +120,7 @@ def valid(tmp_path_factory):
 @often(200)
 @what_is_done
 def test_a_garbled_file_is_taken_up_or_refused(valid, **done):
-    """What is taken up is whole afterwards, every key once."""
+    """A file that is continued is complete afterwards, every key once."""
 
     def read(folder):
         file = folder / "results.jsonl"

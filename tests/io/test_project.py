@@ -1,4 +1,4 @@
-"""The project format: what it says, what it refuses, and that writing is the inverse of reading."""
+"""The project format: meaning, refusals, and writing as the inverse of reading."""
 
 import dataclasses
 import re
@@ -392,9 +392,9 @@ def test_the_kind_of_input_is_recognised(folder):
             read_network(folder / name)
     camera = folder / "camera.yaml"
     write_opencv(Camera("a", "opencv", {"fx": 9.0, "fy": 9.0}, image_size=(8, 6)), camera)
-    with pytest.raises(InputError, match="holds cameras alone, without images and points"):
+    with pytest.raises(InputError, match="contains only cameras, without images and points"):
         read_network(camera)
-    for name, what in (("opencv", "holds a camera alone"), ("ply", "is written only")):
+    for name, what in (("opencv", "contains only a camera"), ("ply", "is written only")):
         with pytest.raises(InputError, match=f"--format {name}: {what}"):
             read_network(camera, format=name)
     with pytest.raises(InputError, match="not recognised; known formats: project: a .toml file"):

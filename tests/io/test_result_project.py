@@ -1,4 +1,4 @@
-"""The adjusted network: adjusted again it stays as it is, and other programs can have it."""
+"""The adjusted network: adjusted again it does not change, and other programs can read it."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Solves problems on several devices and processes, and prints what it found as JSON.
+"""Solves problems on several devices and processes, and prints the results as JSON.
 
     python sharded_run.py DEVICES PROBLEMS [PROCESSES ID PORT [SIGNAL]]
 

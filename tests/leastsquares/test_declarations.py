@@ -1,4 +1,4 @@
-"""What is declared is checked before anything is computed: the message names what is wrong."""
+"""Declarations are checked before anything is computed: the message names the error."""
 
 import numpy as np
 import pytest

@@ -29,7 +29,7 @@ from jaxbundle.leastsquares.indexing.rows import lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import minimise
 from jaxbundle.leastsquares.problem import (
-    given_data,
+    complete_data,
     make_problem,
     make_solver,
     without_filling,
@@ -164,7 +164,7 @@ def residuals(problem, values, data):
 
 def after(problem, values):
     """A change of all unknowns in one vector -> the tables; and which of them are free."""
-    padded = given_data(problem, dataclasses.replace(problem.data, start=values)).start
+    padded = complete_data(problem, dataclasses.replace(problem.data, start=values)).start
     zero, unravel = ravel_pytree(zero_tangent(problem.plan))
     free = ravel_pytree({name: g.free for name, g in problem.plan.groups.items()})[0]
     moved = lambda x: retract(problem.declared, problem.plan, padded, unravel(x * free))
@@ -174,7 +174,7 @@ def after(problem, values):
 @pytest.mark.parametrize("name", ["a point held", "photographs"])
 def test_hessian_is_that_of_the_dense_cost(name):
     problem = made(name)
-    data = given_data(problem, None)
+    data = complete_data(problem, None)
     moved, zero, free = after(problem, problem.data.start)
     cost = lambda x: 0.5 * jnp.sum(residuals(problem, moved(x), problem.data) ** 2)
 
@@ -231,7 +231,7 @@ def scalar_of(problem, values, data):
     """S, a scalar of all values of the solution."""
     random = np.random.default_rng(5)
     factors = jax.tree.map(lambda x: random.normal(size=x.shape), problem.data.start)
-    padded = given_data(problem, data)
+    padded = complete_data(problem, data)
     solution = attach_derivatives(problem.declared, problem.plan, values, padded)
     found = without_filling(problem, solution)
     return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, found)))
@@ -253,7 +253,7 @@ def program(name):
 
 
 def minimum(problem, data):
-    data = given_data(problem, data)
+    data = complete_data(problem, data)
     return find_minimum(make_solver(problem, atol=1e-7), data, data.start).values
 
 
@@ -332,7 +332,7 @@ def dense(problem, values, data):
     J = np.asarray(J)[:, free]
     if problem.plan.datum is None:
         return J, np.zeros((J.shape[1], 0))
-    padded = given_data(problem, dataclasses.replace(data, start=values)).start
+    padded = complete_data(problem, dataclasses.replace(data, start=values)).start
     flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
 
     @jax.jit
@@ -380,7 +380,7 @@ def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
     def points(measured, start, weight):
         start = data.start | {"point": start}
         given = dataclasses.replace(data, measured=(measured,), weight=(weight,), start=start)
-        given = given_data(problem, given), "gauss-newton"
+        given = complete_data(problem, given), "gauss-newton"
         moved = attach_derivatives(problem.declared, problem.plan, solution, *given)
         return (without_filling(problem, moved)["point"].ravel(),) * 2
 

@@ -1,4 +1,5 @@
-"""A problem that is no network: a levelling net, a height held or none, against dense algebra."""
+"""A problem other than a bundle: a levelling net, with a held height or without, against dense
+algebra."""
 
 import numpy as np
 import pytest

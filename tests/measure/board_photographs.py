@@ -1,4 +1,4 @@
-"""Photographs of a chessboard as a person would take them, rendered, and as corners only."""
+"""Realistic photographs of a chessboard, rendered, and as corners only."""
 
 import numpy as np
 import render
@@ -10,7 +10,7 @@ PATTERN = render.chessboard(9, 6, 0.03)
 
 
 def poses(number, seed=0, turned=True, middle=(0.12, 0.075)):
-    """M and X0 of photographs from all around, near and far, some with the camera turned."""
+    """M and X0 of photographs from all around, near and far, some with a rolled camera."""
     rng = np.random.default_rng(seed)
     found = []
     for i in range(number):

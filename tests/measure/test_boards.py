@@ -1,4 +1,4 @@
-"""Boards in rendered photographs: where their points are, and which is which."""
+"""Boards in rendered photographs: positions and labels of their points."""
 
 import dataclasses
 from pathlib import Path
@@ -166,7 +166,7 @@ def test_reading_photographs(tmp_path):
     (tmp_path / "cut.png").write_bytes(whole[:40])
     for name, said in (
         ("missing.jpg", "no such file"), (".", "is a folder"), ("empty.jpg", "is empty"),
-        ("text.jpg", "not an image"), ("cut.png", "cut short"),
+        ("text.jpg", "not an image"), ("cut.png", "truncated"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=said):
             read_photograph(tmp_path / name)

@@ -12,7 +12,7 @@ SIZE, PITCH = (15333, 15200), (0.015, 0.0148)
 
 
 def scanned(noise=0.0, seed=0):
-    """Pixels of the marks in a scan that is turned, scaled and sheared a little."""
+    """Pixels of the marks in a slightly rotated, scaled and sheared scan."""
     rng = np.random.default_rng(seed)
     A = np.array([[66.61, 0.9], [0.7, -66.59]])
     return MARKS @ A.T + [7560.9, 7560.3] + noise * rng.normal(size=MARKS.shape)

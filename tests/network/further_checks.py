@@ -1,4 +1,4 @@
-"""What every further kind of observations is asked: Jacobians against differences, σ against a
+"""Checks of every further kind of observations: Jacobians against differences, σ against a
 sample."""
 
 import dataclasses
@@ -29,7 +29,7 @@ def check_jacobians(problem, values, skip=("image coordinates",)):
         along = [random.normal(size=s.width) for s in spaces]
 
         def moved(step, spaces=spaces, touched=touched, along=along, kind=kind, measured=measured):
-            blocks = [s.moved(s.prepare(x), tuple(step * d))
+            blocks = [s.move(s.prepare(x), tuple(step * d))
                       for s, x, d in zip(spaces, touched, along)]  # fmt: skip
             return jnp.stack(evaluate(kind, blocks, measured))
 

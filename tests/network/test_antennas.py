@@ -124,7 +124,7 @@ def test_residuals_at_the_truth_are_those_of_the_formula(flight):
 
 
 def test_they_are_simulated_as_the_formula_says(flight):
-    """Measured anew of the truth: what `measured` computes by hand, and with noise of their σ."""
+    """Measured again from the truth: as `measured` computes by hand, and with noise of their σ."""
     antennas, attitudes = measured(flight.truth, noise=0.0)
     by_hand = with_sensors(
         flight.network, antennas, attitudes, attitude={"boresight": list(TURN)},
@@ -160,7 +160,7 @@ def test_sigma_is_that_of_a_sample(flight, result):
 
 
 def test_free_shifts_leave_the_place_of_a_network_open(flight):
-    """No control, every strip with a shift: the scale and the turns are those of GNSS, the place is
+    """No control, every strip with a shift: scale and rotations are those of GNSS, the place is
     given by inner constraints; with a prior of the shifts nothing is open."""
     points = flight.network.points
     network = flight.network.replace(

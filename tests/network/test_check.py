@@ -14,7 +14,7 @@ from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
 from jaxbundle.network.check import check_network, split_check_points
 from jaxbundle.network.rules import check_camera
-from jaxbundle.network.sightings import connected_parts
+from jaxbundle.network.sightings import label_connected_parts
 from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block, cloud_of_targets
 
@@ -286,7 +286,7 @@ def test_connected_parts_of_long_strips():
     first, second = order[:1200], order[1200:]
     image = np.concatenate([first[:-1], first[1:], second[:-1], second[1:]])
     point = np.concatenate([np.arange(1199)] * 2 + [np.arange(1199, 1998)] * 2)
-    label = connected_parts(image, point, 2000, 1998)
+    label = label_connected_parts(image, point, 2000, 1998)
     assert set(label[first]) == {first.min()}
     assert set(label[second]) == {second.min()}
 

@@ -11,10 +11,10 @@ from network.further_checks import sample
 
 import jaxbundle
 from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
-from jaxbundle.bundle.minimum import solved
+from jaxbundle.bundle.minimum import inspect_solution
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_text
-from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
+from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, AnyDistance, derivative
 from jaxbundle.leastsquares.indexing.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.problem import pad_data, pad_values
 from jaxbundle.leastsquares.spaces import Vector
@@ -61,7 +61,7 @@ def moderate():
     for lengths in (None, LENGTHS):
         problem = prepared(network, lengths)
         problem, minimum = minimise_with_infinity(problem, problem.data.start, max_steps=50)
-        found.append(solved(problem, minimum))
+        found.append(inspect_solution(problem, minimum))
     return found
 
 
@@ -87,7 +87,7 @@ def _of_a_place(value, change):
     there = retracted(change)
     return (
         derivative(value), jax.jacfwd(retracted)(jnp.zeros(3))[:3],
-        jnp.stack(space.moved(space.prepare(value), tuple(change))), there,
+        jnp.stack(space.move(space.prepare(value), tuple(change))), there,
         space.difference(there, value),
     )  # fmt: skip
 
@@ -104,7 +104,7 @@ def test_a_step_beyond_infinity_ends_there():
     space, value = AnyDistance(), jnp.array([3.0, -2, 500, 2])
     u = value[:3] / jnp.linalg.norm(value[:3])
     there = space.retract(value, jnp.array([0.0, 0.0, -5.0]))
-    np.testing.assert_allclose(there[:3], FARTHEST * 2 * u, rtol=1e-12)
+    np.testing.assert_allclose(there[:3], LARGEST_DISTANCE * 2 * u, rtol=1e-12)
     back = space.retract(there, jnp.array([0.0, 0.0, 0.5]))
     assert 0 < jnp.linalg.norm(back[:3]) < 10 and back[:3] @ u > 0
 
@@ -206,13 +206,13 @@ def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
     problem, values = result.problem, result.values
     point = np.array(values.point)
     u = point[NEAR:] / np.linalg.norm(point[NEAR:], axis=1)[:, None]
-    point[NEAR:] = FARTHEST * LENGTHS[NEAR:, None] * u
+    point[NEAR:] = LARGEST_DISTANCE * LENGTHS[NEAR:, None] * u
     for start in (problem.data.start, dataclasses.replace(values, point=jnp.asarray(point))):
         again, minimum = minimise_with_infinity(problem, start, max_steps=100)
         np.testing.assert_array_equal(
             at_infinity(again, minimum.values), at_infinity(problem, values)
         )
-        found = solved(again, minimum)
+        found = inspect_solution(again, minimum)
         np.testing.assert_allclose(found.vtpv, result.vtpv, rtol=1e-9)
 
 
@@ -227,7 +227,7 @@ def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
     rows = tables["point"][NEAR:]
 
     def vtpv(along):
-        X = jnp.stack([jnp.stack(space.moved(space.prepare(row), (0.0, 0.0, d)))
+        X = jnp.stack([jnp.stack(space.move(space.prepare(row), (0.0, 0.0, d)))
                        for row, d in zip(rows, along)])  # fmt: skip
         point = values.point.at[NEAR:].set(X)
         return _vtpv_of_images(problem, dataclasses.replace(values, point=point))
@@ -267,7 +267,7 @@ def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
 
 
 def test_start_values_of_a_horizon_are_found(horizon):
-    """Of nothing but image coordinates and a distance; most of its rays do not meet."""
+    """From image coordinates and one distance alone; most of the rays do not intersect."""
     network, _, result = horizon
     points, images = network.points, network.images
     blank = lambda x: np.full_like(x, np.nan)
@@ -285,7 +285,7 @@ def test_start_values_of_a_horizon_are_found(horizon):
 
 @pytest.mark.further
 def test_images_from_one_place_are_not_solved_by_points_at_infinity():
-    """A panorama determines no distance at all: that is said."""
+    """A panorama determines no distance at all; the message says so."""
     network, _ = simulated(np.full(FAR, 50.0))
     images = network.images
     position = np.tile(images.position[:1], (len(images), 1))

@@ -6,15 +6,15 @@ import numpy as np
 from adjustment_checks import NETWORKS, synthetic
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.indexing.indices import rounded
+from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.problem import pad_data
 
 
 def test_round_sizes_are_few_and_never_much_larger():
-    found = [rounded(n) for n in range(1, 5000)]
+    found = [round_up(n) for n in range(1, 5000)]
     assert all(n <= size <= max(n + 1, 1.125 * n) for n, size in enumerate(found, 1))
     assert found == sorted(found) and len(set(found)) < 16 + 8 * 9
-    assert rounded(0) == 0
+    assert round_up(0) == 0
 
 
 def test_networks_with_a_few_rays_less_share_their_programs():

@@ -76,7 +76,7 @@ def test_the_mounting_is_found(simulated, result):
 
 
 def test_in_a_batch(simulated, result, tmp_path):
-    """The line of a rig names its mountings, and the population has them."""
+    """The line of a rig names its mountings, and they are part of the population."""
     path = jaxbundle.write_project(mounted(simulated.network), tmp_path / "pair")
     row = network_row(str(path), max_iterations=100)
     of = row["further_unknowns"]["mounting"]["right of pair"]

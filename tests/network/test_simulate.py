@@ -364,7 +364,7 @@ GOOD = dict(noise=0.01, image_format=(24, 16))
         (dict(image_format=(24, 0)), "image_format is"),
         (dict(control=[99]), "control holds an index that is not among the 60 targets"),
         (dict(control=[1], check=[1]), "control point and a check point at once"),
-        (dict(control=[1], control_sigma=(0, 1, 1)), "must stand for all three axes or for none"),
+        (dict(control=[1], control_sigma=(0, 1, 1)), "must be given for all three axes or"),
         (dict(camera_of_station=[0, 0]), "camera_of_station must be 5 indices below 1"),
         (dict(max_incidence=1.0), "give normals"),
         (dict(datum="iner"), "datum must be one of"),

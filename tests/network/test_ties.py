@@ -92,7 +92,7 @@ def test_the_space_of_tied_numbers():
     value, change = np.array([5.0, 5.0, 1.0, 7.0]), np.array([0.5, -0.25])
     moved = np.asarray(space.retract(jnp.asarray(value), change))
     np.testing.assert_array_equal(moved, [5.5, 5.5, 0.75, 7.0])
-    np.testing.assert_array_equal(space.moved(tuple(value), tuple(change)), moved)
+    np.testing.assert_array_equal(space.move(tuple(value), tuple(change)), moved)
     np.testing.assert_array_equal(space.difference(moved, value), change)
     held = space.hold(jnp.asarray(moved), value, np.array([0.0, 1.0]))
     np.testing.assert_array_equal(held, [5.0, 5.0, 0.75, 7.0])

@@ -1,4 +1,4 @@
-"""Numbers in the wrong unit are told with the likely unit; what may be right is let through."""
+"""Numbers in the wrong unit are reported with the likely unit; plausible ones are accepted."""
 
 import dataclasses
 import re

@@ -21,7 +21,7 @@ from jaxbundle.network_design.aims import Aim, measure, smallest_redundancy, tas
 from jaxbundle.network_design.feasible import start_at
 from jaxbundle.network_design.pairs import make_pairs
 from jaxbundle.network_design.search import configuration, make_program
-from jaxbundle.network_design.variables import choose_variables, turned
+from jaxbundle.network_design.variables import choose_variables, turn_axis
 
 PAGE = (Path(__file__).parents[2] / "docs" / "design.md").read_text(encoding="utf-8")
 SIGMA = 0.002
@@ -29,7 +29,7 @@ SIGMA = 0.002
 
 @pytest.fixture(scope="module")
 def page():
-    """What the code of docs/design.md leaves behind."""
+    """The names defined by the code of docs/design.md."""
     names = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE, re.S):
         exec(code, names)
@@ -144,7 +144,7 @@ def test_gradient_against_differences(network, site):
 def test_a_station_turns_to_its_point():
     q = np.array([0.7, -0.1, 0.5, 0.3])
     for away in np.random.default_rng(0).standard_normal((5, 3)):
-        w, x, y, z = np.asarray(turned(q, away))
+        w, x, y, z = np.asarray(turn_axis(q, away))
         M = Rotation.from_quat([x, y, z, w]).as_matrix()
         np.testing.assert_allclose(M @ away / np.linalg.norm(away), [0, 0, -1], atol=1e-12)
 

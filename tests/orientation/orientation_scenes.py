@@ -45,6 +45,6 @@ def pairs(N, n, noise=0.0, seed=0, base=1.0, plane=False):
 
 
 def mahalanobis(difference, cofactor, noise):
-    """dᵀ·(σ²·Q)⁻¹·d of many items: χ² distributed if Q is honest."""
+    """dᵀ·(σ²·Q)⁻¹·d of many items: χ² distributed if Q is correct."""
     inverse = np.linalg.inv(cofactor)
     return np.einsum("ki,kij,kj->k", difference, inverse, difference) / noise**2

@@ -118,7 +118,7 @@ def test_control_seen_once_throughout(with_control):
 
 
 def test_a_strip_that_hangs_together_by_pairs():
-    """With few points in three images resection stops; a pair takes it on."""
+    """With few points in three images resection stops, and a pair continues."""
     simulation = block(1, 11, 130, control=())
     found = orient(bare(simulation.network))
     assert not found.images
@@ -306,7 +306,7 @@ def test_a_case_needs_no_start_values():
 
 
 def test_control_in_the_corners_of_a_block():
-    """No image sees control enough: pairs first, then onto the control."""
+    """No image sees enough control: pairs first, then the transformation to the control."""
     simulation = block()
     found = orient(bare(simulation.network))
     assert not found.images and not found.points and "given" in found.frame
@@ -316,7 +316,7 @@ def test_control_in_the_corners_of_a_block():
 
 
 def test_one_measurement_in_twenty_wrong(with_control):
-    """Most of what is wrong is left out with the start values, the rest by data snooping."""
+    """Most blunders are left out with the start values, the rest by data snooping."""
     network = bare(with_blunders(with_control.network, 0.05, 20.0))
     found = orient(network)
     assert not found.images
@@ -330,18 +330,19 @@ def test_one_measurement_in_twenty_wrong(with_control):
 
 
 def test_blunders_that_leave_least_squares_no_solution(with_control):
-    """With good start values, too, what contradicts them altogether goes before data snooping."""
+    """Even with good start values, observations that contradict them completely are removed before
+    data snooping."""
     spoilt = with_blunders(with_control.network, 0.05, 20.0)
     assert not adjust(spoilt).converged
     result = adjust(spoilt, snooping="pope")
     off = result.image_values[:, :3] - with_control.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
-    assert any("in contradiction to the start values" in warning for warning in result.warnings)
+    assert any("that contradict the start values" in warning for warning in result.warnings)
 
 
 def test_a_plane_without_control():
-    """And an image that cannot be placed: the answer is that without it."""
+    """With an image that cannot be placed: the result is that without it."""
     network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6))
     rays = network.observations
     keep = (rays.image != 4) | np.isin(rays.point, [10, 11])
@@ -350,7 +351,8 @@ def test_a_plane_without_control():
 
 
 def test_a_principal_distance_far_from_the_truth():
-    """What contradicts the one given, and is left out, comes back with the one adjusted."""
+    """Observations left out because they contradict the given one come back with the adjusted
+    one."""
     true = Camera("wide", "brown", {"c": 50.0, "K1": -2e-6})
     start = Camera("wide", "brown", {"c": 40.0}, free=("c", "x0", "y0", "K1"))
     near = dataclasses.replace(start, parameters={"c": 50.0})

@@ -32,7 +32,7 @@ def test_exact_points(orient):
 
 
 def test_noise_is_what_the_cofactors_say():
-    """Turns of the second camera: M = exp([δ]×)·M_true."""
+    """Rotations of the second camera: M = exp([δ]×)·M_true."""
     sigma = 2e-4
     xy1, xy2, M, b = pairs(N, n, sigma, seed=1)
     result = five(xy1, xy2)

@@ -23,7 +23,7 @@ N, n, GROSS, SIGMA = 20, 25, 10, 2e-4
 
 
 def spoilt(xy, seed=0):
-    """The first ten points anywhere in the image, off their place by 0.05 at least."""
+    """The first ten points anywhere in the image, wrong by at least 0.05."""
     rng = np.random.default_rng(seed)
     wrong = rng.uniform(-0.8, 0.8, (N, GROSS, 2))
     near = np.linalg.norm(wrong - xy[:, :GROSS], axis=2, keepdims=True) < 0.05

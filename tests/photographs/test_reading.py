@@ -1,4 +1,4 @@
-"""Photographs of every kind: pixels, and what their heads say."""
+"""Photographs of every kind: pixels and headers."""
 
 import struct
 import zlib
@@ -42,7 +42,7 @@ def test_pixels_of_a_turned_photograph_are_those_of_the_sensor(tmp_path):
 
 
 def test_photographs_of_any_size_but_what_cannot_be_decoded(tmp_path):
-    """Heads alone: the pixels are not there."""
+    """Headers without pixels."""
     def head(columns, rows):
         found = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
         chunk = lambda kind, data: (struct.pack(">I", len(data)) + kind + data
@@ -60,7 +60,7 @@ def test_files_cut_short(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "whole.jpg")
     content = (tmp_path / "whole.jpg").read_bytes()
     (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="cut.jpg: the file is cut short"):
+    with pytest.raises(InputError, match="cut.jpg: the file is truncated"):
         read_photograph(tmp_path / "cut.jpg")
     (tmp_path / "more.jpg").write_bytes(content + b"trailer \xff\xda")
     assert read_photograph(tmp_path / "more.jpg").shape == GREY.shape

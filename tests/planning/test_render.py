@@ -1,5 +1,5 @@
-"""Rendered photographs show what the truth says: every pixel's point, nothing through a hill, and
-the texture where it is to far below a pixel."""
+"""Rendered photographs agree with the truth: every pixel's point, nothing through a hill, and the
+position of the texture to far below a pixel."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -55,7 +55,7 @@ def table_of(rpc, size=(7, 7, 4), noise=0.0, seed=0):
 
 
 def smooth_image(lines=600, pixels=400, half=0.02, seconds=4.0):
-    """A scanner that turns evenly, over the orbit of `pushbroom_scenes`: nothing to jitter at."""
+    """A scanner that rotates evenly, over the orbit of `pushbroom_scenes`, without jitter."""
     t = np.arange(-6.0, 12.0)
     angles = np.stack([0.01 + 2e-4 * t, -0.1 + 3e-4 * t + 1e-5 * t**2, 0.02 - 1e-4 * t], 1)
     attitude = attitude_table(t, angles, method="spline", reference="orbit")

@@ -7,8 +7,13 @@ import pytest
 from pushbroom_scenes import PIXELS, above_a_plane, satellite
 from scipy.stats import chi2
 
-from jaxbundle.pushbroom.accuracy import circular_error, closed_form, drawn, propagated
-from jaxbundle.pushbroom.noise import Noise, disturbed, no_errors
+from jaxbundle.pushbroom.accuracy import (
+    circular_error,
+    closed_form,
+    propagate_accuracy,
+    simulate_accuracy,
+)
+from jaxbundle.pushbroom.noise import Noise, add_errors, zero_errors
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.trajectory import attitude_at
 
@@ -24,7 +29,7 @@ SOME = np.array([20.0, 300.0, 577.0]), np.array([3.0, 170.0, 398.0])
 def test_closed_form_of_a_level_camera(roll, pitch, yaw):
     image = eqx.tree_at(lambda i: i.optics.row, above_a_plane(c=20.0), 0.0)
     noise = Noise(attitude_bias=np.array([pitch, roll, yaw]))
-    found = propagated(image, Plane(), *LINE, noise)
+    found = propagate_accuracy(image, Plane(), *LINE, noise)
     view = 2 * np.arctan(0.05 * PIXELS / 2 / 20)
     expected = closed_form(1000, view, roll, pitch, yaw)
     np.testing.assert_allclose(found.overall, expected, rtol=3e-5)
@@ -41,8 +46,8 @@ NOISES = {
 def test_propagation_against_drawing(name):
     """RMS within 3 %, CE90, and covariances within four standard deviations, on the ellipsoid."""
     image, draws = satellite("lagrange", "slerp"), 6000
-    exact = propagated(image, Ground(), *SOME, NOISES[name])
-    found = drawn(image, Ground(), *SOME, NOISES[name], draws)
+    exact = propagate_accuracy(image, Ground(), *SOME, NOISES[name])
+    found = simulate_accuracy(image, Ground(), *SOME, NOISES[name], draws)
     np.testing.assert_allclose(found.rms, exact.rms, rtol=0.03)
     np.testing.assert_allclose(found.ce90, exact.ce90, rtol=0.04)
     scale = np.sqrt(np.einsum("nii,njj->nij", exact.covariance, exact.covariance))
@@ -53,7 +58,7 @@ def test_white_noise_is_averaged_between_the_rows():
     """Halfway between two rows, interpolation on the shortest way leaves σ/√2."""
     at_row, between = 60.0, 67.5  # rows every 0.1 s are 15 lines apart
     places = np.array([at_row, between, 300.0]), np.full(3, 200.0)
-    found = propagated(satellite(), Ground(), *places, Noise(attitude_white=1e-4))
+    found = propagate_accuracy(satellite(), Ground(), *places, Noise(attitude_white=1e-4))
     np.testing.assert_allclose(found.rms[1] / found.rms[0], np.sqrt(0.5), rtol=1e-3)
 
 
@@ -63,10 +68,10 @@ def test_errors_turn_angles_and_quaternions_alike():
     for turns in ("angles", "slerp"):
         image = satellite(turns=turns)
         table = image.trajectory.attitude.table
-        errors = no_errors(image)
+        errors = zero_errors(image)
         errors = errors._replace(attitude_white=errors.attitude_white.at[14].set(error))
         t = table.times[14]
-        images = image, jax.jit(disturbed)(image, errors)
+        images = image, jax.jit(add_errors)(image, errors)
         before, after = (np.array(at(i.trajectory.attitude, t)) for i in images)
         turn = before.T @ after
         np.testing.assert_allclose([turn[2, 1], turn[0, 2], turn[1, 0]], error, rtol=1e-2)

@@ -45,7 +45,7 @@ def test_ground_points_of_the_reference():
 
 
 def by_hand(isd, t):
-    """Position and rotation camera → body at t, as usgscsm and ALE go about it."""
+    """Position and rotation camera → body at t, as computed by usgscsm and ALE."""
     centre = isd["center_ephemeris_time"]
 
     def table(key):
@@ -119,7 +119,7 @@ def test_times_are_merged_and_orders_fall(tmp_path):
 
 def short(seconds, end="start"):
     """The older form of an ISD whose attitudes begin after the first line, or end before the last
-    one, by so many seconds; steps of 0.1 s."""
+    one, by this number of seconds; steps of 0.1 s."""
     isd = support_data(older=True)
     q = isd["sensor_orientation"]["quaternions"]
     if end == "start":

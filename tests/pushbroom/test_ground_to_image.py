@@ -70,7 +70,7 @@ CORRECTED = "hermite, angles in the orbit by splines, uneven times, light time, 
 # lagrange with slerp, there and back: test_csm, test_scanner_file
 CASES = {
     LINEAR: satellite("linear", "linear", 4, table_optics()),
-    # refraction, slow to compile here, is undone by `seen_point` alike: test_locate
+    # refraction, slow to compile here, is undone by `apparent_point` alike: test_locate
     CORRECTED: satellite("hermite", "angles", 4, times=LineTimes(
         jnp.float64(0), jnp.float64(0),
         jnp.asarray(PERIOD * (np.arange(LINES) + rng.uniform(-0.2, 0.2, LINES))),
@@ -84,7 +84,7 @@ SIZE = 5 * len(SOME_LINES) * len(SOME_PIXELS)
 
 
 def placed(image, X, earth=el.WGS84, most=1):
-    """`project_points` of few points [3, n], among others that are not looked at."""
+    """`project_points` of few points [3, n], among others that are ignored."""
     n = X.shape[1]
     found = project_points(
         image, make_search(image, earth), np.pad(X, [(0, 0), (0, SIZE - n)], "wrap"), most=most
@@ -117,7 +117,8 @@ def test_project_from_a_place_near_by():
 
 
 def rocking(size, period, angles=(0.0, 0.0, 0.0)):
-    """A camera above a plane that nods, so that the ground is seen forth, back, and forth again."""
+    """A pitching camera above a plane that sees the ground forwards, backwards, and forwards
+    again."""
     image = above_a_plane()
     t = np.arange(-0.1, 6.2, 0.02)
     nod = np.stack([size * np.sin(2 * np.pi * t / period), 0 * t, 0 * t], 1) + angles

@@ -30,10 +30,10 @@ from jaxbundle.pushbroom.corrections import (
     BORDERS,
     INDICES,
     Corrections,
+    apparent_direction,
+    apparent_point,
     earlier_earth,
-    refracted,
-    seen_direction,
-    seen_point,
+    refract,
     true_direction,
 )
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
@@ -151,19 +151,19 @@ def test_aberration_is_the_sum_of_velocities():
     np.testing.assert_allclose(np.linalg.norm(l), 1)
     sight = 299792458 * l + np.array(V)
     np.testing.assert_allclose(np.cross(sight / np.linalg.norm(sight), seen), 0, atol=1e-14)
-    again = np.array(jax.jit(seen_direction)(tuple(l), V))
+    again = np.array(jax.jit(apparent_direction)(tuple(l), V))
     np.testing.assert_allclose(np.cross(again / np.linalg.norm(again), seen), 0, atol=1e-14)
 
 
 def test_light_time_turns_the_earth():
-    """In an inertial frame light is straight, and the ground moves on while it travels."""
+    """In an inertial frame light travels in a straight line, and the ground moves meanwhile."""
     v = np.array([6378e3, 1e5, 2e5])
     seconds = 5e5 / 299792458
     turn = Rotation.from_rotvec([0, 0, EARTH_RATE * seconds])
     np.testing.assert_allclose(earlier_earth(tuple(v), 5e5), turn.apply(v), atol=1e-9)
 
 
-through_air = jax.jit(refracted)
+through_air = jax.jit(refract)
 
 
 def test_refraction_keeps_the_invariant_of_bouguer():
@@ -185,14 +185,14 @@ def sight(pose, corrections, slopes=(0.3, 0.1)):
 
 @partial(jax.jit, static_argnums=0)
 def back(corrections, P, V, X):
-    return seen_point(corrections, el.WGS84, P, V, X)
+    return apparent_point(corrections, el.WGS84, P, V, X)
 
 
 @pytest.mark.parametrize("name, least, most", [
     ("light_time", 0.3, 1.3), ("aberration", 10, 20), ("refraction", 0.01, 3),
 ])  # fmt: skip
 def test_size_and_inverse_of_corrections(name, least, most):
-    """`seen_point` undoes what the correction did to the ray."""
+    """`apparent_point` undoes what the correction did to the ray."""
     pose = pose_of(satellite(), 1.0)
     of = lambda corrections: np.array(sight(pose, corrections))
     corrections = Corrections(**{name: True})

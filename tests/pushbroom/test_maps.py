@@ -1,4 +1,4 @@
-"""Systems and grids of maps: across 180°, what is no map, what is too large."""
+"""Systems and grids of maps: across 180°, invalid maps, maps that are too large."""
 
 import numpy as np
 import pytest
@@ -47,5 +47,5 @@ def test_no_system_of_maps(crs, words):
 def test_a_map_that_is_too_large():
     x, y = np.array([0.0, 1.0]), np.array([0.0, 2.0])
     for size, most in ((1e-10, np.inf), (1e-3, 1e6)):
-        with pytest.raises(InputError, match="--spacing .* greater"):
+        with pytest.raises(InputError, match="--spacing .* larger"):
             grid_around(x, y, size, most)

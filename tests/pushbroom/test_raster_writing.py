@@ -1,4 +1,4 @@
-"""A disk that is full: the raster that is written is named with its disk, and nothing is left."""
+"""A full disk: the raster is named with its disk, and nothing is left behind."""
 
 import os
 
@@ -13,7 +13,7 @@ from jaxbundle.io.rasters import writing as raster_writing
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
-from jaxbundle.system.temporaries import put_off
+from jaxbundle.system.temporaries import defer
 
 
 def write(target):
@@ -24,7 +24,7 @@ def write(target):
 
 @pytest.mark.parametrize("cache", [64, 2**20], ids=["at closing", "at a block"])
 def test_a_full_disk_names_the_map_and_its_disk(tmp_path, capfd, cache):
-    """GDAL with a large cache writes when the file is closed, and swallows what fails then."""
+    """GDAL with a large cache writes when the file is closed, and ignores errors then."""
     target = tmp_path / "map.tif"
     target.write_text("the old one")
     with rasterio.Env(GDAL_CACHEMAX=cache), files_end_at(100_000):
@@ -57,7 +57,7 @@ def test_no_interrupt_waits_while_a_raster_is_written_or_verified(tmp_path, monk
 
         def noted(*arguments, **options):
             os.write(2, name.encode())
-            moments.append((name, put_off(lambda: None)))
+            moments.append((name, defer(lambda: None)))
             return work(*arguments, **options)
 
         monkeypatch.setattr(package, name, noted)

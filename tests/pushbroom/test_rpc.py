@@ -103,7 +103,7 @@ def test_second_derivatives_of_the_way_back():
 
 
 def test_a_line_of_sight_on_surfaces():
-    """Points on a height and a sloping terrain project back to where they came."""
+    """Points on a height and on sloping terrain project back to their origin."""
     line, sample, _ = r.project_points(RPC, *PLACES)
     line, sample = np.asarray(line), np.asarray(sample)
     east, north, h, status = r.locate_points_on(RPC, Height(350.0), line, sample)

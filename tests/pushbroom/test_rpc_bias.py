@@ -9,7 +9,7 @@ from rpc_scenes import made_up, places
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
 from jaxbundle.pushbroom.rpc import project_points
-from jaxbundle.pushbroom.rpc_bias import Bias, compensated, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc_bias import Bias, apply_bias, fit_bias, project_compensated
 from jaxbundle.pushbroom.rpc_fit import RpcTable
 
 RPC = made_up()
@@ -30,7 +30,7 @@ def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
     fit = fit_bias(RPC, control(bias), model=model)
     np.testing.assert_allclose(fit.bias.line, bias.line, atol=1e-9)
     np.testing.assert_allclose(fit.bias.sample, bias.sample, atol=1e-9)
-    rpc, check = compensated(RPC, fit.bias)
+    rpc, check = apply_bias(RPC, fit.bias)
     found = project_points(rpc, *PLACES)[:2]
     np.testing.assert_allclose(found, image(RPC, bias, *PLACES), atol=2e-3)
     assert (check is None) == (model == "shift")
@@ -38,7 +38,7 @@ def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
 
 
 def test_covariance_redundancy_and_tests_by_drawing():
-    """With σ of image and ground: unknowns scatter as told, w is standard normal, σ0 is 1."""
+    """With σ of image and ground: unknowns scatter as stated, w is standard normal, σ0 is 1."""
     rng, noise, ground = np.random.default_rng(1), 0.4, np.array([2.0, 1.0, 5.0])
     draws = 400
     base = control(BIAS)

@@ -50,7 +50,8 @@ def test_a_table_is_fitted(tmp_path, run):
 
 
 def test_a_scanner_is_fitted_as_well_as_its_wobble_allows(tmp_path, run):
-    """Its attitude sways by 1e-4 at 0.7 Hz: more than a pixel that no cubic follows; it is told."""
+    """Its attitude sways by 1e-4 at 0.7 Hz: more than a pixel that no cubic can follow; this is
+    reported."""
     scanner = write_scanner(tmp_path)
     status, out, err = run(
         "fit", scanner, "--heights", "0:1000", "--out", tmp_path / "a.RPB", "--json", "-"

@@ -19,7 +19,7 @@ from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.signals import signal
-from jaxbundle.pushbroom.simulate import Flight, measured_image, taken_image, true_image
+from jaxbundle.pushbroom.simulate import Flight, measured_image, take_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.terrain import make_terrain
 
@@ -95,7 +95,7 @@ def test_a_corrected_image_is_the_scene(tmp_path):
     values = pattern(*scene.centres(np.arange(900), np.arange(1000)))
     to_scene = lambda X: scene.place(X[0], X[1])
     taken = np.concatenate([
-        taken_image(truth, surface, jnp.asarray(values), to_scene, lines + np.arange(64.0), "cubic")
+        take_image(truth, surface, jnp.asarray(values), to_scene, lines + np.arange(64.0), "cubic")
         for lines in (0, 64)
     ], axis=1)  # fmt: skip
     assert np.isfinite(taken).all()
@@ -165,7 +165,7 @@ def test_a_satellite_image_in_utm(tmp_path):
     lines = np.arange(128.0)
     values = wave(*scene.centres(np.arange(scene.rows), np.arange(scene.columns)))[None]
     to_scene = lambda X: scene.place(*system.from_ground(X))
-    taken = taken_image(image, Ground(), jnp.asarray(values), to_scene, lines, "bilinear")
+    taken = take_image(image, Ground(), jnp.asarray(values), to_scene, lines, "bilinear")
     source = write_image(tmp_path / "image.tif", taken, "uint8")
     grid = map_of(image, Ground(), system, None)
     assert 40 < grid.size < 60
@@ -209,7 +209,7 @@ def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
 
 @pytest.mark.further
 def test_a_rough_trajectory_leaves_no_holes():
-    """Every pixel of the map that the search finds in the image is placed, and where it is found.
+    """Every pixel of the map that the search finds in the image is filled from where it is found.
 
     Attitudes change their course within the distance of two nodes.
     """

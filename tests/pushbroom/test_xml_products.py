@@ -40,7 +40,7 @@ def ground(P, d):
 
 
 def check_image(scanner, truth):
-    """Located and projected as the truth says, to a micrometre and a millionth of a pixel."""
+    """Locate and project agree with the truth to a micrometre and a millionth of a pixel."""
     found = np.asarray(locate(scanner.image, Ground(), *AT))
     expected = np.array([[truth(l, u) for u in AT[1]] for l in AT[0]]).transpose(2, 0, 1)
     np.testing.assert_allclose(found, expected, atol=1e-6)

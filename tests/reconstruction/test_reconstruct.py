@@ -14,7 +14,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.orientation.alignment import similarity
-from jaxbundle.reconstruction.parts import connected
+from jaxbundle.reconstruction.parts import group_connected
 from jaxbundle.reconstruction.photographs import assign_cameras, find_photographs
 from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.settings import Settings
@@ -58,7 +58,7 @@ def test_all_photographs_of_a_scene_are_placed_and_foreign_ones_left_out(made):
     assert set(part.adjustment.network.images.id) - same_file == set(truth) - same_file
     why = found.left_out
     assert set(why) - same_file == {"c0.png", "cut.png", "dull.png"}
-    assert "cut short" in why["cut.png"] and "no texture" in why["dull.png"]
+    assert "truncated" in why["cut.png"] and "no texture" in why["dull.png"]
     assert "the same file as" in why.get("again.png", why.get("a2.png"))
 
 
@@ -148,7 +148,7 @@ def test_two_scenes_by_the_positions_in_their_files(tmp_path):
 def test_groups_of_connected_photographs():
     empty = np.zeros((0, 2), int)
     pair = lambda i, j: Pair((i, j), empty, np.zeros(0), np.eye(3), np.zeros(3), 0.1, "relative", 9)
-    assert connected(6, [pair(4, 5), pair(0, 3), pair(5, 3)]) == [[0, 3, 4, 5], [1], [2]]
+    assert group_connected(6, [pair(4, 5), pair(0, 3), pair(5, 3)]) == [[0, 3, 4, 5], [1], [2]]
 
 
 def test_what_cannot_be_used_is_refused(tmp_path):

@@ -18,7 +18,7 @@ from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.trajectory import Trajectory
 from jaxbundle.refinement import FREE, Freedom, ScannerImage, local_points
-from jaxbundle.refinement.freedom import change_of, changed
+from jaxbundle.refinement.freedom import change_image, change_of
 
 LINES, PIXELS, PERIOD = 900, 800, 1 / 300
 """3 s, about 23 m a line."""
@@ -56,7 +56,7 @@ def ground(image, form, p, heights, places):
     """The ground points that places show, p the vector of the image's true changes."""
 
     def one(h, place):
-        moved = changed(image, form, change_of(form.sizes, p), image.times.time(place[0]))
+        moved = change_image(image, form, change_of(form.sizes, p), image.times.time(place[0]))
         return jnp.stack(locate_point(moved, Height(h, WGS84), *place))
 
     return jax.vmap(one)(heights, places)

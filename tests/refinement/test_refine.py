@@ -1,4 +1,5 @@
-"""Refinement: what was injected comes back, σ is honest, blunders are found, weakness is named."""
+"""Refinement: injected errors are recovered, σ is correct, blunders are found, weakness is
+named."""
 
 import dataclasses
 
@@ -25,7 +26,7 @@ from jaxbundle.network.tables import Observations
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.project import misclosure
 from jaxbundle.refinement import FREE, Freedom, refine, report, to_json
-from jaxbundle.refinement.freedom import make_form, of_one_size
+from jaxbundle.refinement.freedom import make_form, pad_forms
 from jaxbundle.refinement.kinds import ScannerPoint, lines_of
 
 BIAS, DRIFT = np.array([20.0, -30.0, 90.0]) * ARCSEC, np.array([5.0, -4.0, 30.0]) * ARCSEC
@@ -112,7 +113,7 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
 def test_the_residual_of_what_is_located_is_zero():
     switch = Corrections(True, True, True)
     image = satellite(switch)
-    form, = of_one_size([make_form(image, WGS84, FREEDOM)])
+    form, = pad_forms([make_form(image, WGS84, FREEDOM)])
     p = 1e-4 * np.random.default_rng(3).normal(size=sum(form.sizes))
     places, heights = np.array([[120.3, 600.2]]), np.array([350.0])
     X = ground(image, form, p, heights, places)

@@ -1,4 +1,4 @@
-"""The refine file and command: what is written is read again, what is wrong is said with row."""
+"""The refine file and command: round trips, and errors reported with their row."""
 
 import json
 
@@ -29,8 +29,8 @@ from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine
-from jaxbundle.refinement.freedom import change_of, changed, make_form
-from jaxbundle.refinement.refined import refined_image
+from jaxbundle.refinement.freedom import change_image, change_of, make_form
+from jaxbundle.refinement.refined_image import refined_image
 
 TEXT = """
 [refine]
@@ -139,7 +139,7 @@ def test_a_refined_image_is_read_as_it_was(tmp_path, kind):
     @jax.jit
     @jax.vmap
     def both(t, pixel):
-        of = read, changed(image, form, change, t)
+        of = read, change_image(image, form, change, t)
         return tuple(pose_at(one, t) for one in of), tuple(one.optics.slopes(pixel) for one in of)
 
     (got, true), slopes = both(t, pixel)

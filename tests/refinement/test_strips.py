@@ -1,4 +1,5 @@
-"""Two strips flown to and fro with one scanner, in a local frame: what they share is one."""
+"""Two strips flown in opposite directions with one scanner, in a local frame: shared unknowns are
+estimated once."""
 
 import dataclasses
 
@@ -65,7 +66,7 @@ def strips():
 
 @pytest.fixture(scope="module")
 def found(strips):
-    """With a coordinate of a control point that is wrong, and goes by data snooping."""
+    """With a wrong coordinate of a control point, which data snooping removes."""
     images, points, observations, X = strips
     wrong = points.X.copy()
     wrong[2, 1] += 3.0

@@ -21,7 +21,7 @@ from jaxbundle.network.tables import Camera, Distances, Images, Network, Observa
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.project import misclosure
 from jaxbundle.refinement import FREE, Freedom, adjusted_photographs, point_rows, refine
-from jaxbundle.refinement.freedom import change_of, changed, make_form, names
+from jaxbundle.refinement.freedom import change_image, change_of, make_form, names
 
 POINTS, CONTROL = 24, 8
 TIE = 3 * (POINTS - CONTROL)
@@ -116,7 +116,7 @@ def equations(case):
 
         def scanned(X, xy, S):
             t = one.image.times.time(xy[0])
-            image = changed(one.image, form, change, t)
+            image = change_image(one.image, form, change, t)
             return S @ misclosure(image, X, t, xy[1], one.earth) / SIGMA
 
         v = jax.vmap(scanned)(X[rays.point], jnp.asarray(rays.xy), jnp.asarray(S))

@@ -33,7 +33,7 @@ NAMES = ("cameras of two models", "everything given", "free", "minimal")
 
 @cache
 def both(name):
-    """The start values looked at in blocks, and dense with the cofactors of all unknowns."""
+    """The start values inspected in blocks, and dense with the cofactors of all unknowns."""
     dense = linearised(name)
     return Inspection(make(name), make(name).data.start), dense, dense.Q
 

@@ -1,4 +1,4 @@
-"""The population of a batch: distributions, outlying cameras, what parameters go with."""
+"""The population of a batch: distributions, outlying cameras, what parameters correlate with."""
 
 import json
 
@@ -13,7 +13,7 @@ CAMERAS = 200
 
 
 def rows():
-    """fx grows with the serial number by 0.02, k1 goes with nothing."""
+    """fx grows with the serial number by 0.02, k1 is correlated with nothing."""
     rng = np.random.default_rng(3)
     found = []
     for i in range(CAMERAS):

@@ -1,4 +1,4 @@
-"""What can be removed together, what cannot be told apart: rows and numbers, no photographs."""
+"""Joint removal and inseparable blunders: rows and numbers, no photographs."""
 
 import numpy as np
 

@@ -16,7 +16,7 @@ from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.compare import compare
 from jaxbundle.surface.dsm import NO_DATA, Dsm, make_dsm, write_dsm
-from jaxbundle.surface.filtering import drop_lonely, drop_weak, thin
+from jaxbundle.surface.filtering import drop_isolated, drop_weak, thin
 from jaxbundle.surface.orthophoto import orthophoto
 from jaxbundle.surface.point_files import read_cloud, write_cloud
 from jaxbundle.surface.stereo import StereoPair, stereo_pair
@@ -57,7 +57,7 @@ def test_lonely_and_weak_points_go(plane):
     lost = Cloud(far.X + [0, 0, 50], *(getattr(far, n) for n in
                  ("covariance", "rays", "image", "uv", "images", "colour")))  # fmt: skip
     both = merge([plane, lost])
-    kept = drop_lonely(both, limit=6.0)
+    kept = drop_isolated(both, limit=6.0)
     assert len(kept) > 0.97 * len(plane) and kept.X[:, 2].max() < 45
     assert len(drop_weak(plane, 0.06)) == len(plane) // 2
     assert set(drop_weak(plane, least_rays=3).rays) == {3, 4}

@@ -1,5 +1,5 @@
-"""Photographs and rasters as surfaces are given them: folders with masks beside, COLMAP models, the
-σ of orientations, colours, large rasters by blocks."""
+"""Inputs of surfaces: folders of photographs with masks, COLMAP models, the σ of orientations,
+colours, large rasters by blocks."""
 
 import dataclasses
 
@@ -21,7 +21,11 @@ from jaxbundle.surface import scanner_inputs
 from jaxbundle.surface.correlation import make_pyramid
 from jaxbundle.surface.inputs import find_photographs, read_views
 from jaxbundle.surface.intersection import intersect
-from jaxbundle.surface.orientation import by_orientation, is_uncertain, orientation_covariance
+from jaxbundle.surface.orientation import (
+    derivative_by_orientation,
+    is_uncertain,
+    orientation_covariance,
+)
 from jaxbundle.surface.views import FrameView
 
 ANGLES = np.array([[0.02, -0.1, 0.3], [-0.05, 0.12, 0.1], [0.1, 0.05, -0.2]])
@@ -99,7 +103,7 @@ def test_a_joint_covariance_of_orientations_and_camera_moves_points_as_it_says(t
 
 def test_the_derivative_by_the_orientation_is_that_of_the_projection():
     X = np.array([[0.3, 0.2, 0.1]])
-    B = by_orientation(views([SIGMA] * 3)[0], X)[0]
+    B = derivative_by_orientation(views([SIGMA] * 3)[0], X)[0]
     for j in range(6):
         both = []
         for sign in (1, -1):

@@ -1,5 +1,5 @@
-"""Rendered pairs: matches are where the truth is, heights as good as their σ say, and nothing is
-found where there is nothing to see."""
+"""Rendered pairs: matches agree with the truth, heights with their σ, and nothing is found where
+nothing is visible."""
 
 import numpy as np
 import pytest

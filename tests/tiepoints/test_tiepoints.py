@@ -27,7 +27,7 @@ def seen(X, X0, M):
 
 
 def pixels(xy, rng):
-    """What a camera with distortion sees, v down, with noise."""
+    """Pixels of a camera with distortion, v down, with noise."""
     x, y = xy[:, 0], -xy[:, 1]
     grown = 1 + K1 * (x**2 + y**2)
     u, v = F * x * grown + SIZE[0] / 2 - 0.5, F * y * grown + SIZE[1] / 2 - 0.5

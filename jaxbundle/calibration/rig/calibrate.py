@@ -18,7 +18,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.batch.epochs import FEWEST, contradicting, epoch_keys
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import kept_rays
@@ -31,7 +31,7 @@ from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.system.programs import compile_once
 
 
@@ -56,13 +56,13 @@ def calibrate_rig(
     """
     check_test(snooping, significance)
     if not isinstance(calibrations, Mapping):
-        raise InputError(f"calibrations are {shown(calibrations)}; expected a mapping from the "
+        raise InputError(f"calibrations are {show(calibrations)}; expected a mapping from the "
                          "name of each camera to its Calibration")  # fmt: skip
     if len(calibrations) < 2:
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
         if not isinstance(one, Calibration):
-            raise InputError(f"calibrations: {name!r} is {shown(one)}; expected the Calibration "
+            raise InputError(f"calibrations: {name!r} is {show(one)}; expected the Calibration "
                              "that calibrate returns for this camera")  # fmt: skip
         if not one.converged:
             why = one.adjustment.termination
@@ -78,7 +78,7 @@ def calibrate_rig(
     left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
     while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
         left_out += [(rig.epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                      "not of the same moment?") for e, rms in bad.items()]  # fmt: skip
+                      "not simultaneous?") for e, rms in bad.items()]  # fmt: skip
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
@@ -95,10 +95,10 @@ def require_solved(found: Result) -> Result:
     **Raises:** `NotSolvedError` where it is not solved."""
     if not found.converged:
         names = found.undetermined
-        what = f"; not determined: {some(names, 8, str)}" if names else ""
+        what = f"; not determined: {list_some(names, 8, str)}" if names else ""
         raise NotSolvedError(
             f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
-            "that share too few epochs, or photographs that are not of the same moment",
+            "that share too few epochs, or photographs that are not simultaneous",
             list(names),
         )  # fmt: skip
     return found

@@ -4,9 +4,9 @@ A point Y at the distance d from camera k is fixed in the frame
 
     "rig"       of the reference camera: mounting and interior orientation of camera k vary,
                 ray = R_k·(Y − b_k). This is what the rig is used for: points intersected from its
-                cameras. Of the reference camera there is no mounting.
+                cameras. The reference camera has no mounting.
     "camera"    of camera k itself, the interior orientation alone
-    "rotation"  of camera k, the rotation that moves the images least taken off
+    "rotation"  of camera k, without the rotation that moves the images least
 
 with the covariance of the common adjustment, as `jaxbundle.statistics.projection` for one camera.
 """
@@ -42,7 +42,7 @@ def _slopes(model, p, mounting: PoseValue, xy, nearness):
         ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
 
         def image(change, p):
-            moved = space.moved(block, (*(nearness * change[:3]), *change[3:]))
+            moved = space.move(block, (*(nearness * change[:3]), *change[3:]))
             return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
 
         return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)

@@ -18,7 +18,7 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
-from jaxbundle.display import shows_itself
+from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
@@ -31,7 +31,7 @@ POSE = Pose.width
 DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
 
 
-@shows_itself
+@print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Mounting:
     """The mounting of a camera in the frame of the reference camera.
@@ -276,7 +276,7 @@ def _to_angles(mounting: PoseValue):
     block = Pose().prepare(mounting)
     R = block.rotation.matrix()
     given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
-    change = lambda d: exterior(Pose().moved(block, tuple(d)), given)
+    change = lambda d: exterior(Pose().move(block, tuple(d)), given)
     return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
 
 

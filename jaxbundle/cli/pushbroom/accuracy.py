@@ -52,7 +52,7 @@ def accuracy(
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
     from jaxbundle.cli.pushbroom.places import places
     from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, surface_of, write_rows
-    from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
+    from jaxbundle.pushbroom.accuracy import ground_errors, propagate_accuracy, simulate_accuracy
     from jaxbundle.pushbroom.noise import Noise
     from jaxbundle.pushbroom.terrain import Terrain
 
@@ -90,11 +90,11 @@ def accuracy(
             raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
         if isinstance(surface, Terrain):
             raise InputError("--dem: use --height with σ; terrain has no reverse mode")
-        found = propagated(file.image, surface, line, pixel, noise)
+        found = propagate_accuracy(file.image, surface, line, pixel, noise)
         columns |= {"rms": found.rms, "ce90": found.ce90}
         head = {"rms": found.overall, "ce90": found.overall_ce90}
         if draws:
-            counted = drawn(file.image, surface, line, pixel, noise, draws, seed)
+            counted = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
             columns |= {"drawn_rms": counted.rms, "drawn_ce90": counted.ce90}
             head |= {
                 "drawn_rms": counted.overall, "drawn_ce90": counted.overall_ce90, "draws": draws

@@ -8,7 +8,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.network.columns import Columns, did_you_mean
 
 CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
-TOLD = ("id", "line", "pixel", "count", "status")
+OUTPUT_COLUMNS = ("id", "line", "pixel", "count", "status")
 """Further columns written by `locate` and `project`: their tables are accepted as input."""
 
 
@@ -34,16 +34,16 @@ def points_of(table: Columns, earth: Ellipsoid | None) -> np.ndarray:
     cartesian = "X" in table.values
     if not cartesian and not any(name in table.values for name in GEOGRAPHIC[:2]):
         expected = (*CARTESIAN, *GEOGRAPHIC)
-        odd = next((name for name in table.values if name not in TOLD), "")
+        odd = next((name for name in table.values if name not in OUTPUT_COLUMNS), "")
         raise InputError(
             f"{table.source.name}: no columns {', '.join(CARTESIAN)} nor {', '.join(GEOGRAPHIC)}"
             f"{did_you_mean(odd, expected, listing=False)}"
         )
     if cartesian:
-        table.check_names(CARTESIAN, (*GEOGRAPHIC, *TOLD))
+        table.check_names(CARTESIAN, (*GEOGRAPHIC, *OUTPUT_COLUMNS))
         return np.stack([table.numbers(n, required=True) for n in CARTESIAN])
     if earth is None:
         raise InputError(f"{table.source.name}: a local frame has no longitudes; give X, Y, Z")
     check_spheroid(earth)
-    table.check_names(GEOGRAPHIC, TOLD)
+    table.check_names(GEOGRAPHIC, OUTPUT_COLUMNS)
     return np.array(earth_fixed(earth, geographic(table)))

@@ -8,7 +8,7 @@ import typer
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-OVER = "found beyond a place without height"
+BEYOND_GAP = "found beyond a place without height"
 
 
 @pushbroom.command(example="out/flight/scanner.toml --grid 3x3 --csv out/points.csv")
@@ -30,7 +30,7 @@ def locate(
     import jax
     import numpy as np
 
-    from jaxbundle.cli.pushbroom.places import OFF, off_image, places
+    from jaxbundle.cli.pushbroom.places import OFF_IMAGE, off_image, places
     from jaxbundle.cli.pushbroom.shared import (
         keep_inputs,
         open_scanner,
@@ -76,5 +76,6 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    columns["status"] = np.select([off, missed, over], [OFF, reason, OVER], "found").tolist()
+    reasons = [OFF_IMAGE, reason, BEYOND_GAP]
+    columns["status"] = np.select([off, missed, over], reasons, "found").tolist()
     write_rows(columns, csv, json, {"scanner": file.name})

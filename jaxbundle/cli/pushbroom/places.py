@@ -10,8 +10,8 @@ from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 
-OFF = "off the image"
-TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
+OFF_IMAGE = "off the image"
+OUTPUT_COLUMNS = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
 """Further columns written by `locate` and `project`: their tables are accepted as input."""
 
 
@@ -31,7 +31,7 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
         pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
         return (), lines, pixels, Source("grid", None, "place")
     table = read_csv(points)
-    table.check_names(("line", "pixel"), TOLD)
+    table.check_names(("line", "pixel"), OUTPUT_COLUMNS)
     line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
     ids = table.ids("id") if "id" in table.values else ()
     return ids, line, pixel, table.source
@@ -51,7 +51,7 @@ def off_image(
         if outside.any() and said is None:
             row = int(outside.argmax())
             said = (
-                f"{source(row)}: {name} {values[row]:g} is {OFF}, which has {size}; -0.5 to "
+                f"{source(row)}: {name} {values[row]:g} is {OFF_IMAGE}, which has {size}; -0.5 to "
                 f"{size - 0.5:g} is expected"
             )
         off |= outside

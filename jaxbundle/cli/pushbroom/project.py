@@ -8,7 +8,7 @@ import typer
 from jaxbundle.cli.pushbroom.app import Csv, Json, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-MOST = 4
+MOST_LINES = 4
 """Largest number of lines reported for one point."""
 
 
@@ -33,7 +33,7 @@ def project(
     file = open_scanner(scanner)
     table = with_points(read_csv(points))
     X = points_of(table, file.earth)
-    found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST)
+    found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST_LINES)
     line, pixel = np.asarray(found.line), np.asarray(found.pixel)
     status, count = np.asarray(found.status), np.asarray(found.count)
     if (status != Status.SEEN).all():
@@ -48,7 +48,8 @@ def project(
             f"{table.source(first)}: not in the image but {Status(int(status[first])).meaning} "
             f"({len(unseen)} of {len(status)} points)"
         )
-    solution, point = np.nonzero(~np.isnan(line) | ((np.arange(MOST) == 0)[:, None] & (count == 0)))
+    first = (np.arange(MOST_LINES) == 0)[:, None]
+    solution, point = np.nonzero(~np.isnan(line) | (first & (count == 0)))
     order = np.lexsort((solution, point))
     solution, point = solution[order], point[order]
     ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(status))]

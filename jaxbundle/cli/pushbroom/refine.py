@@ -25,7 +25,14 @@ def refine(
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images with control and tie points."""
-    from jaxbundle.cli.outputs import PAGE, REPORT, RESULT, check_writable, trace_files, written
+    from jaxbundle.cli.outputs import (
+        PAGE,
+        REPORT,
+        RESULT,
+        check_writable,
+        trace_files,
+        write_result,
+    )
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project
     from jaxbundle.io.results.result_json import without_nan
@@ -56,7 +63,7 @@ def refine(
     text, document = report(result), without_nan(to_json(result))
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     page = partial(compose_refinement, result, origin)
-    with written(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
+    with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
         if new is not None:
             for one in file.images:
                 write_scanner_image(new, one.id, result.image(one.id), one.earth)

@@ -13,7 +13,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 rpc = Application(help="Rational polynomial coefficients (RPC00B).")
 pushbroom.add_typer(rpc, name="rpc")
 
-ENOUGH = 0.5
+LARGEST_RESIDUAL = 0.5
 """A fit with larger residuals, in pixels, is reported."""
 GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
@@ -70,7 +70,7 @@ def fit(
         )
     write_rpc(out, found.rpc)
     largest = max(found.check.largest.max(), *(v for k, v in head.items() if "largest" in k), 0.0)
-    if largest > ENOUGH:
+    if largest > LARGEST_RESIDUAL:
         warn(
             f"{source}: residuals up to {largest:.3g} pixel: the coefficients do not follow "
             "jitter faster than a cubic over the image; cut it into shorter pieces, or use the "
@@ -150,7 +150,7 @@ def compensate(
     from jaxbundle.cli.pushbroom.rpc_tables import figures_of, table_of
     from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
-    from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
+    from jaxbundle.pushbroom.rpc_bias import apply_bias, fit_bias
 
     # the tags of a raster may be replaced in place
     keep_inputs([control], out=out, csv=csv, json=json)
@@ -163,7 +163,7 @@ def compensate(
     found = fit_bias(
         given, table, model=model, sigma=sigma, ground_sigma=ground, source=columns.source
     )
-    changed, left = compensated(given, found.bias)
+    changed, left = apply_bias(given, found.bias)
     write_rpc(out, changed)
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]

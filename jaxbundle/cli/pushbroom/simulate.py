@@ -34,7 +34,7 @@ def simulate(
     from jaxbundle.io.scanner.flight import read_flight
     from jaxbundle.io.scanner.writing import names_of, write_scanner_image
     from jaxbundle.io.writing.fingerprints import files_read
-    from jaxbundle.io.writing.folders import check_folder, replaced_folder
+    from jaxbundle.io.writing.folders import check_folder, replace_folder
     from jaxbundle.pushbroom.simulate import measured_image, true_image
 
     kind = cast(Resampling, resampling)
@@ -49,7 +49,7 @@ def simulate(
     write = lambda folder, image: write_scanner_image(
         folder, NAME, image, given.earth, prefix="", angle_unit=unit
     )
-    with replaced_folder(out, COMMAND, names, force) as new:
+    with replace_folder(out, COMMAND, names, force) as new:
         path = write(new, measured)
         write(new / TRUTH, truth)
         if shown is not None:

@@ -23,11 +23,11 @@ from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.text.rows import Row, Rows
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import BoardViews
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 
 COLUMNS = ("filename", "x", "y")
 QUALITY = ("level", "weight")
-NOTHING = "-"
+NO_COORDINATE = "-"
 
 
 def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> BoardViews:
@@ -64,7 +64,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
     w, h = (int(n) for n in image_size)
     told = [f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
-            f"less precise: {some(reduced)}"] if reduced else []  # fmt: skip
+            f"less precise: {list_some(reduced)}"] if reduced else []  # fmt: skip
     return BoardViews(board, tuple(names), (w, h), xy,
                       tuple((name, "no board found") for name in failed), tuple(told))  # fmt: skip
 
@@ -78,12 +78,12 @@ def _legend(row: Row) -> list[str]:
 
 def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
-    if NOTHING in (given["x"], given["y"]):
+    if NO_COORDINATE in (given["x"], given["y"]):
         return np.nan, np.nan
     own = Row(row.path, row.number, f"{given['x']} {given['y']}")
     x, y = own.numbers(("x", "y"))
     for name in QUALITY:
-        if given.get(name, NOTHING) != NOTHING:
+        if given.get(name, NO_COORDINATE) != NO_COORDINATE:
             (value,) = Row(row.path, row.number, given[name]).numbers((name,))
             if value < 0 or (name == "weight" and value == 0):
                 return np.nan, np.nan

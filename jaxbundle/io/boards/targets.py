@@ -17,7 +17,7 @@ from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
@@ -33,16 +33,16 @@ def read_target(path: str | Path) -> Board:
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
     if kind == "aprilgrid":
-        columns, rows = (fields.whole(key, least=1) for key in ("tagCols", "tagRows"))
+        columns, rows = (fields.integer(key, least=1) for key in ("tagCols", "tagRows"))
         side, gap = fields.number("tagSize"), fields.number("tagSpacing")
         if not gap > 0:
             raise InputError(f"{path}: tagSpacing {gap:g}: a positive part of tagSize is expected")
         return Board(columns, rows, side * (1 + gap), kind, marker=side)
-    columns, rows = (fields.whole(key, least=1) for key in ("targetCols", "targetRows"))
+    columns, rows = (fields.integer(key, least=1) for key in ("targetCols", "targetRows"))
     if kind == "circlegrid":
         asymmetric = fields.get("asymmetricGrid", False)
         if asymmetric not in CIRCLES:
-            raise InputError(f"{path}: asymmetricGrid is {shown(asymmetric)}; True or False")
+            raise InputError(f"{path}: asymmetricGrid is {show(asymmetric)}; True or False")
         return Board(columns, rows, fields.number("spacingMeters"), CIRCLES[asymmetric])
     across, along = fields.number("rowSpacingMeters"), fields.number("colSpacingMeters")
     if across != along:

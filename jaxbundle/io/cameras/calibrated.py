@@ -62,7 +62,7 @@ def _calibrate(path, id, entry, about) -> Calibrated:
     free = [name for name, p in parameters.items() if p["free"]]
     sigma = np.array([float(parameters[name]["sigma"]) for name in free])
     known = entry["correlations"]
-    one = {name: _tied_to(name, parameters, known) for name in free}
+    one = {name: _find_tied(name, parameters, known) for name in free}
     R = np.array([
         [1.0 if one[a] == one[b] else float(known[one[a]][one[b]]) for b in free] for a in free
     ]).reshape(len(free), len(free))  # fmt: skip
@@ -71,7 +71,7 @@ def _calibrate(path, id, entry, about) -> Calibrated:
     return camera, (free, sigma[:, None] * R * sigma)
 
 
-def _tied_to(name: str, parameters, known) -> str:
+def _find_tied(name: str, parameters, known) -> str:
     """The parameter with the correlations of this one: itself, or the first of tied ones, such as
     fx and fy, with the same value and σ."""
     if name in known:

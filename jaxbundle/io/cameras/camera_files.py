@@ -71,7 +71,7 @@ def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     write_text(Path(path), cameras_text(cameras))
 
 
-def chosen_camera(cameras: Sequence[Camera], id: str | None, where: str) -> Camera:
+def choose_camera(cameras: Sequence[Camera], id: str | None, where: str) -> Camera:
     """The camera of this id, or the only one.
 
     **Raises:** `InputError` if there is none, or several and no id is given.

@@ -3,7 +3,7 @@
 A reader gives the formula of the camera, from rays to pixels. Points of a grid over the image get
 their rays by Newton's method; the parameters of each candidate are those that bring the images of
 these rays nearest to the points (`cameras.convert_fit`). The first candidate with differences below
-`GOOD` is taken, else the nearest.
+`GOOD_FIT` is taken, else the nearest.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import MEASURABLE
 from jaxbundle.cameras.convert_fit import (
     fit_parameters,
-    fitted,
+    fitted_parameters,
     image_grid,
     images_of,
     start_values,
@@ -36,20 +36,20 @@ Formula = Callable[..., Float[Array, "2"]]
 one: a function of JAX whose derivatives are finite on the axis, the same object for every camera of
 a kind (it is compiled once)."""
 
-GOOD = 0.05
+GOOD_FIT = 0.05
 """Pixels: a candidate this near is taken without trying the next."""
 ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
 ROUNDS, LONGEST = 60, 0.2
 """Newton's method for rays: rounds, and radians of its steps."""
-OPENCV = fitted(get_model("opencv"))
+OPENCV = fitted_parameters(get_model("opencv"))
 RATIONAL = (*OPENCV, "k4", "k5", "k6")
 PRISM = (*OPENCV, "s1", "s2", "s3", "s4")
 PERSPECTIVE = (("opencv", OPENCV), ("opencv", RATIONAL), ("opencv", PRISM),
                ("opencv", (*RATIONAL, *PRISM[-4:])),
-               ("brown-projected", fitted(get_model("brown-projected"))))  # fmt: skip
-FISHEYE = (("kannala-brandt", fitted(get_model("kannala-brandt"))),)
-NARROW = np.cos(np.radians(75))
+               ("brown-projected", fitted_parameters(get_model("brown-projected"))))  # fmt: skip
+FISHEYE = (("kannala-brandt", fitted_parameters(get_model("kannala-brandt"))),)
+NARROW_COSINE = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
 
 
@@ -90,7 +90,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         )
     uv, rays = uv[there], rays[there] * [1, -1, -1]
     source = get_model("kannala-brandt" if camera.fisheye else "opencv")
-    narrow = (-rays[:, 2] > NARROW).all()
+    narrow = (-rays[:, 2] > NARROW_COSINE).all()
     found, problem = [], ""
     for name, free in (*(FISHEYE if camera.fisheye else ()), *(PERSPECTIVE if narrow else ())):
         target = get_model(name)
@@ -107,7 +107,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         off = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
         largest = float(off.max()) if np.isfinite(off).all() else np.inf
         found.append((largest, float(np.sqrt(np.mean(off**2))), target, values))
-        if largest <= GOOD:
+        if largest <= GOOD_FIT:
             break
     if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
         raise NoPlaceError(f"{where}: no camera model fits it; {problem}")
@@ -128,7 +128,7 @@ class FittedCamera(Camera):
     told: str = ""
 
 
-def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
+def fit_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
     """The nearest of our cameras; `why` the original model has no equal here.
 
     **Raises:** `NoPlaceError`.
@@ -142,7 +142,7 @@ def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamer
     )  # fmt: skip
 
 
-def fits_told(cameras: Iterable[Camera]) -> tuple[str, ...]:
+def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:
     """Messages about the fitted cameras."""
     return tuple(camera.told for camera in cameras if isinstance(camera, FittedCamera))
 

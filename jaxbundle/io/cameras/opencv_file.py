@@ -43,12 +43,12 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import project
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera
 from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.io.networks.losses import size_of, the_rest_is_0
+from jaxbundle.io.networks.losses import check_others_zero, size_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.yaml_text import parse_yaml
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.file_content import beginning, parse_json
@@ -58,7 +58,7 @@ SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 OF_A_MESSAGE = b"distortion_model"
-"""Required beside a lone `k` in a message of ROS 2."""
+"""Required in addition to a lone `k` in a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 LENGTHS = (4, 5, 8, 12)
 FISHEYE = ("equidistant", "fisheye")
@@ -121,7 +121,7 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
     has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
     foreign = Foreign(FORMULAS[str(camera.model)], parameters, p, camera.image_size,
                       fisheye=camera.model == "kannala-brandt")  # fmt: skip
-    return fitted_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
+    return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
 
 
 def _image(name: str, p: Mapping, X, Y, Z):
@@ -182,7 +182,7 @@ def ros_text(camera: Camera) -> str:
     """
     fisheye = camera.model == "kannala-brandt"
     names = ("k1", "k2", "k3", "k4") if fisheye else ORDER[:8]
-    p, (w, h) = the_rest_is_0(camera, "ROS", names), size_of(camera, "ROS")
+    p, (w, h) = check_others_zero(camera, "ROS", names), size_of(camera, "ROS")
     rational = any(p[name] for name in names[5:])
     kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
     values = [p[name] for name in (names if fisheye or rational else names[:5])]
@@ -242,8 +242,8 @@ def _matrix(path: Path, entries: Mapping, names, shape):
         if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
             size = len(data) if isinstance(data, list) else "no"
             raise InputError(
-                f"{path}: {name} has {size} numbers for {shown(value.get('rows'))} rows and "
-                f"{shown(value.get('cols'))} columns"
+                f"{path}: {name} has {size} numbers for {show(value.get('rows'))} rows and "
+                f"{show(value.get('cols'))} columns"
             )
     else:
         data, given = value, None
@@ -279,7 +279,7 @@ def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
         given = size if isinstance(size, list) and len(size) == 2 else [None, None]
     width, height = (_whole(x) for x in given)
     if width is None or height is None:
-        raise InputError(f"{path}: the image size is {shown(given)}; two whole numbers expected")
+        raise InputError(f"{path}: the image size is {show(given)}; two whole numbers expected")
     return width, height
 
 

@@ -27,7 +27,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import (
     angles_of,
     matrices_of,
@@ -36,9 +36,9 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.networks.settings import apply_overrides, check_settings
 from jaxbundle.io.text.csv_tables import write_bytes
-from jaxbundle.io.text.unpacking import most_unpacked
+from jaxbundle.io.text.unpacking import largest_unpacked_size
 from jaxbundle.network.build import make_cameras, make_network
-from jaxbundle.network.columns import Columns, shown
+from jaxbundle.network.columns import Columns, show
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
@@ -138,7 +138,7 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
         case ".bz2":
             text = bz2.compress(text)
     write_bytes(path, text)
-    return what_is_lost(network, shared_cameras=True, names=True)
+    return describe_losses(network, shared_cameras=True, names=True)
 
 
 def _are_counts(words: Sequence[bytes]) -> bool:
@@ -172,7 +172,7 @@ def _numbers(path: Path):
             cameras, points, rows = counts
             expected = 4 * rows + 9 * cameras + 3 * points
             size = path.stat().st_size
-            held = most_unpacked(size) if suffix in OPENERS else size
+            held = largest_unpacked_size(size) if suffix in OPENERS else size
             most = min(NUMBER * (expected + 1), held)
             text = file.read(most + 1)
     except UNREADABLE as error:
@@ -209,8 +209,8 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
                 good = False
             if not good:
                 word = word.decode(errors="replace")
-                return InputError(f"{path}, line {line}: {shown(word)} where a number is expected")
-    return InputError(f"{path}: there is something between the numbers that is none")
+                return InputError(f"{path}, line {line}: {show(word)} where a number is expected")
+    return InputError(f"{path}: there is something other than numbers")
 
 
 def _images(pose) -> dict:

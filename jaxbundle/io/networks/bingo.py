@@ -35,7 +35,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import assemble, foreign_document
 from jaxbundle.io.text.rows import Row, Rows
-from jaxbundle.network.columns import Columns, did_you_mean, some
+from jaxbundle.network.columns import Columns, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 IMAGE, GEO = "image.dat", "geoin.dat"
@@ -102,7 +102,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )  # fmt: skip
     unseen = [row["id"] for row in points if row["id"] not in ids]
     if unseen:
-        network = network.warn(f"no photograph shows the points {some(unseen)}: left out")
+        network = network.warn(f"no photograph shows the points {list_some(unseen)}: left out")
     if skipped:
         network = network.warn(
             f"{', '.join(skipped)} of {files[GEO].name} are not read: the distortion starts at 0; "
@@ -166,7 +166,7 @@ def _geo_input(path: Path):
         else:
             raise row.error(
                 f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "
-                "take it out if the network does not need it"
+                "remove it if the network does not need it"
             )
     if not cameras:
         raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")
@@ -174,7 +174,7 @@ def _geo_input(path: Path):
 
 
 def _camera(row: Row) -> dict:
-    key = row.whole(1, "the key of CAPA")
+    key = row.integer(1, "the key of CAPA")
     if len(row) not in (6, 9):
         raise row.error("CAPA key CAMERA c xH yH [σc σx σy] is expected")
     values = row.numbers(INTERIOR, 3, more=True).tolist()

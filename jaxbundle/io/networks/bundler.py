@@ -25,12 +25,12 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.rows import Rows
-from jaxbundle.io.writing.replacing import replaced_files
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.io.writing.replacing import replace_files
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
 
@@ -57,7 +57,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if " ".join(head.words) != HEAD:
         raise head.error(f"{HEAD!r} is expected; other versions are not known")
     counts = rows.take("the numbers of cameras and points")
-    cameras, points = (counts.whole(k, what) for k, what in ((0, "cameras"), (1, "points")))
+    cameras, points = (counts.integer(k, what) for k, what in ((0, "cameras"), (1, "points")))
     interior, R, t, places = _cameras(rows, cameras)
     oriented = np.flatnonzero(interior[:, 0] != 0) if cameras else np.zeros(0, int)
     if not len(oriented):
@@ -69,7 +69,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     image = observed[:, 0].astype(np.int64)
     good = np.isin(image, oriented)
     left = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
-    warnings = [f"left out {count(len(left), 'image')} that have no orientation: {some(left)}"]
+    warnings = [f"left out {count(len(left), 'image')} that have no orientation: {list_some(left)}"]
     M, X0 = exterior_from_bundler(R[oriented], t[oriented])
     chosen = [names[i] for i in oriented]
     images = image_columns(Source(str(path), places[oriented], "line"), chosen, chosen, M, X0)
@@ -119,7 +119,7 @@ def _points(rows: Rows, number: int, cameras: int):
         rows.take(f"colour of {thing}")
         row = rows.take(f"rays of {thing}")
         given = row.all_numbers("a ray")
-        claimed = row.whole(0, f"the number of rays of {thing}")
+        claimed = row.integer(0, f"the number of rays of {thing}")
         if len(given) != 1 + 4 * claimed:
             raise row.error(
                 f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
@@ -175,10 +175,10 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     content: dict[Path, Sequence[str]] = {path: lines}
     if not numbered or names.is_file():  # an existing list would name the images
         content[names] = images.id
-    with replaced_files(*content) as temporary:
+    with replace_files(*content) as temporary:
         for place, text in zip(temporary, content.values()):
             place.write_bytes(("\n".join(text) + "\n").encode())
-    lost = what_is_lost(network, shared_cameras=True)
+    lost = describe_losses(network, shared_cameras=True)
     return lost if _from_zero(points.id) else (*lost, "names of points, which are numbered from 0")
 
 

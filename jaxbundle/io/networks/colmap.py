@@ -13,7 +13,7 @@ from jaxbundle.io.networks.colmap_text import (
     text_files,
 )
 from jaxbundle.io.text.csv_tables import write_bytes
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.tables import Camera, Network
 
 PARTS = ("cameras", "images", "points3D")
@@ -80,7 +80,7 @@ def write_colmap(
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
     """
-    with replaced_folder(folder, "write_colmap", FILES, force) as new:
+    with replace_folder(folder, "write_colmap", FILES, force) as new:
         return fill_colmap(network, new, text)
 
 

@@ -57,7 +57,7 @@ class _Bytes:
     def raw(self, size: int) -> bytes:
         part = self.data[self.position : self.position + size]
         if len(part) < size:
-            raise self.error(f"the file ends here, after {len(self.data)} bytes; it is cut off")
+            raise self.error(f"the file ends here, after {len(self.data)} bytes; it is truncated")
         self.position += size
         return part
 
@@ -78,7 +78,7 @@ class _Bytes:
     def name(self) -> str:
         end = self.data.find(b"\0", self.position)
         if end < 0:
-            raise self.error("the name has no end; the file is cut off")
+            raise self.error("the name is not terminated; the file is truncated")
         text = self.raw(end - self.position)
         self.position += 1
         try:

@@ -17,9 +17,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.networks.colmap_models import HALF, to_colmap
-from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
@@ -132,7 +132,7 @@ def _observations(path: Path, model: ColmapModel):
     xy = np.concatenate(xy) - HALF
     warnings = (
         f"left out {count(len(repeated), 'image point')} of object points that have another in "
-        f"the same image: {some(dict.fromkeys(repeated))}",
+        f"the same image: {list_some(dict.fromkeys(repeated))}",
     )  # fmt: skip
     columns = {"image": index, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
     source = Source(str(path), np.arange(1, len(xy) + 1), "image point")
@@ -161,7 +161,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
             number, camera_numbers[images.camera[i]], images.id[i], q[i], t[i],
             rays.xy[mine] + HALF, point_numbers[rays.point[mine]], f"image {images.id[i]!r}",
         ))  # fmt: skip
-    lost = what_is_lost(network)
+    lost = describe_losses(network)
     if list(point_numbers.astype(str)) != list(points.id):
         lost = (*lost, "names of points, which are numbered from 1")
     return ColmapModel(

@@ -46,12 +46,12 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.txt by number."""
     cameras: dict[int, Camera] = {}
     for row in Rows(path, "#"):
-        number = row.whole(0, "CAMERA_ID")
+        number = row.integer(0, "CAMERA_ID")
         if number in cameras:
             raise row.error(f"camera {number} occurs twice")
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
-        size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
+        size = [row.integer(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
         values = row.numbers(names, 4)
         cameras[number] = from_colmap(str(number), model, size, values)
     return cameras
@@ -78,7 +78,7 @@ def _images(path: Path) -> list[ColmapImage]:
         if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
             raise points.error("a POINT3D_ID is not a whole number")
         images.append(ColmapImage(
-            head.whole(0, "IMAGE_ID"), head.whole(8, "CAMERA_ID"), " ".join(head.words[9:]),
+            head.integer(0, "IMAGE_ID"), head.integer(8, "CAMERA_ID"), " ".join(head.words[9:]),
             pose[:4], pose[4:7], numbers[:, :2], numbers[:, 2].astype(np.int64),
             f"{path}, line {head.number}",
         ))  # fmt: skip
@@ -89,13 +89,13 @@ def _images(path: Path) -> list[ColmapImage]:
 def _points(path: Path, images: set[int]):
     ids, positions, lines = [], [], []
     for row in Rows(path, "#"):
-        ids.append(row.whole(0, "POINT3D_ID"))
+        ids.append(row.integer(0, "POINT3D_ID"))
         positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
         lines.append(row.number)
         if len(row) % 2:
             raise row.error("the track has an IMAGE_ID without its POINT2D_IDX")
         for k in range(8, len(row), 2):
-            if row.whole(k, "IMAGE_ID") not in images:
+            if row.integer(k, "IMAGE_ID") not in images:
                 raise row.error(f"the image {row.words[k]} of the track is not in images")
     source = Source(str(path), np.array(lines, np.int64), "line")
     check_unique(ids, source, "point")

@@ -53,7 +53,7 @@ from jaxbundle.io.networks.poses import angles_of, apply_in_batches, are_rotatio
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.rows import Rows
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.system.file_content import read_content
@@ -129,7 +129,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
             raise InputError(f"{where}: unknown key {key!r}{did_you_mean(key, KEYS)}")
     file, names = entry.get("file"), entry.get("columns")
     if not isinstance(file, str):
-        raise InputError(f"{where}: file is {shown(file)}; the name of a file is expected")
+        raise InputError(f"{where}: file is {show(file)}; the name of a file is expected")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
     more = bool(names) and names[-1] == REST
@@ -142,12 +142,12 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         if name not in used or name in IDS:
             raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
-            raise InputError(f"{where}: scale of {name} is {shown(factor)}; a number is expected")
+            raise InputError(f"{where}: scale of {name} is {show(factor)}; a number is expected")
     skip, decimal = entry.get("skip", 0), entry.get("decimal", ".")
     if isinstance(skip, bool) or not isinstance(skip, int) or skip < 0:
-        raise InputError(f"{where}: skip is {shown(skip)}; a number of lines is expected")
+        raise InputError(f"{where}: skip is {show(skip)}; a number of lines is expected")
     if decimal not in (".", ","):
-        raise InputError(f'{where}: decimal is {shown(decimal)}; "." or "," is expected')
+        raise InputError(f'{where}: decimal is {show(decimal)}; "." or "," is expected')
     texts: dict[str, list[str]] = {name: [] for name in used}
     lines = []
     for row in Rows(folder / file, _comment(where, entry), separator=_separator(where, entry)):
@@ -172,7 +172,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
 def _table(where: str, entry: Mapping, key: str) -> dict:
     value = entry.get(key, {})
     if not isinstance(value, dict):
-        raise InputError(f"{where}: {key} is {shown(value)}; a table such as {{ x = 1 }} expected")
+        raise InputError(f"{where}: {key} is {show(value)}; a table such as {{ x = 1 }} expected")
     return value
 
 
@@ -182,7 +182,7 @@ def _separator(where: str, entry: Mapping) -> str | None:
         return SEPARATORS[given]
     if not isinstance(given, str) or len(given) != 1:
         raise InputError(
-            f"{where}: separator is {shown(given)}; blanks, tab or one character is expected"
+            f"{where}: separator is {show(given)}; blanks, tab or one character is expected"
         )
     return given
 
@@ -190,7 +190,7 @@ def _separator(where: str, entry: Mapping) -> str | None:
 def _comment(where: str, entry: Mapping) -> str:
     given = entry.get("comment", "")
     if not isinstance(given, str):
-        raise InputError(f"{where}: comment is {shown(given)}; text is expected")
+        raise InputError(f"{where}: comment is {show(given)}; text is expected")
     return given
 
 

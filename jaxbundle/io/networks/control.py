@@ -23,7 +23,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.poses import angles_of, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
-from jaxbundle.network.columns import Columns, count, did_you_mean, shown, some
+from jaxbundle.network.columns import Columns, count, did_you_mean, list_some, show
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
 from jaxbundle.orientation.alignment import similarity
@@ -32,7 +32,7 @@ from jaxbundle.orientation.network import find_start_values
 PLAIN = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
 NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
-ELSEWHERE = 0.01
+LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
 
@@ -126,7 +126,7 @@ def _points(table: Columns) -> Points:
     sigma = np.stack([table.numbers(name, words=words) for name in POINT_SIGMAS], 1)
     for row, axis in np.argwhere(~(sigma > 0) & ~np.isnan(sigma))[:1]:
         raise InputError(
-            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {shown(sigma[row, axis])}; a positive "
+            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {show(sigma[row, axis])}; a positive "
             "number is expected, or nothing for a point that is held"
         )
     return Points(ids, roles, position, sigma, table.source)
@@ -145,7 +145,7 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     if not rows:
         raise InputError(
             f"{control.source.name}: none of its {len(control)} points is one of the network; it "
-            f"has {some(network.points.id)}"
+            f"has {list_some(network.points.id)}"
         )
     network = _in_the_frame_of(network, at, control.position[rows])
     points = network.points
@@ -165,10 +165,11 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     lost = [id for id in control.id if id not in index]
     warnings = []
     if dropped:
-        warnings.append(f"{count(len(dropped), 'control point')} of the input not in "
-                        f"{control.source.name} became tie points: {some(dropped)}")  # fmt: skip
+        points = count(len(dropped), "control point")
+        warnings.append(f"{points} of the input not in {control.source.name} became tie points: "
+                        f"{list_some(dropped)}")  # fmt: skip
     if lost:
-        warnings.append(f"{control.source.name}: no photograph shows the points {some(lost)}")
+        warnings.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
     return network.warn(*warnings)
 
 
@@ -184,7 +185,9 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
     source, target = source[known], target[known]
     found = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
-    if found is None or np.median(np.linalg.norm(source - target, axis=1)) <= ELSEWHERE * extent:
+    if found is None:
+        return network
+    if np.median(np.linalg.norm(source - target, axis=1)) <= LARGEST_OFFSET * extent:
         return network
     A, t = found
     scale = np.cbrt(np.linalg.det(A))
@@ -196,7 +199,7 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
         points=dataclasses.replace(points, position=position),
     ).warn(
         "the start values of the input are in another frame than the control: a similarity by "
-        f"{count(len(source), 'point')} took them there (scale {scale:.6g})"
+        f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
     )  # fmt: skip
 
 

@@ -26,15 +26,15 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.networks.losses import need_values, size_of, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.io.text.rows import Row, Rows
-from jaxbundle.io.writing.replacing import replaced_files
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.io.writing.replacing import replace_files
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Distances, Network, Source
 
 SUFFIX = ".phc"
-BESIDE = (".ior", ".eor", ".obc", ".scale")
+COMPANION_SUFFIXES = (".ior", ".eor", ".obc", ".scale")
 CAP = 0
 """The order of rotations ω, φ, κ."""
 NOT_ORIENTED = 1
@@ -56,7 +56,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    beside = {suffix: path.with_suffix(suffix) for suffix in BESIDE}
+    beside = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
     cameras = _cameras(beside[".ior"])
     images, angles, position, camera, told = _images(beside[".eor"])
     points, at, datum = _points(beside[".obc"])
@@ -131,7 +131,7 @@ def _images(file: Path):
         angles.append(values[3:])
         camera.append(row.words[1])
     told = [f"{count(len(other), 'image')} whose rotation is of another order than 0: without "
-            f"orientation: {some(other)}"] if other else []  # fmt: skip
+            f"orientation: {list_some(other)}"] if other else []  # fmt: skip
     return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, told)
 
 
@@ -175,7 +175,7 @@ def _rays(file: Path, points: dict | None):
     if not lines:
         raise InputError(f"{file}: there are no active image points")
     what = "left out {} of points that are not in .obc, or not active there: {}"
-    told = [what.format(count(len(unknown), "image point"), some(dict.fromkeys(unknown)))]
+    told = [what.format(count(len(unknown), "image point"), list_some(dict.fromkeys(unknown)))]
     return columns, lines, told if unknown else []
 
 
@@ -240,10 +240,10 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
             ))
         ],
     }  # fmt: skip
-    with replaced_files(*content) as temporary:
+    with replace_files(*content) as temporary:
         for place, lines in zip(temporary, content.values()):
             place.write_bytes("".join(f"{line}\n" for line in lines).encode())
-    lost = [what for what in what_is_lost(network)
+    lost = [what for what in describe_losses(network)
             if what not in ("distances", "σ of image points")]  # fmt: skip
     renamed = image_ids != list(images.id) or camera_ids != [c.id for c in network.cameras]
     return (*lost, *(("names of images and cameras, which are numbered",) if renamed else ()))

@@ -39,7 +39,7 @@ from jaxbundle.io.networks.assemble import (
     foreign_document,
     image_columns,
 )
-from jaxbundle.io.networks.losses import need_values, size_of, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
@@ -137,7 +137,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
     parameters = dict(zip((*core, *coefficients), map(float, (*values, *more))))
     return Camera(id, model, parameters,
-                  image_size=(size.whole("w", least=1), size.whole("h", least=1)))  # fmt: skip
+                  image_size=(size.integer("w", least=1), size.integer("h", least=1)))  # fmt: skip
 
 
 def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
         if mountings is not None and k:
             lines += ["  T_cn_cnm1:", *(f"  - {_list(row)}" for row in mountings[k - 1])]
     write_text(Path(path), "\n".join(lines) + "\n")
-    lost += [what for what in what_is_lost(network, rays=True) if what != Rigs.TABLE]
+    lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
     lost += ["points"] if len(network.points) else []
     own = any(camera.id != f"cam{k}" for k, camera in enumerate(network.cameras))
     return (*lost, *(["names of cameras"] if own else []))

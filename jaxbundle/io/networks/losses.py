@@ -35,7 +35,7 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
             )
 
 
-def what_is_lost(
+def describe_losses(
     network: Network, shared_cameras: bool = False, names: bool = False, rays: bool = False
 ) -> tuple[str, ...]:
     """Messages about parts of a network that formats of computer vision cannot hold.
@@ -62,7 +62,7 @@ def _numbered(*ids) -> bool:
     return all(list(names) == [str(k) for k in range(len(names))] for names in ids)
 
 
-def the_rest_is_0(camera: Camera, format: str, coefficients: Sequence[str]) -> dict[str, float]:
+def check_others_zero(camera: Camera, format: str, coefficients: Sequence[str]) -> dict[str, float]:
     """All parameters of a camera of one of the `PIXEL_MODELS`, for a format with some of the
     coefficients.
 

@@ -45,7 +45,7 @@ from jaxbundle.io.networks.metashape_camera import (
 )
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.xml_fields import number_in, read_xml
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Points, Source
 from jaxbundle.system.file_content import beginning
 
@@ -97,7 +97,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     document = foreign_document(path.stem, entries.values(), object_unit="m")
     if left:
         what = f"left out {count(len(left), 'camera')} that are disabled or not aligned"
-        told.append(f"{what}: {some(left)}")
+        told.append(f"{what}: {list_some(left)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
         datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
@@ -126,7 +126,7 @@ def _entries(path: Path, sensors: dict, used: Sequence[ET.Element]):
             raise error
         lost = [label_of(c) for c in used if c.get("sensor_id") == id]
         why = str(error).removeprefix(f"{path}, ")
-        told.append(f"{why}; left out {count(len(lost), 'camera')}: {some(lost)}")
+        told.append(f"{why}; left out {count(len(lost), 'camera')}: {list_some(lost)}")
     return entries, told
 
 

@@ -33,7 +33,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
 from jaxbundle.io.text.xml_fields import number_in
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
 OLD = ("fx", "fy", "skew")
@@ -58,7 +58,7 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     for name in (sensor.get("type", "frame"), kind):
         if name not in TYPES:
             raise NoPlaceError(
-                f"{where}: sensors of type {shown(name)} are not offered; these are: "
+                f"{where}: sensors of type {show(name)} are not offered; these are: "
                 f"{', '.join(TYPES)}"
             )
     size = calibration.find("resolution")
@@ -132,7 +132,7 @@ def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
     return pixel if min(pixel) > 0 else None
 
 
-def _published(kind: str, p: dict, X, Y, Z):
+def _project_metashape(kind: str, p: dict, X, Y, Z):
     """The manual's formula, from the centre of the first pixel."""
     if kind == "frame":
         x, y = X / Z, Y / Z
@@ -151,7 +151,7 @@ def _published(kind: str, p: dict, X, Y, Z):
     return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - 0.5
 
 
-FORMULAS = {kind: partial(_published, kind) for kind in TYPES}
+FORMULAS = {kind: partial(_project_metashape, kind) for kind in TYPES}
 
 
 def label_of(element: ET.Element) -> str:

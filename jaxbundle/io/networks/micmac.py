@@ -24,14 +24,14 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
-from jaxbundle.io.cameras.nearest_camera import fits_told
+from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
-from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.micmac_camera import C2M, M2C, calibration, calibration_lines, document
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.tables import Camera, Network, Source
 
 ORIENTATION, CALIBRATION = "Orientation-", "AutoCal_"
@@ -69,7 +69,7 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     images = image_columns(Source(str(path), None, "file"), names, used,
                            flip_rows(np.array(rotations)), np.array(centres))  # fmt: skip
     made = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
-    return assemble(path, made, overrides, images, warnings=fits_told(cameras.values()))
+    return assemble(path, made, overrides, images, warnings=fit_messages(cameras.values()))
 
 
 def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
@@ -120,7 +120,7 @@ def write_micmac(network: Network, folder: str | Path, force: bool = False) -> t
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
     """
-    with replaced_folder(folder, "write_micmac", FILES, force) as new:
+    with replace_folder(folder, "write_micmac", FILES, force) as new:
         return fill_micmac(network, new)
 
 
@@ -140,7 +140,7 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
         camera = network.cameras[images.camera[k]].id
         lines = _orientation(f"{CALIBRATION}{camera}.xml", C2W[k], images.position[k])
         write_text(folder / f"{ORIENTATION}{id}.xml", document(lines))
-    return (*what_is_lost(network, rays=True), *(("points",) if len(network.points) else ()))
+    return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
 
 
 def _orientation(file: str, C2W: np.ndarray, X0: np.ndarray) -> list[str]:

@@ -38,9 +38,9 @@ import jax.numpy as jnp
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera
 from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.io.networks.losses import one_focal_length, size_of, the_rest_is_0
+from jaxbundle.io.networks.losses import check_others_zero, one_focal_length, size_of
 from jaxbundle.io.networks.micmac_unified import unified_camera
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
@@ -110,7 +110,7 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
     size = int(w), int(h)
     if has:
         foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (PIXEL, PIXEL))
-        return fitted_camera(id, foreign, str(path), f"has {has}")
+        return fit_camera(id, foreign, str(path), f"has {has}")
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
     model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {PIXEL:g} mm"
@@ -203,7 +203,7 @@ def calibration_lines(camera: Camera) -> list[str]:
 
 
 def _of_opencv(camera: Camera) -> dict[str, float]:
-    p = the_rest_is_0(camera, "MicMac", ("k1", "k2", "k3", "p1", "p2"))
+    p = check_others_zero(camera, "MicMac", ("k1", "k2", "k3", "p1", "p2"))
     if camera.model != MODELS[0]:
         raise InputError(f"camera {camera.id!r}: a fisheye is not written for MicMac")
     f = one_focal_length(camera, "MicMac")

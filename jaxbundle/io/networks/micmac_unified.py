@@ -24,7 +24,7 @@ from functools import partial
 import jax.numpy as jnp
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera, root
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, root
 from jaxbundle.io.text.xml_fields import XmlFields, number_in
 
 FISHEYE_PARAMS = 24
@@ -58,7 +58,7 @@ def unified_camera(
         start |= {f"k{i}": V[1 + i] for i in (1, 2, 3, 4)}
     given = {**core, "V": jnp.array(V), "S": jnp.array(S)}
     foreign = Foreign(formula, given, start, size, (pixel, pixel), fisheye)
-    return fitted_camera(id, foreign, str(xml.path), f"is {kind}")
+    return fit_camera(id, foreign, str(xml.path), f"is {kind}")
 
 
 def _pinhole(p, X, Y, Z):
@@ -145,4 +145,4 @@ FORMULAS = {
     "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, FISHEYE_PARAMS),
     "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, FISHEYE_PARAMS),
 }  # fmt: skip
-"""Of a kind its formula, the number of its Etats, the number of its Params."""
+"""By kind: the formula, the number of Etats, the number of Params."""

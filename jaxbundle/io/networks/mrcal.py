@@ -38,7 +38,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
-from jaxbundle.io.cameras.nearest_camera import Foreign, fits_told, fitted_camera
+from jaxbundle.io.cameras.nearest_camera import Foreign, fit_camera, fit_messages
 from jaxbundle.io.networks.assemble import (
     all_parameters,
     assemble,
@@ -46,7 +46,7 @@ from jaxbundle.io.networks.assemble import (
     foreign_document,
     image_columns,
 )
-from jaxbundle.io.networks.losses import need_values, size_of, what_is_lost
+from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import (
     matrices_of,
     matrices_of_rotation_vectors,
@@ -54,7 +54,7 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network, Source
 
@@ -102,7 +102,7 @@ def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     return assemble(
         path, foreign_document(path.stem, map(entry_of, cameras), object_unit="m"), overrides,
         image_columns(Source(str(path), None, "file"), list(models), list(models), M, X0),
-        warnings=fits_told(cameras),
+        warnings=fit_messages(cameras),
     )  # fmt: skip
 
 
@@ -122,7 +122,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     kind = name.removeprefix(PREFIX)
     size = fields.array("imagersize", (2,))
     sizes = JsonFields(f"{fields.path}: imagersize", dict(zip("wh", size.tolist())))
-    w, h = sizes.whole("w", least=1), sizes.whole("h", least=1)
+    w, h = sizes.integer("w", least=1), sizes.integer("h", least=1)
     model, more = MODELS.get(kind, ("", CAHVOR if kind == "CAHVOR" else None))
     if knots := SPLINE.fullmatch(kind):
         model = "spline-{}x{}-{}".format(*knots.groups())
@@ -144,7 +144,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if p["alpha"] == 0 == p["beta"]:
         return Camera(id, "opencv", exact, image_size=(w, h))
     foreign = Foreign(cahvor, p, exact, (w, h))
-    return fitted_camera(id, foreign, str(fields.path), "is of CAHVOR with a separate axis")
+    return fit_camera(id, foreign, str(fields.path), "is of CAHVOR with a separate axis")
 
 
 def cahvor(p: Mapping, X, Y, Z):
@@ -194,7 +194,7 @@ def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tu
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
     """
-    with replaced_folder(folder, "write_mrcal", FILES, force) as new:
+    with replace_folder(folder, "write_mrcal", FILES, force) as new:
         return fill_mrcal(network, new)
 
 
@@ -212,7 +212,7 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
         write_text(folder / f"{name}{SUFFIX}", text)
-    lost = what_is_lost(network, shared_cameras=True, rays=True)
+    lost = describe_losses(network, shared_cameras=True, rays=True)
     return (*lost, *(("points",) if len(network.points) else ()))
 
 

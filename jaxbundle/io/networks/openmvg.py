@@ -46,16 +46,16 @@ from jaxbundle.io.networks.assemble import (
 )
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
+    check_others_zero,
+    describe_losses,
     need_values,
     one_focal_length,
     size_of,
-    the_rest_is_0,
-    what_is_lost,
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Network, Points, Source
 from jaxbundle.system.file_content import beginning
 
@@ -108,7 +108,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     views = {key: view for key, view in views.items() if key in posed or key in seen}
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
-    told = [f"left out {count(len(ids), 'view')} {why}: {some(ids)}" for ids, why in (
+    told = [f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}" for ids, why in (
         (left, "of spherical cameras or without intrinsics"),
         (lost, "without pose and image points"),
     ) if ids]  # fmt: skip
@@ -144,7 +144,7 @@ def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
     """The values of a list of keys and values."""
     found: dict[int, JsonFields] = {}
     for row in scene.rows(name):
-        key = row.whole("key")
+        key = row.integer("key")
         if key in found:
             raise InputError(f"{row.path}: key {key} occurs twice")
         found[key] = row.of("value")
@@ -166,7 +166,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
     names: dict[int, str] = {}
     cameras, spherical = {}, {}
     for key, value in _entries(scene, "intrinsics").items():
-        number = value.whole("polymorphic_id", ALIKE)
+        number = value.integer("polymorphic_id", ALIKE)
         if value.get("polymorphic_name") is not None:
             names[number % FIRST] = value.text("polymorphic_name")
         name = names.get(number % FIRST, "")
@@ -184,7 +184,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
         given = data.array(field, (len(coefficients),)).tolist() if field else ()
         cameras[key] = {
             "id": str(key), "model": model, "tie": [["fx", "fy"]],
-            "image_size": [data.whole("width", least=1), data.whole("height", least=1)],
+            "image_size": [data.integer("width", least=1), data.integer("height", least=1)],
             "fx": f, "fy": f, "cx": float(cx), "cy": float(cy), **dict(zip(coefficients, given)),
         }  # fmt: skip
     return cameras, spherical
@@ -192,7 +192,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
 
 def _sphere(key: int, data: JsonFields) -> dict:
     """The entry of a spherical camera."""
-    w, h = data.whole("width", least=1), data.whole("height", least=1)
+    w, h = data.integer("width", least=1), data.integer("height", least=1)
     f = max(w, h) / (2 * np.pi)
     return {"id": str(key), "model": "equirectangular", "image_size": [w, h], "fx": f, "fy": f,
             "cx": w / 2, "cy": h / 2}  # fmt: skip
@@ -203,7 +203,7 @@ def _views(scene: JsonFields, cameras: Mapping, spherical: Mapping):
     views, left = {}, []
     for key, value in _entries(scene, "views").items():
         view = _data(value)
-        camera = view.whole("id_intrinsic", NONE)
+        camera = view.integer("id_intrinsic", NONE)
         if camera in cameras:
             views[key] = view
         elif camera in spherical or camera == NONE:
@@ -228,7 +228,7 @@ def _images(
         if pose is not None:
             R[k], X0[k] = pose.array("rotation", (3, 3)), pose.array("center", (3,))
             check_rotations(R[k], f"{pose.path}: rotation")
-    cameras = [view.whole("id_intrinsic") for view in views.values()]
+    cameras = [view.integer("id_intrinsic") for view in views.values()]
     source = Source(str(path), np.array(list(views)), "view")
     R = mirror[:, None] * R * mirror
     return image_columns(source, list(names.values()), cameras, flip_rows(R), X0 * mirror)
@@ -240,7 +240,7 @@ def _structure(scene: JsonFields, name: str, views: Mapping):
     for key, value in _entries(scene, name).items():
         points[key] = value.get("X")
         for row in value.rows("observations"):
-            view = row.whole("key")
+            view = row.integer("key")
             if view in views:
                 rays.append((view, key, row.get("value.x")))
     return points, rays
@@ -304,7 +304,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
         "extrinsics": extrinsics, "structure": tables[0], "control_points": tables[1],
     }  # fmt: skip
     write_text(Path(path), json.dumps(scene, indent=1) + "\n")
-    lost = [what for what in what_is_lost(network) if not what.startswith("roles")]
+    lost = [what for what in describe_losses(network) if not what.startswith("roles")]
     lost += ["σ of control points, check points"] if held.any() or "check" in points.role else []
     return (*lost, *(("names of points",) if list(map(str, numbers)) != list(points.id) else ()))
 
@@ -335,7 +335,7 @@ def _intrinsic(camera: Camera) -> tuple[str, dict]:
     """The smallest kind that holds a camera, and its fields."""
     kinds = {n: (field, c) for n, (model, field, c) in KINDS.items() if model == camera.model}
     most = max((c for _, c in kinds.values()), key=len, default=())
-    p = the_rest_is_0(camera, "openMVG", most)
+    p = check_others_zero(camera, "openMVG", most)
     (w, h), f = size_of(camera, "openMVG"), one_focal_length(camera, "openMVG")
     name = next(n for n, (_, c) in kinds.items() if not any(p[k] for k in most if k not in c))
     field, names = kinds[name]

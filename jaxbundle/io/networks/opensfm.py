@@ -37,17 +37,17 @@ from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.cameras.nearest_camera import (
     Foreign,
     NoPlaceError,
-    fits_told,
-    fitted_camera,
+    fit_camera,
+    fit_messages,
     root,
 )
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.networks.losses import (
+    check_others_zero,
+    describe_losses,
     need_values,
     one_focal_length,
     size_of,
-    the_rest_is_0,
-    what_is_lost,
 )
 from jaxbundle.io.networks.poses import (
     matrices_of,
@@ -57,8 +57,8 @@ from jaxbundle.io.networks.poses import (
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.io.text.rows import Rows
-from jaxbundle.io.writing.folders import replaced_folder
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.io.writing.folders import replace_folder
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.further import Antennas
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
@@ -141,7 +141,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise next(iter(refused.values()), InputError(f"{file}: there are no shots"))
     if lost:
         why = "; ".join(str(error).removeprefix(f"{file}, ") for error in refused.values())
-        told.append(f"{why}; left out {count(len(lost), 'shot')}: {some(lost)}")
+        told.append(f"{why}; left out {count(len(lost), 'shot')}: {list_some(lost)}")
     gps = _positions(shots)
     points = scene.objects("points")
     at = stack_rows([p.get("coordinates") for p in points.values()], 3,
@@ -159,7 +159,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides, _images(file, shots),
         Columns({"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
                 Source(str(file), None, "point")),
-        rays, (*told, *fits_told(cameras.values())),
+        rays, (*told, *fit_messages(cameras.values())),
     )  # fmt: skip
     return network.replace(further=gps)
 
@@ -192,7 +192,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceErr
 def _camera(id: str, fields: JsonFields) -> Camera:
     """Our camera; **Raises:** `NoPlaceError` if no model fits."""
     kind = fields.text("projection_type", "perspective")
-    size = fields.whole("width", least=1), fields.whole("height", least=1)
+    size = fields.integer("width", least=1), fields.integer("height", least=1)
     if kind in SPHERICAL:
         f = max(size) / (2 * np.pi)
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
@@ -224,7 +224,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
             return Camera(id, model, core | p | exact, image_size=size)
         formula = _prism
     foreign = Foreign(formula, core | own, core, size, fisheye=True)
-    return fitted_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
+    return fit_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
 
 
 def _prism(p: Mapping, X, Y, Z):
@@ -324,7 +324,7 @@ def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
     """
-    with replaced_folder(folder, "write_opensfm", FILES, force) as new:
+    with replace_folder(folder, "write_opensfm", FILES, force) as new:
         return fill_opensfm(network, new)
 
 
@@ -353,7 +353,7 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
     write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
     rest = tuple(one for one in network.further if not any(one is m for m in measured))
-    return what_is_lost(network.replace(further=rest))
+    return describe_losses(network.replace(further=rest))
 
 
 def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable[str]:
@@ -381,7 +381,7 @@ def _camera_fields(camera: Camera) -> dict:
     """The fields of a camera, of the smallest kind that holds it."""
     kinds = {name: rest for name, (model, *rest) in KINDS.items() if model == camera.model}
     most = max((names for _, names in kinds.values()), key=len, default=())
-    p = the_rest_is_0(camera, "OpenSfM", most)
+    p = check_others_zero(camera, "OpenSfM", most)
     w, h = size_of(camera, "OpenSfM")
     s = max(w, h)
     c = [(p["cx"] - (w - 1) / 2) / s, (p["cy"] - (h - 1) / 2) / s]

@@ -21,7 +21,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.settings import apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import Columns, count, shown
+from jaxbundle.network.columns import Columns, count, show
 from jaxbundle.network.tables import Network, Source
 
 PHOTO = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
@@ -165,7 +165,7 @@ class _Parser:
         number, words = self.lines[self.next]
         if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
-                number, f"{shown(' '.join(words))} where the number of image points of {photo} is "
+                number, f"{show(' '.join(words))} where the number of image points of {photo} is "
                 "expected"
             )  # fmt: skip
         self.next += 1

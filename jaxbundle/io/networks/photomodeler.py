@@ -60,7 +60,7 @@ from jaxbundle.io.networks.photomodeler_points import Block, point_table, ray_ta
 from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.io.networks.settings import apply_overrides
 from jaxbundle.io.text.rows import Row, Rows
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
 
@@ -123,7 +123,7 @@ def _warnings(points: Columns, renumbered: str):
         yield renumbered
     lost = [id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)]
     if lost:
-        yield f"{count(len(lost), 'point')} without coordinates in the file: {some(lost)}"
+        yield f"{count(len(lost), 'point')} without coordinates in the file: {list_some(lost)}"
 
 
 def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[str]):
@@ -178,24 +178,24 @@ def _photos(rows: Rows, header) -> list[Photo]:
     photos: list[Photo] = []
     while rows.next_words():
         row = rows.take("a photograph")
-        number = row.whole(0, "the number of a photograph")
+        number = row.integer(0, "the number of a photograph")
         if any(photo.number == number for photo in photos):
             raise row.error(f"photograph {number} is in the file twice")
         name = row.text.split(None, 1)[1].strip() if len(row) > 1 else ""
-        outer = _numbered(rows, number, "orientation").numbers(OUTER, 1)
-        _numbered(rows, number, "σ of the orientation").numbers(OUTER, 1)
+        outer = _read_numbered(rows, number, "orientation").numbers(OUTER, 1)
+        _read_numbered(rows, number, "σ of the orientation").numbers(OUTER, 1)
         rows.take("covariances of the orientation or an empty line")
-        inner = photo_camera(_numbered(rows, number, "the camera"), header)
-        _numbered(rows, number, "σ of the camera").numbers(INNER, 1)
+        inner = photo_camera(_read_numbered(rows, number, "the camera"), header)
+        _read_numbered(rows, number, "σ of the camera").numbers(INNER, 1)
         photos.append(Photo(number, name or f"photo {number}", row.number, outer, *inner))
     if rows.more():
         rows.take("an empty line")
     return photos
 
 
-def _numbered(rows: Rows, number: int, what: str) -> Row:
+def _read_numbered(rows: Rows, number: int, what: str) -> Row:
     row = _take(rows, f"{what} of photograph {number}")
-    if row.whole(0, f"the number of the photograph before {what}") != number:
+    if row.integer(0, f"the number of the photograph before {what}") != number:
         raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
     return row
 
@@ -203,7 +203,7 @@ def _numbered(rows: Rows, number: int, what: str) -> Row:
 def _points(rows: Rows, what: str) -> Block:
     ids, values, lines = [], [], []
     for row in _block(rows):
-        ids.append(str(row.whole(0, f"the number of one of the {what}")))
+        ids.append(str(row.integer(0, f"the number of one of the {what}")))
         values.append(row.numbers(POINT, 1))
         lines.append(row.number)
     return Block(ids, np.array(values).reshape(-1, 6), lines)
@@ -212,12 +212,12 @@ def _points(rows: Rows, what: str) -> Block:
 def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
     ids, values, lines, photos = [], [], [], []
     for row in _block(rows):
-        photo = row.whole(0, "the number of a photograph")
+        photo = row.integer(0, "the number of a photograph")
         if photo not in names:
             raise row.error(f"photograph {photo} does not exist; there are {len(names)}, "
                             f"{min(names)} to {max(names)}")  # fmt: skip
         photos.append(photo)
-        ids.append(str(row.whole(1, "the number of a point")))
+        ids.append(str(row.integer(1, "the number of a point")))
         values.append(row.numbers(RAY, 2))
         lines.append(row.number)
     return Block(ids, np.array(values).reshape(-1, 4), lines, photos)

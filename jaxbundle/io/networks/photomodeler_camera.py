@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.io.text.rows import Row
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
 INNER = ("c", "xp", "yp", "xs", "ys", "K1", "K2", "K3", "P1", "P2")
@@ -83,7 +83,8 @@ def rounding_warnings(
         }  # fmt: skip
         coarse = {name: cost for name, cost in costs.items() if cost > LARGEST_ROUNDING}
         if coarse:
-            worst = some((f"{name} to {cost:.2g} px" for name, cost in coarse.items()), as_text=str)
+            costs = (f"{name} to {cost:.2g} px" for name, cost in coarse.items())
+            worst = list_some(costs, as_text=str)
             told.append(
                 f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
                 f"open {worst}; give more digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Source
 
 
@@ -59,7 +59,7 @@ def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
     return (
         f"{count(len(other), 'smart point')} had the id of another point and "
         f"{'was' if len(other) == 1 else 'were'} renumbered: "
-        f"{some((f'{id} is {new}' for id, new in other.items()), 3, str)}"
+        f"{list_some((f'{id} is {new}' for id, new in other.items()), 3, str)}"
     )
 
 

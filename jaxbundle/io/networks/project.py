@@ -42,7 +42,7 @@ from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, is_own
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.settings import (
-    NEEDED,
+    REQUIRED_TABLES,
     SETTINGS,
     TABLES,
     Document,
@@ -51,7 +51,7 @@ from jaxbundle.io.networks.settings import (
 )
 from jaxbundle.io.text.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
     IMAGE_COLUMNS,
@@ -155,7 +155,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
         columns = as_columns(document[key], table)
         return Columns(columns.values, Source(f"{path} [[{key}]]", None, "entry"))
     if file is None:
-        if table not in NEEDED:
+        if table not in REQUIRED_TABLES:
             return None
         raise InputError(
             f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
@@ -184,7 +184,7 @@ def write_project(
     (`jaxbundle.io.writing.folders`).
     """
     network, folder = require_network(network), Path(given_path("folder", folder))
-    with replaced_folder(folder, by, FILES, force) as new:
+    with replace_folder(folder, by, FILES, force) as new:
         fill_project(network, new)
     return folder / FILE_NAME
 
@@ -251,7 +251,8 @@ def _document_text(network: Network) -> str:
     lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
     settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
     further = among(network)
-    tables = [*NEEDED, *["distances"] * (len(network.distances) > 0), *(f.TABLE for f in further)]
+    distances = ["distances"] * (len(network.distances) > 0)
+    tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in further)]
     settings |= {table: f"{table}.csv" for table in tables}
     if not network.datum_points:
         del settings["datum_points"]

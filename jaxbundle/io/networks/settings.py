@@ -11,13 +11,13 @@ from typing import Any
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, did_you_mean, shown, some
+from jaxbundle.network.columns import Columns, did_you_mean, list_some, show
 from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import Network
 
-NEEDED = ("images", "points", "observations")
-TABLES = (*NEEDED, "distances", *KINDS)
+REQUIRED_TABLES = ("images", "points", "observations")
+TABLES = (*REQUIRED_TABLES, "distances", *KINDS)
 TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
 SETTINGS = (*TEXT, "sigma_image", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
@@ -74,7 +74,7 @@ def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     if not rest.startswith(f"{ALL}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
-            f"{some((f'camera.{id}.PARAMETER' for id in (*ids, ALL)), 12, str)}"
+            f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL)), 12, str)}"
         )
     for camera in cameras:
         _override_camera(camera, key, rest.removeprefix(f"{ALL}."), text)
@@ -93,7 +93,7 @@ def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
         sigma = camera.setdefault("sigma", {})
         if not isinstance(sigma, dict):
             raise InputError(
-                f"--set {key}: sigma of the camera is {shown(sigma)}; expected a table such as "
+                f"--set {key}: sigma of the camera is {show(sigma)}; expected a table such as "
                 "{ c = 0.1 }"
             )
         sigma[field.removeprefix("sigma.")] = _number(key, text)
@@ -110,7 +110,7 @@ def _override_section(document: Document, key: str, text: str) -> None:
     for section in sections:
         settings = settings.setdefault(section, {})
         if not isinstance(settings, dict):
-            raise InputError(f"--set {key}: {section} is {shown(settings)}; a table is expected")
+            raise InputError(f"--set {key}: {section} is {show(settings)}; a table is expected")
     words = _words(text)
     try:
         values = [float(word) for word in words]

@@ -24,13 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, fits_told, fitted_camera
+from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, fit_camera, fit_messages
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
-from jaxbundle.io.networks.losses import need_values, size_of, the_rest_is_0, what_is_lost
+from jaxbundle.io.networks.losses import check_others_zero, describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
-from jaxbundle.network.columns import count, some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
 
@@ -87,14 +87,14 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
         raise InputError(f"{path}: two frames have the file_path {twice!r}")
-    told = [f"{why}; left out {count(len(lost), 'frame')}: {some(lost)}"] if lost else []
+    told = [f"{why}; left out {count(len(lost), 'frame')}: {list_some(lost)}"] if lost else []
     undone = [name for name in UNDONE if file.get(name) is not None]
     if undone:
         told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
     images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
     return assemble(path, document, overrides, images,
-                    warnings=(*told, *fits_told(cameras.values())))  # fmt: skip
+                    warnings=(*told, *fit_messages(cameras.values())))  # fmt: skip
 
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
@@ -116,7 +116,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     model, names = MODELS[kind]
     size = None
     if fields.get("w") is not None or fields.get("h") is not None:
-        size = fields.whole("w", least=1), fields.whole("h", least=1)
+        size = fields.integer("w", least=1), fields.integer("h", least=1)
     fx = _focal_length(fields, "x", size and size[0], None)
     fy = _focal_length(fields, "y", size and size[1], fx)
     middle = (size[0] / 2, size[1] / 2) if size else (None, None)
@@ -130,7 +130,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if size is None:
         raise InputError(f"{fields.path}: w is missing; k4 is not 0: a fit needs the image size")
     foreign = Foreign(polynomial, core | given | {"k4": k4}, core | given, size)
-    return fitted_camera(id, foreign, str(fields.path), f"has k4 {k4:g}")
+    return fit_camera(id, foreign, str(fields.path), f"has k4 {k4:g}")
 
 
 def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float | None) -> float:
@@ -170,14 +170,14 @@ def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
     ]
     document = (fields[0] if one else {}) | {"frames": frames}
     write_text(Path(path), json.dumps(document, indent=1) + "\n")
-    return (*what_is_lost(network, rays=True), *(("points",) if len(network.points) else ()))
+    return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
 
 
 def _fields(camera: Camera) -> dict:
     fisheye = camera.model == "kannala-brandt"
     kind = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     names = MODELS[kind][1]
-    p = the_rest_is_0(camera, "nerfstudio", names)
+    p = check_others_zero(camera, "nerfstudio", names)
     w, h = size_of(camera, "nerfstudio")
     return {
         "camera_model": kind, "w": w, "h": h, "fl_x": p["fx"], "fl_y": p["fy"],

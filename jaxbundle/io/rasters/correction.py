@@ -21,15 +21,15 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
 
-REACH = 3
+MARGIN = 3
 """Pixels that resampling may require beyond the outermost position."""
-ROUND = 128
+WINDOW_STEP = 128
 """Windows of the image are widened to a multiple of this, or an eighth: few shapes to compile."""
 WINDOW = 2**22
 """Image values, of all bands, in memory for a part of a block."""
 BORDER = 33
 """Points along each border of the image that bound the map."""
-MOST = 10_000
+MOST_PIXELS = 10_000
 """Pixels of a map relative to those of the image: more indicate a wrong spacing."""
 
 _resample = compile_once(resample, 3)
@@ -62,13 +62,13 @@ def map_of(
         )
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():
-        raise InputError(f"coordinate system {system.crs}: it has no place for the image")
+        raise InputError(f"coordinate system {system.crs}: it is not defined where the image is")
     x = contiguous(system, x)
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
-    grid = grid_around(x, y, size, MOST * image.lines * image.pixels)
+    grid = grid_around(x, y, size, MOST_PIXELS * image.lines * image.pixels)
     # a line beyond the outermost centres, outside the border
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
@@ -125,7 +125,7 @@ def _values(bands, reading, image, places, resampling):
     for part, window in _parts(line, pixel, image, WINDOW / bands.count):
         with reading:
             seen = bands.read(window=window)
-        pad = [(0, -n % max(ROUND, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
+        pad = [(0, -n % max(WINDOW_STEP, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
         seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
         (top, _), (left, _) = window
         values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
@@ -142,7 +142,7 @@ def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
     if not np.isfinite(seen[0]).any():
         return
     window = tuple(
-        (max(int(np.nanmin(v)) - REACH, 0), min(int(np.nanmax(v)) + REACH + 1, size))
+        (max(int(np.nanmin(v)) - MARGIN, 0), min(int(np.nanmax(v)) + MARGIN + 1, size))
         for v, size in zip(seen, (image.lines, image.pixels))
     )
     side = part[0].stop - part[0].start

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
@@ -64,7 +64,7 @@ def write_image_raster(
     transform = rasterio().transform.Affine(
         steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
     )
-    with written_raster(
+    with write_raster(
         target, len(pixels), len(lines), len(bands), "float32", nodata=np.nan, transform=transform
     ) as raster:
         raster.write(np.stack(list(bands.values())).astype("float32"))

@@ -20,7 +20,7 @@ HEIGHTS = -12_000.0, 25_000.0
 """Metres: limits for the Earth with its sea floor, the Moon and Mars."""
 PLACES = 17
 """Lines and pixels of the lattice."""
-WIDER = 0.03
+MARGIN = 0.03
 """Margin on each side, relative to the size."""
 POLE = 85.0
 """Beyond this latitude, in degrees, all longitudes may be visible."""
@@ -71,7 +71,7 @@ def rpc_extent(rpc: Rpc) -> Extent | None:
 def _around(longitude, latitude):
     if np.abs(latitude).max() > POLE or np.ptp(longitude) > 180:
         return None
-    wider = WIDER * np.ptp(longitude), WIDER * np.ptp(latitude)
+    wider = MARGIN * np.ptp(longitude), MARGIN * np.ptp(latitude)
     return Extent(
         float(longitude.min() - wider[0]), float(latitude.min() - wider[1]),
         float(longitude.max() + wider[0]), float(latitude.max() + wider[1]),

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import as_type, rasterio
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
 
@@ -44,7 +44,7 @@ def write_map(
         map_.write(values, row, column)
 
     corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
-    with written_raster(
+    with write_raster(
         target, grid.columns, grid.rows, count, dtype, crs=system.text,
         nodata=np.nan if floating else 0, tiled=True, blockxsize=BLOCK, blockysize=BLOCK,
         transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),

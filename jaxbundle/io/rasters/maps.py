@@ -17,7 +17,7 @@ from jaxbundle.system.programs import compile_once
 
 JUMP = 0.25
 """Neighbouring points farther apart than this part of the extent are on both sides of an edge."""
-LARGEST = 2**31 - 1
+LARGEST_SIDE = 2**31 - 1
 """Maximum rows and columns of a GeoTIFF."""
 
 _geodetic = compile_once(geodetic, ())
@@ -128,10 +128,10 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)
     columns, rows = right - left, top - bottom
-    if not (max(rows, columns) < LARGEST and rows * columns <= most):
+    if not (max(rows, columns) < LARGEST_SIDE and rows * columns <= most):
         raise InputError(
             f"--spacing {size:g}: the map would have {rows:.3g} × {columns:.3g} pixels; give a "
-            "greater one, in the unit of the map, or another --crs"
+            "larger one, in the unit of the map, or another --crs"
         )
     return MapGrid(left * size, top * size, size, int(columns), int(rows))
 

@@ -69,7 +69,7 @@ def read_terrain(
                 return _terrain(source, earth, path, extent)
             if source.crs is None:
                 raise InputError(
-                    f"{path}: the raster has no coordinate system; add one, such as by "
+                    f"{path}: the raster has no coordinate system; add one, such as with "
                     "gdal_translate -a_srs EPSG:4326"
                 )
             with WarpedVRT(
@@ -96,7 +96,7 @@ def _degrees_around(source):
 def _terrain(source, earth, path, extent):
     transform = source.transform
     if transform.b or transform.d:
-        raise InputError(f"{path}: the raster is turned; bring it north up, by gdalwarp")
+        raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
     step = transform.a, transform.e
     first = (0, 0)
     if earth is None or extent is None:

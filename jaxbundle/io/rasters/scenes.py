@@ -12,9 +12,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
 from jaxbundle.io.rasters.reading import as_type, open_plain, rasterio, unreadable
-from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.simulate import taken_image
+from jaxbundle.pushbroom.simulate import take_image
 from jaxbundle.pushbroom.surfaces import Surface
 
 PORTION = 64
@@ -69,11 +69,11 @@ def write_taken(
     **Raises:** `InputError` if the scene is not in the image.
     """
     seen = False
-    with written_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
+    with write_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
         for first in range(0, image.lines, PORTION):
             lines = np.arange(first, first + PORTION, dtype=float)
             inside = np.minimum(lines, image.lines - 1)
-            values = taken_image(image, surface, bands, place, inside, resampling)
+            values = take_image(image, surface, bands, place, inside, resampling)
             values = values[:, : image.lines - first]
             seen |= bool(np.isfinite(values).any())
             target.write(as_type(values, dtype), first)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.reading import open_plain, rasterio
-from jaxbundle.io.writing.replacing import disk_of, replaced_file
+from jaxbundle.io.writing.replacing import disk_of, replace_file
 
 
 class RasterWriter:
@@ -42,7 +42,7 @@ class RasterWriter:
 
 
 @contextmanager
-def written_raster(
+def write_raster(
     target: str | Path, width: int, height: int, count: int, dtype: np.dtype | str, **profile
 ) -> Iterator[RasterWriter]:
     """A GeoTIFF to write, which gets its name when it is completely on the disk.
@@ -56,7 +56,7 @@ def written_raster(
     with suppress(OSError):
         if needed > shutil.disk_usage(Path(os.path.realpath(target)).parent).free:
             raise _unwritable(target, f"{needed / 1e6:.6g} MB are needed")
-    with replaced_file(target) as temporary:
+    with replace_file(target) as temporary:
         try:
             with _silence:
                 raster = open_plain(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.io.text.csv_tables import write_csv
-from jaxbundle.io.writing.replacing import replaced_files
+from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Network
@@ -37,7 +37,7 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
                               errors[:, None]], 1)  # fmt: skip
     header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
     rows = zip(points.id, points.role, numbers.tolist())
-    with replaced_files(images_path(path), path) as (of_images, of_points):
+    with replace_files(images_path(path), path) as (of_images, of_points):
         write_csv(
             of_images, IMAGE_COLUMNS,
             ((id, c, *_cells(row)) for id, c, row in

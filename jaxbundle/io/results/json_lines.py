@@ -13,7 +13,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.text.csv_tables import write_bytes
-from jaxbundle.system.temporaries import unbroken
+from jaxbundle.system.temporaries import defer_interrupts
 
 HEAD = ("status", "settings", "data")
 """Fields of a line kept in memory: its status and inputs."""
@@ -97,7 +97,8 @@ class JsonLines:
     def _write(self, write: Callable) -> None:
         try:
             # A pipe may be slow: nothing waits for it.
-            with unbroken() if self._regular else nullcontext(), self._file.open("ab") as file:
+            whole = defer_interrupts() if self._regular else nullcontext()
+            with whole, self._file.open("ab") as file:
                 write(file)
                 file.flush()
                 if self._regular:

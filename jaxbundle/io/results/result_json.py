@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.io.text.csv_tables import in_portions, table_rows
+from jaxbundle.io.text.csv_tables import table_rows, take_portions
 from jaxbundle.network.tables import EXTERIOR
 
 
@@ -90,9 +90,9 @@ def result_text(
         return
     yield _text(head | {"variance_components": _components(adjustment)})[:-1]
     yield ', "points": {'
-    yield from _join(_text(dict(some))[1:-1] for some in in_portions(_points(adjustment.points)))
+    yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
     yield '}, "residuals": ['
-    yield from _join(_text(some)[1:-1] for some in in_portions(_residuals(adjustment.residuals)))
+    yield from _join(_text(some)[1:-1] for some in take_portions(_residuals(adjustment.residuals)))
     yield "]}\n"
 
 

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.writing.replacing import replaced_file
+from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.system.file_content import check_plain
 
 HEAD = "head"
@@ -29,7 +29,7 @@ def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
 
     **Raises:** `InputError` for anything else, and if the file cannot be written."""
     head, arrays = flatten(tree, classes)
-    with replaced_file(path) as temporary, temporary.open("wb") as file:
+    with replace_file(path) as temporary, temporary.open("wb") as file:
         content: dict[str, Any] = {HEAD: np.frombuffer(head, np.uint8), **arrays}
         np.savez_compressed(file, **content)
 

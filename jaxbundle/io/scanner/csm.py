@@ -25,7 +25,7 @@ from jaxbundle.io.scanner.csm_trajectory import ORDER, slerp, states_of, traject
 from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import check_times
 from jaxbundle.pushbroom.image import check_size, make_image
@@ -65,7 +65,7 @@ def _support_data(path):
     name = name.strip()
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
-            raise InputError(f"{path}: a model state of {shown(name)}; {MODEL} is expected")
+            raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
         text = text[text.index("{") : text.rindex("}") + 1] if "}" in text else brace
     isd, order = JsonFields(path, read_object(path, text, "an ISD or a model state")), ORDER
     if name or is_state(isd.document):
@@ -73,7 +73,7 @@ def _support_data(path):
         return JsonFields(path, document), order
     model = isd.get("name_model", MODEL)
     if model != MODEL:
-        raise InputError(f"{path}: name_model is {shown(model)}; {MODEL} is expected")
+        raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")
     return isd, order
 
 

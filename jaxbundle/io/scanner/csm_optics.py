@@ -14,7 +14,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.sight_frames import sight_frame
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import shown, some
+from jaxbundle.network.columns import list_some, show
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
 ALIGNED = 1e-9
@@ -30,7 +30,9 @@ def optics_of(
     """
     f = isd.number("focal_length_model.focal_length")
     if f == 0:
-        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; millimetres, please")
+        raise InputError(
+            f"{isd.path}: focal_length_model.focal_length is 0; millimetres are expected"
+        )
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])
@@ -71,7 +73,7 @@ def _distortion(isd, x, y):
     kind = next(iter(given), None) if isinstance(given, dict) else None
     if isinstance(given, dict) and len(given) > 1:
         raise InputError(
-            f"{isd.path}: optical_distortion has {len(given)} kinds ({some(given)}); "
+            f"{isd.path}: optical_distortion has {len(given)} kinds ({list_some(given)}); "
             "one is expected"
         )
     where = f"optical_distortion.{kind}"
@@ -98,7 +100,7 @@ def _distortion(isd, x, y):
             a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
             return kind, _transverse(isd, a, b, x, y)
     raise InputError(
-        f"{isd.path}: optical_distortion {shown(kind)} is not supported; {', '.join(KNOWN[:-1])} "
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; {', '.join(KNOWN[:-1])} "
         f"or {KNOWN[-1]} is expected"
     )
 
@@ -114,4 +116,4 @@ def _transverse(isd, a, b, x, y):
         u, v = u + du, v + dv
         if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):
             return u, v
-    raise InputError(f"{isd.path}: optical_distortion.transverse cannot be undone; look at it")
+    raise InputError(f"{isd.path}: optical_distortion.transverse cannot be inverted; check it")

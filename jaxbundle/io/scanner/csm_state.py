@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 DISTORTIONS = (
@@ -80,7 +80,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
 def _check(state):
     name = state.get("m_modelName", MODEL)
     if name != MODEL:
-        raise InputError(f"{state.path}: m_modelName is {shown(name)}; {MODEL} is expected")
+        raise InputError(f"{state.path}: m_modelName is {show(name)}; {MODEL} is expected")
     adjusted = state.array("m_currentParameterValue", (None,), [])
     if adjusted.any():
         raise InputError(

@@ -26,14 +26,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.json_fields import JsonFields
-from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
     check_times,
     extrapolation_limit,
     position_table,
-    told_extrapolation,
+    warn_of_extrapolation,
 )
 from jaxbundle.pushbroom.interpolation import interpolate
 from jaxbundle.pushbroom.trajectory import Trajectory
@@ -65,7 +65,7 @@ def unit_of(isd: JsonFields, key: str, default: str) -> float:
     """Metres in the unit of a field."""
     unit = isd.get(f"{key}.unit", default)
     if unit not in UNITS:
-        raise InputError(f"{isd.path}: {key}.unit is {shown(unit)}; m or km is expected")
+        raise InputError(f"{isd.path}: {key}.unit is {show(unit)}; m or km is expected")
     return UNITS[unit]
 
 
@@ -80,7 +80,7 @@ def states_of(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
             f"{did_you_mean(interpolation, INTERPOLATIONS)}"
         )
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
-    return _given(isd, lines) if older else _resample(isd, lines, interpolation)
+    return _read_even_table(isd, lines) if older else _resample(isd, lines, interpolation)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -105,7 +105,7 @@ def slerp(t: Float[np.ndarray, " n"], R: Rotation, at: Float[np.ndarray, " m"]) 
     return R[i] * Rotation.from_rotvec(part[:, None] * (R[i].inv() * R[i + 1]).as_rotvec())
 
 
-def _given(isd, lines):
+def _read_even_table(isd, lines):
     """Even tables as they are."""
     P = isd.array("sensor_position.positions", (None, 3)) * unit_of(isd, "sensor_position", "m")
     q = isd.array("sensor_orientation.quaternions", (None, 4))
@@ -114,7 +114,7 @@ def _given(isd, lines):
         t = isd.number(f"t0_{name}") + isd.number(f"dt_{name}") * np.arange(n)
         _check_rows(isd, f"sensor_{key}", t)
         tables.append((t, isd.source(f"sensor_{key}")))
-    warnings = [w for t, source in tables for w in told_extrapolation(t, lines, source)]
+    warnings = [w for t, source in tables for w in warn_of_extrapolation(t, lines, source)]
     (t, rows), sources = zip(*tables)
     R = _rotations(isd, "sensor_orientation", q)
     limits = extrapolation_limit(t), extrapolation_limit(rows)
@@ -130,7 +130,7 @@ def _resample(isd, lines, interpolation):
               "body_rotation": body_times}  # fmt: skip
     warnings = [
         warning for key, t in tables.items() if len(t) > 1
-        for warning in told_extrapolation(t, lines, isd.source(key))
+        for warning in warn_of_extrapolation(t, lines, isd.source(key))
     ]  # fmt: skip
     t = np.linspace(given[0], given[-1], max(FEWEST, len(given)))
     P = body(t).apply(_positions(isd, given)(t))

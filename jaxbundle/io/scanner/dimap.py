@@ -28,7 +28,7 @@ from jaxbundle.pushbroom.ancillary import (
     check_covered,
     check_times,
     position_table,
-    told_extrapolation,
+    warn_of_extrapolation,
 )
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.interpolation import interpolate
@@ -69,7 +69,7 @@ def read_dimap(file: XmlFields) -> Scanner:
     source = Source(f"{path}, Corrected_Attitude", None, "row")
     check_times(rows, source)
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
-    warnings = told_extrapolation(rows, when, source)
+    warnings = warn_of_extrapolation(rows, when, source)
     rows, angles = _extrapolate(rows, angles, when[0], when[-1])
     check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))

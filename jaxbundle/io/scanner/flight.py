@@ -66,7 +66,7 @@ SECTIONS = {
     "noise": Noise._fields,
     "simulation": ("seed",),
 }
-NEEDED = ("scanner", "times", "optics", "track")
+REQUIRED_FIELDS = ("scanner", "times", "optics", "track")
 
 
 class FlightFile(NamedTuple):
@@ -82,13 +82,13 @@ def read_flight(path: str | Path) -> FlightFile:
 
     **Raises:** `InputError` naming file, section and key.
     """
-    file = read_sections(Path(path), SECTIONS, NEEDED)
+    file = read_sections(Path(path), SECTIONS, REQUIRED_FIELDS)
     scanner, times = file.section("scanner"), file.section("times")
     earth = earth_of(scanner)
     period = times.number("period")
     if period <= 0:
         raise InputError(f"{times.where}period is {period}; a positive number is expected")
-    pixels = scanner.whole("pixels")
+    pixels = scanner.integer("pixels")
     instruments = file.section("instruments")
     options: dict[str, Any] = {k: instruments.number(k) for k in RATES if k in instruments}
     for name, rate in options.items():
@@ -96,7 +96,7 @@ def read_flight(path: str | Path) -> FlightFile:
             raise InputError(f"{instruments.where}{name} is {rate}; a positive number, in Hz")
     options |= {k: instruments.text(k) for k in METHODS if k in instruments}
     flight = Flight(
-        scanner.whole("lines"), pixels, period, optics_of(file, pixels), _track(file, earth),
+        scanner.integer("lines"), pixels, period, optics_of(file, pixels), _track(file, earth),
         {k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
          for k, v in file.section("angles").values.items()},
         mounting_of(file), noise=_noise(file),

@@ -12,7 +12,7 @@ from jaxbundle.pushbroom.ancillary import (
     attitude_table,
     extrapolation_limit,
     position_table,
-    told_extrapolation,
+    warn_of_extrapolation,
 )
 from jaxbundle.pushbroom.trajectory import Trajectory
 
@@ -50,7 +50,7 @@ def trajectory_of(
     warnings: list[str] = []
 
     def options(rows, source):
-        told = told_extrapolation(rows, lines, source)
+        told = warn_of_extrapolation(rows, lines, source)
         warnings.extend(told)
         return {
             "method": "usgscsm" if told else "lagrange", "order": min(ORDER, len(rows) - 1),

@@ -9,7 +9,7 @@ from jaxbundle.io.scanner.dimap import read_dimap
 from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
 from jaxbundle.io.scanner.pvl import read_support_data
 from jaxbundle.io.scanner.scanner import Scanner
-from jaxbundle.io.scanner.scanner_file import NEEDED, SECTIONS, scanner_of
+from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
 from jaxbundle.io.scanner.worldview import read_worldview
 from jaxbundle.io.text.sections import Section, TomlFile, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
@@ -28,7 +28,7 @@ def read_scanner(path: str | Path) -> Scanner:
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
         return _read_product(path)
-    file = read_sections(path, SECTIONS, NEEDED[:1])
+    file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
     return _of_product(file, scanner) if "source" in scanner else scanner_of(file)
 

@@ -49,7 +49,7 @@ from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.sections import Section, read_sections
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement.freedom import Freedom
@@ -62,7 +62,7 @@ SECTIONS = {
     ),
     "images": (), "sensors": (), "unknowns": (),
 }  # fmt: skip
-NEEDED = ("refine", "images", "unknowns")
+REQUIRED_FIELDS = ("refine", "images", "unknowns")
 WORDS = {"free": math.inf, "held": 0.0}
 TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
 LISTS = ("look_across", "look_along")
@@ -86,7 +86,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
-    file = read_sections(path, SECTIONS, NEEDED)
+    file = read_sections(path, SECTIONS, REQUIRED_FIELDS)
     section = file.section("refine")
     unit = section.text("angle_unit", "deg")
     if unit not in ANGLE_UNITS:
@@ -138,7 +138,8 @@ def read_refinement(path: str | Path) -> RefineFile:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
-        raise InputError(f"{section.where}significance is {significance}; between 0 and 1, please")
+        raise InputError(f"{section.where}significance is {significance}; a number between 0 and 1 "
+                         "is expected")  # fmt: skip
     return RefineFile(
         images, points, observations, frames, snooping, significance, tuple(warnings)
     )
@@ -162,7 +163,7 @@ def _freedom(section: Section, radians: float) -> Freedom:
         else:
             values = value if isinstance(value, list) else [value] * 3
             if len(values) != 3:
-                raise InputError(f"{section.where}{key} is {shown(value)}; one value or three")
+                raise InputError(f"{section.where}{key} is {show(value)}; one value or three")
             found[key] = tuple(factor * _sigma(section, key, v) for v in values)
     return Freedom(**found)
 
@@ -173,7 +174,7 @@ def _sigma(section: Section, key: str, value: Any) -> float:
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
         return float(value)
     raise InputError(
-        f'{section.where}{key} is {shown(value)}; "free", "held" or a prior σ is expected'
+        f'{section.where}{key} is {show(value)}; "free", "held" or a prior σ is expected'
     )
 
 

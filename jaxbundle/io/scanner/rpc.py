@@ -24,8 +24,8 @@ from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.scanner.rpc_products import from_geom, from_xml
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.xml_fields import number_in
-from jaxbundle.io.writing.replacing import disk_of, replaced_file
-from jaxbundle.network.columns import shown
+from jaxbundle.io.writing.replacing import disk_of, replace_file
+from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
 from jaxbundle.system.file_content import check_plain
 
@@ -99,12 +99,12 @@ def _from_text(path, text):
         name, colon, value = line.partition(":")
         if not colon:
             raise InputError(
-                f"{path}, line {number}: {shown(line.strip())}; NAME: value is expected, such as "
+                f"{path}, line {number}: {show(line.strip())}; NAME: value is expected, such as "
                 "LINE_OFF: 3000.5"
             )
         name = name.strip().upper()
         if name in found:
-            raise InputError(f"{path}, line {number}: {name} is there twice")
+            raise InputError(f"{path}, line {number}: {name} occurs twice")
         found[name] = value.split(), number
 
     def number_of(name, unit=None):
@@ -134,7 +134,7 @@ def _from_rpb(path, text):
                 continue
             key, value = match.groups()
             if key in found:
-                raise InputError(f"{path}, line {number}: {key} is there twice")
+                raise InputError(f"{path}, line {number}: {key} occurs twice")
             found[key] = [value, number]
             name = key if "(" in value and ")" not in value else None
         else:
@@ -201,7 +201,7 @@ def _to_raster(path, rpc):
     if not path.is_file():
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
-        with replaced_file(path) as temporary:
+        with replace_file(path) as temporary:
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)

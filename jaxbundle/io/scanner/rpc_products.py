@@ -16,7 +16,7 @@ from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc import TERMS
 
 AXES = {"line": "line", "sample": "samp", "longitude": "long", "latitude": "lat",
@@ -63,7 +63,7 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
     kind, line = found.get("polynomial_format", ("B", 0))
     if kind != "B":
         raise InputError(
-            f"{path}, line {line}: polynomial_format is {shown(kind)}; only B is read, whose terms "
+            f"{path}, line {line}: polynomial_format is {show(kind)}; only B is read, whose terms "
             "are those of RPC00B"
         )
     adjusted = [
@@ -117,7 +117,7 @@ def _from_digitalglobe(file):
     kind = file.text("RPB/SPECID", "RPC00B")
     if kind != "RPC00B":
         raise InputError(
-            f"{file.path}: SPECID is {shown(kind)}; only RPC00B is read, whose terms are in "
+            f"{file.path}: SPECID is {show(kind)}; only RPC00B is read, whose terms are in "
             "another order"
         )
     values = {}

@@ -64,7 +64,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.text.sections import Section, TomlFile
-from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
 from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
@@ -92,7 +92,7 @@ SECTIONS = {
     "corrections": Corrections._fields,
     "earth_orientation": frames.EarthOrientation._fields,
 }  # fmt: skip
-NEEDED = ("scanner", "times", "position", "attitude", "optics")
+REQUIRED_FIELDS = ("scanner", "times", "position", "attitude", "optics")
 
 
 def scanner_of(file: TomlFile) -> Scanner:
@@ -100,9 +100,9 @@ def scanner_of(file: TomlFile) -> Scanner:
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
-    file.require(NEEDED)
+    file.require(REQUIRED_FIELDS)
     scanner = file.section("scanner")
-    lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
+    lines, pixels = (scanner.integer(key) for key in ("lines", "pixels"))
     check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
     position, positions = _position(file, earth)
@@ -169,7 +169,7 @@ def earth_of(scanner: Section) -> Ellipsoid | None:
         return Ellipsoid(*axes.tolist())
     if value not in ("WGS84", "local"):
         raise InputError(
-            f'{scanner.where}earth is {shown(value)}; "WGS84", "local" or [a, b, c] is expected'
+            f'{scanner.where}earth is {show(value)}; "WGS84", "local" or [a, b, c] is expected'
         )
     return WGS84 if value == "WGS84" else None
 

@@ -29,7 +29,7 @@ from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
 from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import check_times
 from jaxbundle.pushbroom.corrections import Corrections
@@ -52,7 +52,7 @@ def read_worldview(file: XmlFields) -> Scanner:
     level = file.text("IMD/IMAGEDESCRIPTOR", "Basic1B")
     if level.lower() not in LEVELS:
         raise InputError(
-            f"{path}: IMAGEDESCRIPTOR is {shown(level)}; only Basic1B and Stereo1B have the "
+            f"{path}: IMAGEDESCRIPTOR is {show(level)}; only Basic1B and Stereo1B have the "
             "geometry of the camera, use the RPC of others"
         )
     lines, pixels = file.number("IMD/NUMROWS"), file.number("IMD/NUMCOLUMNS")
@@ -160,7 +160,7 @@ def _detectors(file):
         raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
     other = [band.tag for band, v in zip(bands, values) if v != values[0]]
     warnings = () if not other else (
-        f"{file.path}: the detectors of {', '.join(other)} are elsewhere than those of "
+        f"{file.path}: the detectors of {', '.join(other)} differ in position from those of "
         f"{bands[0].tag}, which are used",
     )  # fmt: skip
     direction = pitch * np.array([np.sin(np.radians(angle)), -np.cos(np.radians(angle))])

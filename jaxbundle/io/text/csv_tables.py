@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.writing.replacing import replaced_file, unwritable
+from jaxbundle.io.writing.replacing import replace_file, unwritable
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import DESCRIPTORS, parse_toml, read_content
@@ -83,7 +83,7 @@ def read_csv(path: Path) -> Columns:
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a table for `read_csv`; floats in full precision."""
-    write_text(path, (_csv_text(some) for some in in_portions(itertools.chain((header,), rows))))
+    write_text(path, (_csv_text(some) for some in take_portions(itertools.chain((header,), rows))))
 
 
 def _csv_text(rows: Iterable[Sequence[Any]]) -> str:
@@ -104,7 +104,7 @@ def table_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple]:
         yield from zip(*(column[first : first + PORTION].tolist() for column in columns))
 
 
-def in_portions(rows: Iterable[Any]) -> Iterator[list]:
+def take_portions(rows: Iterable[Any]) -> Iterator[list]:
     """Some rows at a time."""
     rows = iter(rows)
     while portion := list(itertools.islice(rows, PORTION)):
@@ -132,5 +132,5 @@ def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
         except OSError as error:
             raise unwritable(path, error) from None
         return
-    with replaced_file(path) as temporary, temporary.open("wb") as file:
+    with replace_file(path) as temporary, temporary.open("wb") as file:
         file.writelines(pieces)

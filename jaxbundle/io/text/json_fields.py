@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import parse_json
 
@@ -50,10 +50,10 @@ class JsonFields:
         if not fits or not np.isfinite(array).all():
             size = " × ".join("n" if n is None else str(n) for n in shape)
             kind = f"an array {size} of finite numbers" if shape else "a finite number"
-            raise InputError(f"{self.path}: {key} is {shown(value)}; {kind} is expected")
+            raise InputError(f"{self.path}: {key} is {show(value)}; {kind} is expected")
         return array
 
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+    def integer(self, key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number that is not less than `least`."""
         value = self.number(key, default)
         if not (value.is_integer() and least <= value < 2**53):
@@ -66,7 +66,7 @@ class JsonFields:
         """A text; a number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
-            said = "missing" if value in (None, "") else f"{shown(value)}; a text is expected"
+            said = "missing" if value in (None, "") else f"{show(value)}; a text is expected"
             raise InputError(f"{self.path}: {key} is {said}")
         return str(value)
 
@@ -74,7 +74,7 @@ class JsonFields:
         """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
-            said = "missing" if value is None else f"{shown(value)}; an object is expected"
+            said = "missing" if value is None else f"{show(value)}; an object is expected"
             raise InputError(f"{self.path}: {key} is {said}")
         return JsonFields(f"{self.path}, {key}", value)
 
@@ -82,7 +82,7 @@ class JsonFields:
         """The objects in a field with an object of objects; none if it is missing."""
         fields = self.of(key) if self.get(key) is not None else JsonFields(self.path, {})
         return {
-            id: _object(f"{self.path}, {key} {shown(id)}", value)
+            id: _object(f"{self.path}, {key} {show(id)}", value)
             for id, value in fields.document.items()
         }
 
@@ -90,7 +90,7 @@ class JsonFields:
         """The objects in a list, counted from 0 in messages; none if it is missing."""
         value = self.get(key, [])
         if not isinstance(value, list):
-            raise InputError(f"{self.path}: {key} is {shown(value)}; a list is expected")
+            raise InputError(f"{self.path}: {key} is {show(value)}; a list is expected")
         return [_object(f"{self.path}, {key}[{k}]", row) for k, row in enumerate(value)]
 
     def source(self, key: str) -> Source:
@@ -100,7 +100,7 @@ class JsonFields:
 
 def _object(where: str, value: Any) -> JsonFields:
     if not isinstance(value, dict):
-        raise InputError(f"{where} is {shown(value)}; an object is expected")
+        raise InputError(f"{where} is {show(value)}; an object is expected")
     return JsonFields(where, value)
 
 

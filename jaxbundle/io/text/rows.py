@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
 
 class Row:
@@ -52,12 +52,12 @@ class Row:
             return np.array([self._number(word, what) for word in self.words])
         return numbers
 
-    def whole(self, k: int, what: str, least: int = 0) -> int:
+    def integer(self, k: int, what: str, least: int = 0) -> int:
         """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
         sign = word.removeprefix("-")
         if not (sign.isascii() and sign.isdigit() and len(sign) < 19) or int(word) < least:
-            raise self.error(f"{what} is {shown(word)}; a whole number from {least} is expected")
+            raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
         return int(word)
 
     def _number(self, word: str, what: str) -> float:
@@ -66,7 +66,7 @@ class Row:
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
-            raise self.error(f"{what} is {shown(word)}; a number is expected")
+            raise self.error(f"{what} is {show(word)}; a number is expected")
         return number
 
 

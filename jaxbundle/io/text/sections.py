@@ -11,7 +11,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv, read_toml
 from jaxbundle.io.text.toml_text import assignments
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -72,12 +72,12 @@ class Section:
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
-    def _given(self, key, default, expected, kinds) -> Any:
+    def _get(self, key, default, expected, kinds) -> Any:
         value = self.values.get(key, default)
         if value is None:
             raise InputError(f"{self.where}{key} is missing; {expected} is expected")
         if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
-            raise InputError(f"{self.where}{key} is {shown(value)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(value)}; {expected} is expected")
         return value
 
     def check_keys(self, known: Sequence[str]) -> None:
@@ -88,33 +88,33 @@ class Section:
 
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
-        value = float(self._given(key, default, "a number", (int, float)))
+        value = float(self._get(key, default, "a number", (int, float)))
         if not np.isfinite(value):
             raise InputError(f"{self.where}{key} is {value}; a finite number is expected")
         return value
 
-    def whole(self, key: str) -> int:
+    def integer(self, key: str) -> int:
         """A whole number, 2 or more."""
-        value = self._given(key, None, "a whole number, 2 or more,", (int,))
+        value = self._get(key, None, "a whole number, 2 or more,", (int,))
         if value < 2:
             raise InputError(f"{self.where}{key} is {value}; 2 or more are expected")
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
         """Text."""
-        return self._given(key, default, "text in quotes", (str,))
+        return self._get(key, default, "text in quotes", (str,))
 
     def switch(self, key: str) -> bool:
         """True or false; false if it is missing."""
-        return self._given(key, False, "true or false", (bool,))
+        return self._get(key, False, "true or false", (bool,))
 
     def numbers(self, key: str, count: int | None = None) -> np.ndarray:
         """A list of numbers, of a given length."""
         expected = f"a list of {count or 'some'} numbers"
-        values = self._given(key, None, expected, (list,))
+        values = self._get(key, None, expected, (list,))
         good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not good or not values or count not in (None, len(values)):
-            raise InputError(f"{self.where}{key} is {shown(values)}; {expected} is expected")
+            raise InputError(f"{self.where}{key} is {show(values)}; {expected} is expected")
         return np.array(values, float)
 
     def table(self) -> Columns:

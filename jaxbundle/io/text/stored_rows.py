@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 
-WORTH = 2**20
+SMALLEST_STORED = 2**20
 """Smaller arrays are read at once, bytes."""
 LOCAL_HEADER = struct.Struct("<4s22xHH")
 """Signature, length of the name, of the field after it."""
@@ -60,7 +60,7 @@ class StoredRows:
                 stream.seek(self.offset + int(wanted[first]) * size * self.dtype.itemsize)
                 read = np.fromfile(stream, self.dtype, (last - first) * size)
                 if read.size < (last - first) * size:
-                    raise InputError(f"{self.path}: has become shorter while it was read")
+                    raise InputError(f"{self.path}: became shorter while it was read")
                 found[first:last] = read.reshape(-1, *self.shape[1:])
         return found[0] if np.ndim(rows) == 0 else found
 
@@ -75,7 +75,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             member = archive.getinfo(f"{name}.npy")
         except KeyError:
             return None
-        if member.file_size < WORTH:
+        if member.file_size < SMALLEST_STORED:
             return None
         with archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)

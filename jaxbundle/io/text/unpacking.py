@@ -5,6 +5,6 @@ RATIO, ALWAYS = 200, 2**20
 thousand (gzip) or a million (bzip2). And bytes that are always harmless."""
 
 
-def most_unpacked(size: int) -> int:
+def largest_unpacked_size(size: int) -> int:
     """The maximum unpacked size of a compressed file of this size, bytes."""
     return ALWAYS + RATIO * size

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
 TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
 """UTC; digits below a nanosecond are dropped."""
@@ -113,7 +113,7 @@ def number_in(text: str, where: str) -> float:
     except ValueError:
         good = False
     if not good:
-        raise InputError(f"{where} is {shown(text)}; a finite number is expected")
+        raise InputError(f"{where} is {show(text)}; a finite number is expected")
     return value
 
 
@@ -125,7 +125,7 @@ def time_in(text: str, where: str) -> np.datetime64:
     except ValueError:  # a 13th month
         pass
     raise InputError(
-        f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
+        f"{where} is {show(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
     )
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import show
 
-DEEPEST = 32
+DEEPEST_NESTING = 32
 KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s*:(?:\s+(.*))?""")
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
@@ -51,7 +51,7 @@ def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[st
         raise InputError(f"{path}: the file is empty; keys and values are expected")
     value, rest = _block(lines, lines[0].indent, 0)
     if rest:
-        raise rest[0].error(f"{shown(rest[0].text)} is indented differently from the lines before")
+        raise rest[0].error(f"{show(rest[0].text)} is indented differently from the lines before")
     if not isinstance(value, dict):
         raise lines[0].error("keys and values are expected")
     return value
@@ -79,14 +79,14 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
         open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
     if open_brackets:
-        raise lines[-1].error(f"the list {shown(lines[-1].text)} has no end")
+        raise lines[-1].error(f"the list {show(lines[-1].text)} has no end")
     return lines
 
 
 def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
     """The value of the lines of one indentation, and the lines after it."""
-    if depth > DEEPEST:
-        raise lines[0].error(f"nested too deeply: more than {DEEPEST} levels")
+    if depth > DEEPEST_NESTING:
+        raise lines[0].error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
     read = _items if _is_item(lines[0]) else _keys
     return read(lines, indent, depth)
 
@@ -106,7 +106,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]
             value, lines = _block([inner, *lines], inner.indent, depth + 1)
             values.append(value)
         else:
-            value, lines = _nested(lines, indent, depth)
+            value, lines = _parse_nested(lines, indent, depth)
             values.append(value)
     return values, lines
 
@@ -117,18 +117,18 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]
         line, lines = lines[0], lines[1:]
         found = KEY.fullmatch(line.text)
         if not found:
-            raise line.error(f"{shown(line.text)}: a key and a value, KEY: VALUE, are expected")
+            raise line.error(f"{show(line.text)}: a key and a value, KEY: VALUE, are expected")
         key, text = found[1].strip("\"'"), TAG.sub("", found[2] or "", count=1)
         if key in values:
             raise line.error(f"{key} occurs twice")
         if text:
             values[key] = _value(line, text)
         else:
-            values[key], lines = _nested(lines, indent, depth)
+            values[key], lines = _parse_nested(lines, indent, depth)
     return values, lines
 
 
-def _nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
     """The value below a key or the dash of a list; a list may have the indentation of its key."""
     if not lines or lines[0].indent < indent:
         return None, lines
@@ -143,7 +143,7 @@ def _value(line: Line, text: str) -> Any:
     if text[:1] in NOT_READ and line.lenient:
         return None
     if text[:1] in NOT_READ:
-        raise line.error(f"{shown(text)}: {NOT_READ[text[0]]} is not read here")
+        raise line.error(f"{show(text)}: {NOT_READ[text[0]]} is not read here")
     if not text.startswith("["):
         return _scalar(text)
     stack: list[list] = [[]]
@@ -155,8 +155,8 @@ def _value(line: Line, text: str) -> Any:
             stack.pop()
         elif part.strip():
             stack[-1].append(_scalar(part.strip()))
-        if not stack or len(stack) > DEEPEST or (len(stack) == 1 and len(stack[0]) > 1):
-            raise line.error(f"{shown(text)}: brackets that do not match")
+        if not stack or len(stack) > DEEPEST_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
+            raise line.error(f"{show(text)}: brackets that do not match")
     return stack[0][0]
 
 

@@ -28,10 +28,10 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.writing.locks import locked
+from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.io.writing.replacing import unwritable
-from jaxbundle.network.columns import some
-from jaxbundle.system.temporaries import temporary, unbroken
+from jaxbundle.network.columns import list_some
+from jaxbundle.system.temporaries import defer_interrupts, temporary
 
 MARKER, INSIDE = ".jaxbundle", ".jaxbundle.work"
 NEW, READY, OLD = "new", "ready", "old"
@@ -77,7 +77,7 @@ def check_folder(
 
 
 @contextmanager
-def replaced_folder(
+def replace_folder(
     folder: str | Path, by: str, names: Iterable[str], force: bool = False
 ) -> Iterator[Path]:
     """An empty folder to fill, which then replaces `folder` or its files.
@@ -98,7 +98,7 @@ def replaced_folder(
         try:
             for parent in [p for p in real.parents if not p.exists()][::-1]:
                 until.enter_context(temporary(parent, content=False)).mkdir()
-            with unbroken():
+            with defer_interrupts():
                 work = until.enter_context(temporary(_make_work(real), content=False))
             new = work / NEW
             until.enter_context(_held(folder, work))
@@ -164,8 +164,8 @@ def _refuse_others(
     if not entries:
         return
     own = marker.files if marker else {}
-    taken = [str(folder / name) for name in _taken(real, names, own)]
-    listed = some(taken, MOST_NAMED, str)
+    taken = [str(folder / name) for name in _list_taken(real, names, own)]
+    listed = list_some(taken, MOST_NAMED, str)
     way = "give a new folder, or --force (force=True in Python) to"
     if marker is None and taken:
         raise InputError(
@@ -174,19 +174,19 @@ def _refuse_others(
         )
     if marker is None:
         raise InputError(
-            f"{said}: not a folder of jaxbundle {by}: there is {some(entries, 3, str)} in it; "
+            f"{said}: not a folder of jaxbundle {by}: there is {list_some(entries, 3, str)} in it; "
             f"{way} write beside that"
         )
     if marker.by != by:
         there = [str(folder / name) for name in own if os.path.lexists(real / name)]
         raise InputError(
             f"{said}: a folder of jaxbundle {marker.by}, not {by}; {way} replace "
-            f"{some([*there, *taken], MOST_NAMED, str)}"
+            f"{list_some([*there, *taken], MOST_NAMED, str)}"
         )
     changed = [str(folder / n) for n, d in own.items() if _digest(real / n) not in (None, d)]
     if changed or taken:
         raise InputError(
-            f"{said}: {some([*changed, *taken], MOST_NAMED, str)}: already there, and not as "
+            f"{said}: {list_some([*changed, *taken], MOST_NAMED, str)}: already there, and not as "
             f"jaxbundle {by} wrote it; {way} replace it"
         )
 
@@ -198,7 +198,7 @@ def _entries(real: Path) -> list[str]:
         return []
 
 
-def _taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
+def _list_taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
     """Existing files among `names`, except those listed by the marker."""
     found = {}
     for name in names:
@@ -237,7 +237,7 @@ def _make_work(real: Path) -> Path:
 
 
 def _held(folder: str | Path, work: Path) -> AbstractContextManager[None]:
-    return locked(work / "run", folder, needed=False)
+    return hold_lock(work / "run", folder, needed=False)
 
 
 def _replace(
@@ -255,14 +255,14 @@ def _replace(
             _refuse_others(folder, real, by, (*files, *names), str(folder))
         marker = read_marker(real)
         own = [name for name in (marker.files if marker else ()) if os.path.lexists(real / name)]
-        going = [*own, *_taken(real, names, own)]
+        going = [*own, *_list_taken(real, names, own)]
         for name in (*files, *going):
             _check_way(real, name)
             if os.path.lexists(real / name) and name not in going:
                 raise InputError(f"{folder / name}: already there; give a new folder")
     try:
         with ExitStack() as left:
-            with unbroken():
+            with defer_interrupts():
                 _exchange(real, work, files, going)
                 for name in (OLD, READY):
                     left.enter_context(temporary(work / name))

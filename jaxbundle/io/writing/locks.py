@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from jaxbundle.errors import InputError
-from jaxbundle.system.temporaries import temporary, unbroken
+from jaxbundle.system.temporaries import defer_interrupts, temporary
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of file systems without locks."""
 
 
 @contextmanager
-def locked(
+def hold_lock(
     path: str | Path, named: str | Path | None = None, needed: bool = True
 ) -> Iterator[None]:
     """Hold the lock of a file, which need not exist; devices and pipes have none.
@@ -38,18 +38,18 @@ def locked(
         raise InputError(f"{told}: there is no folder {real.parent}")
     lock = real.with_name(f".{real.name}.lock")
     with ExitStack() as held:
-        with unbroken():  # A lock is removed only by the process that holds it.
-            held.enter_context(_taken(lock, told, needed))
+        with defer_interrupts():  # A lock is removed only by the process that holds it.
+            held.enter_context(_acquire(lock, told, needed))
             # Removed before release: no other process locks a file about to vanish.
             # Windows cannot remove open files: there it stays.
             held.enter_context(temporary(lock))
         yield
 
 
-def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
+def _acquire(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
     """The locked file.
 
-    **Raises:** `InputError` as `locked`."""
+    **Raises:** `InputError` as `hold_lock`."""
     try:
         while (stream := _open(lock, needed)) is None:
             pass

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.system.temporaries import temporary, unbroken
+from jaxbundle.system.temporaries import defer_interrupts, temporary
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LONGEST_STEM = 60
@@ -16,14 +16,14 @@ LONGEST_STEM = 60
 
 
 @contextmanager
-def replaced_file(path: str | Path) -> Iterator[Path]:
-    """The temporary name of one file, as `replaced_files`."""
-    with replaced_files(path) as (temporary,):
+def replace_file(path: str | Path) -> Iterator[Path]:
+    """The temporary name of one file, as `replace_files`."""
+    with replace_files(path) as (temporary,):
         yield temporary
 
 
 @contextmanager
-def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
+def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
     """Temporary names, beside some files, to write to; at the end they are renamed to the files.
 
     If writing fails, none is renamed and the temporary files are removed; existing files
@@ -46,7 +46,7 @@ def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
             until.enter_context(temporary(name))
         try:
             yield names
-            with unbroken():
+            with defer_interrupts():
                 for name, target in zip(names, real):
                     os.replace(name, target)
         except OSError as error:

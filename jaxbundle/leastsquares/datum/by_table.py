@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
-HERE = "table"
+TABLE_ALONE = "table"
 """The name of a table treated alone."""
 LEAST_ROWS = 128
 """Tables are padded to at least this many rows."""
@@ -28,14 +28,14 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
     """`datum.generators` of all tables: [rows, width, motions]."""
     found, given = {}, present(declared.motions)
     for name, value in values.items():
-        action = tuple((HERE, act) for table, act in given.actions if table == name)
+        action = tuple((TABLE_ALONE, act) for table, act in given.actions if table == name)
         if not action:
             rows = len(jax.tree.leaves(value)[0])
             found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
             continue
         motions = Motions(given.names, action)
-        one = Declared((), ((HERE, declared.spaces[name]),), motions)
-        of_rows = lambda rows, one=one: _generators(one, {HERE: rows})[HERE]
+        one = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
+        of_rows = lambda rows, one=one: _generators(one, {TABLE_ALONE: rows})[TABLE_ALONE]
         found[name] = _of_rows(of_rows, value)
     return found
 
@@ -59,8 +59,8 @@ def move_into_datum(
         away = {name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
                 for name, value in tables.items()}  # fmt: skip
         missing, slope = datum.equations(pinned, moves, away)
-        step = datum.limited(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
-        moved = _moved(declared, free, step, values)
+        step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
+        moved = _move_tables(declared, free, step, values)
         change = {
             name: jax.tree.map(np.subtract, moved[name], values[name]) for name in pinned.weight
         }
@@ -74,10 +74,10 @@ def move_into_datum(
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1
-    return values, distance <= datum.THERE * size
+    return values, distance <= datum.AT_DATUM * size
 
 
-def _moved(declared, free, motion, values):
+def _move_tables(declared, free, motion, values):
     """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:

@@ -30,11 +30,11 @@ from jaxbundle.types import present
 
 HELD = 1e-7
 """Smallest relative motion of datum unknowns that fix the datum."""
-NEAR = 1e-3
+NEAR_DATUM = 1e-3
 """A motion to the datum by less than this fraction of the problem is near convergence."""
-LONGEST = 1.0
+LONGEST_MOTION = 1.0
 """Largest single motion to the datum: radians, or a factor of e."""
-THERE = 1e-12
+AT_DATUM = 1e-12
 """A motion to the datum by less than this fraction of the problem is the last."""
 MOST_MOTIONS = 50
 
@@ -162,8 +162,8 @@ def move_to_datum(
         values, before, _, count = state
         missing, slope = _datum_equations(declared, plan, values, start)
         near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
-        slope = jnp.where(before > NEAR * size, slope, near)
-        step = limited(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
+        slope = jnp.where(before > NEAR_DATUM * size, slope, near)
+        step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
         moved = _move(declared, plan, step, values)
         differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
                        for name in datum.weight}  # fmt: skip
@@ -171,20 +171,20 @@ def move_to_datum(
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
-    return values, distance <= THERE * size
+    return values, distance <= AT_DATUM * size
 
 
 def moves_on(size, distance, before, count):
     """Whether a motion to the datum continues after a step of `distance` and a previous one of
     `before`."""
     falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
-    return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
+    return (distance > AT_DATUM * size) & falling & (count < MOST_MOTIONS)
 
 
-def limited(step, curved: tuple[int, ...]):
-    """A step of the motions, limited to `LONGEST` in the curved ones."""
+def limit_step(step, curved: tuple[int, ...]):
+    """A step of the motions, limited to `LONGEST_MOTION` in the curved ones."""
     longest = abs(step[np.array(curved, int)]).max(initial=0.0)
-    return step / (longest / LONGEST).clip(1.0)
+    return step / (longest / LONGEST_MOTION).clip(1.0)
 
 
 def largest(holding: Tangent, tables: Values):

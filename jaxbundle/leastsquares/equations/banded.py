@@ -117,7 +117,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     D, E = both.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
     D = D + unused[:, :, None] * jnp.eye(m)
-    border = [S.between(plan, g, other) for other in others]
+    border = [S.block(plan, g, other) for other in others]
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))
 

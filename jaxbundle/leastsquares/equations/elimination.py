@@ -21,12 +21,19 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.leastsquares.equations.banded import BandFactor, factorise_band
 from jaxbundle.leastsquares.equations.damping import matrices
 from jaxbundle.leastsquares.equations.iterative import ConjugateGradients, precondition
-from jaxbundle.leastsquares.equations.normal import Normal, Tangent, agreed, gather, scatter, total
+from jaxbundle.leastsquares.equations.normal import (
+    Normal,
+    Tangent,
+    average_over_devices,
+    gather,
+    scatter,
+    total,
+)
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
 from jaxbundle.leastsquares.indexing.plan import Pairs, Plan
 from jaxbundle.types import present
 
-EXACT = 1e-12
+FULL_PRECISION = 1e-12
 """Relative residual of a reduced system solved iteratively to full precision. A smaller one may be
 unreachable because of rounding, and open motions drift."""
 PIVOT = 1e-13
@@ -49,7 +56,7 @@ class Factor(eqx.Module):
 
     def inverse(self) -> Reduced:
         """The blocks of S⁻¹ where S has blocks."""
-        return self.reduced.inverse().scaled(self.plan, self.scale)
+        return self.reduced.inverse().scale_symmetrically(self.plan, self.scale)
 
 
 def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
@@ -71,7 +78,7 @@ def lift(normal: Normal) -> Normal:
 
 
 def factorise(
-    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = EXACT
+    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
 ) -> Factor:
     """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
     solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates
@@ -97,7 +104,7 @@ def reduced_system(normal: Normal, regular: Bool[Array, ""] | bool = True):
     S, lower_inverse, Z = eliminate(normal)
     diagonal = normal.diagonal()
     scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
-    S = S.scaled(plan, scale)
+    S = S.scale_symmetrically(plan, scale)
     for g, B in S.own.items():
         more = 1.0 - plan.groups[g].free
         if plan.datum is not None:
@@ -140,7 +147,7 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
         h = jnp.einsum("nij,nj->ni", factor.lower_inverse, right[e] * free)
         for g, x in gather(plan, Z, h).items():
             kept[g] = kept[g] - x * factor.scale[g]
-    x = agreed(plan, factor.reduced.solve(kept))
+    x = average_over_devices(plan, factor.reduced.solve(kept))
     x = {g: rows * plan.groups[g].free * factor.scale[g] for g, rows in x.items()}
     if e is not None:
         h = h - scatter(plan, Z, x)
@@ -160,10 +167,10 @@ def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
         product = jnp.einsum("cki,ckj->cij", left, right)
         return sums.at[k].add(product, indices_are_sorted=True)
 
-    return over_pairs(pairs, add, jnp.zeros((blocks, m, n)))
+    return sum_over_pairs(pairs, add, jnp.zeros((blocks, m, n)))
 
 
-def over_pairs(pairs: Pairs, add, sums):
+def sum_over_pairs(pairs: Pairs, add, sums):
     """`add(sums, first, second, block)` for all chunks of pairs, some at a time."""
     for chunks in zip(pairs.first, pairs.second, pairs.block):
         number, length = chunks[0].shape

@@ -1,7 +1,7 @@
 """The exact Hessian of ½vᵀPv in the blocks of the normal equations.
 
 It differs from JᵀPJ by Σ p·v·∂²v, the curvature of the observation equations and, by
-`Space.moved`, which is right to second order, that of the manifolds. Second derivatives come from
+`Space.move`, which is correct to second order, that of the manifolds. Second derivatives come from
 the function of one observation, forward over reverse, and are summed like those of Gauss–Newton
 (`normal.Sums`).
 """
@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.indexing.rows import (
     Residual,
     Values,
     fill_places,
-    over,
+    map_observations,
     prepare,
     residual_of,
 )
@@ -36,7 +36,7 @@ def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
         cost, gradient, hessian = _derivatives(declared, plan, number, prepared, laid)
         more = _blocks(declared, plan, part, gradient, hessian)
         sums.add_part(part, cost.sum(), *more)
-    return sums.finished(declared, values)
+    return sums.total(declared, values)
 
 
 def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
@@ -45,7 +45,7 @@ def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: La
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     one = _HalfSquare(residual_of(declared, part), widths)
-    return over(part, kind, prepared, laid, number, one)
+    return map_observations(part, kind, prepared, laid, number, one)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
     Tangent,
-    agreed,
+    average_over_devices,
     gather,
     scatter,
     times_kept,
@@ -33,11 +33,11 @@ from jaxbundle.leastsquares.equations.reduced import Reduced
 
 MOST_STEPS, MOST_MORE = 2000, 100
 """Steps of conjugate gradients, and of their refinement."""
-REACHED = 1e-10
+REACHABLE_RESIDUAL = 1e-10
 """The relative residual that rounding allows in one run: below it the search directions are noise,
 and steps may drift, above all along open motions. Solutions of full precision are refined once
 more, and are NaN if even this was not reached."""
-LEAST = 1e-300
+SMALLEST_DENOMINATOR = 1e-300
 
 
 class ConjugateGradients(eqx.Module):
@@ -62,7 +62,7 @@ class ConjugateGradients(eqx.Module):
         def improved(y, left, tolerance, steps):
             """y refined with the residual `left`, if that decreases it; and the new residual."""
             # lineax annotates a float, but accepts an array
-            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), LEAST)
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), SMALLEST_DENOMINATOR)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
             change = lx.linear_solve(operator, left, method, throw=False).value
             better = jax.tree.map(jnp.add, y, change)
@@ -70,11 +70,12 @@ class ConjugateGradients(eqx.Module):
             less = optx.two_norm(after) < optx.two_norm(left)
             return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
 
-        nothing, reached = jax.tree.map(jnp.zeros_like, right), max(self.tolerance, REACHED)
+        nothing = jax.tree.map(jnp.zeros_like, right)
+        reached = max(self.tolerance, REACHABLE_RESIDUAL)
         y, left = improved(nothing, right, reached, MOST_STEPS)
-        if self.tolerance < REACHED:
-            y, left = improved(y, left, self.tolerance / REACHED, MOST_MORE)
-            solved = optx.two_norm(left) <= 2 * REACHED * optx.two_norm(right)
+        if self.tolerance < REACHABLE_RESIDUAL:
+            y, left = improved(y, left, self.tolerance / REACHABLE_RESIDUAL, MOST_MORE)
+            solved = optx.two_norm(left) <= 2 * REACHABLE_RESIDUAL * optx.two_norm(right)
             y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
         return back(y)
 
@@ -94,7 +95,7 @@ class ConjugateGradients(eqx.Module):
         product = times_kept(plan, self.normal.blocks, x)
         for g, less in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
             product[g] = product[g] - less
-        return agreed(plan, {g: rows * self.scale[g] for g, rows in product.items()})
+        return average_over_devices(plan, {g: rows * self.scale[g] for g, rows in product.items()})
 
 
 def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:

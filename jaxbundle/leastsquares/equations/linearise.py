@@ -19,14 +19,14 @@ from jaxbundle.leastsquares.indexing.rows import (
     Laid,
     Residual,
     diagonal_of,
-    over,
-    over_rows,
+    map_blocks,
+    map_observations,
     residual_of,
 )
 from jaxbundle.types import present
 
 ROWS_AT_ONCE = 1 << 16
-"""Observations whose derivatives are looked at together where they are many."""
+"""Observations differentiated together, if there are many."""
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
@@ -48,7 +48,7 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     rows = _Rows(residual_of(declared, part), widths, part.large)
-    r, found = over(part, kind, prepared, laid, number, rows)
+    r, found = map_observations(part, kind, prepared, laid, number, rows)
     # Computed once, not again in every loop that uses some of its columns.
     r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
     shape, starts = r[0].shape, np.cumsum((0, *widths))
@@ -64,15 +64,15 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
 
     touches = []
     for touch in part.touches:
-        touches.append(without_held(plan, touch, block(touch.slots, touch.start, touch.stop)))
+        touches.append(zero_held_columns(plan, touch, block(touch.slots, touch.start, touch.stop)))
     E = None
     if plan.eliminated is not None and part.slot is not None:
         E = block(((part.slot, 0),), 0, widths[part.slot])
-        E = eliminated_without_held(plan, part, E)
+        E = zero_held_columns_of_eliminated(plan, part, E)
     return jnp.stack(r, -1), tuple(touches), E
 
 
-def without_held(plan: Plan, touch: Touch, J):
+def zero_held_columns(plan: Plan, touch: Touch, J):
     """The block of a touch with zeros in the columns of held unknowns."""
     group = plan.groups[touch.group]
     if group.all_free:
@@ -80,7 +80,7 @@ def without_held(plan: Plan, touch: Touch, J):
     return J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
 
 
-def eliminated_without_held(plan: Plan, part: Part, E):
+def zero_held_columns_of_eliminated(plan: Plan, part: Part, E):
     """The block of the eliminated rows of a part with zeros in the columns of held unknowns."""
     group = plan.groups[present(plan.eliminated)]
     return E if group.all_free else E * group.free[part.eliminated][:, :, None, :]
@@ -90,7 +90,7 @@ def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
     """Residuals [chunks, length, r] of `function(blocks, measured, weight, changes)` of every
     observation, and their derivatives by the changes of every slot [chunks, length, r, width]."""
     rows = _Rows(function, widths, True)
-    r, found = over_rows(rows, part.by_row, blocks, measured, weight)
+    r, found = map_blocks(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
     none = jnp.zeros((*r[0].shape, 0))
     of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
@@ -102,8 +102,8 @@ def differentiate_chunks(
     declared: Declared, plan: Plan, number: int, prepared, laid: Laid, of_chunk
 ):
     """`of_chunk(part, r, touches, E)` of every chunk of a part, [length, …] each, some chunks at a
-    time, so that derivatives of all of it (2 000 000 rows) are never there at once. The incidences
-    of the touches are always numbered."""
+    time, so that derivatives of all of it (2 000 000 rows) are never in memory at once. The
+    incidences of the touches are always numbered."""
     part = plan.parts[number]
     chunks, length = part.source.shape
     in_order = jnp.arange(chunks * length).reshape(chunks, length)

@@ -2,13 +2,13 @@
 hundreds of knots of a spline camera.
 
 A kind that declares this (`Kind.local`) names, for one observation, the columns its residuals
-depend on at the values as they are, and has its residual as a function of the values in these
+depend on at the current values, and has its residual as a function of the values in these
 columns. J then has their derivatives alone, and products are added to N where they belong:
 
     N[cᵢ, cⱼ] += JᵢᵀJⱼ,    g[cᵢ] += Jᵢᵀr        c the columns of the observation
 
 in place of products of rows that are zero nearly everywhere. Which columns they are may change from
-iteration to iteration; nothing of it is planned.
+iteration to iteration; they are not part of the plan.
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.equations.linearise import (
     differentiate_rows,
-    eliminated_without_held,
     widths_of,
-    without_held,
+    zero_held_columns,
+    zero_held_columns_of_eliminated,
 )
 from jaxbundle.leastsquares.indexing.plan import Part, Plan
-from jaxbundle.leastsquares.indexing.rows import Declared, Laid, look_up, over_rows, weighted
+from jaxbundle.leastsquares.indexing.rows import Declared, Laid, look_up, map_blocks, whiten
 from jaxbundle.leastsquares.spaces import Space, Vector
 
 
@@ -44,7 +44,7 @@ class LocalJacobian:
 
 
 def local_touch(declared: Declared, part: Part) -> int | None:
-    """Which touch of a part is of few of many columns; None: none is."""
+    """The touch of a part that uses few of many columns; None if there is none."""
     kind = declared.kinds[part.observations]
     if kind.local is None or not part.large:
         return None
@@ -64,7 +64,7 @@ def differentiate_locally(
     assert local is not None
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
     measured, weight = laid.measured[number], laid.weight[number]
-    at = over_rows(_Columns(kind), part.by_row, blocks, measured, weight)
+    at = map_blocks(_Columns(kind), part.by_row, blocks, measured, weight)
     table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]
     values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in at)
     spaces = tuple(declared.spaces[name] for name in kind.of)
@@ -92,11 +92,11 @@ def differentiate_locally(
             )  # fmt: skip
             J = J * mask[:, :, None, :]
         else:
-            J = without_held(plan, one, J)
+            J = zero_held_columns(plan, one, J)
         found.append(J)
     E = None
     if plan.eliminated is not None and part.slot is not None:
-        E = eliminated_without_held(plan, part, blocks[part.slot])
+        E = zero_held_columns_of_eliminated(plan, part, blocks[part.slot])
     return LocalJacobian(r, tuple(found), E, touch, columns)
 
 
@@ -123,10 +123,10 @@ class _LocalResidual:
         assert local is not None
         values = tuple(v + d for v, d in zip(values, changes[local.slot], strict=True))
         moved: list[Any] = [
-            block if slot == local.slot else space.moved(block, change)
+            block if slot == local.slot else space.move(block, change)
             for slot, (space, block, change) in enumerate(zip(self.spaces, blocks, changes))
         ]
-        return weighted(local.residual(*moved, columns, values, measured), weight)
+        return whiten(local.residual(*moved, columns, values, measured), weight)
 
 
 def products_of(
@@ -139,7 +139,7 @@ def products_of(
         products = jnp.einsum("kri,krj->kij", J, J)
         return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
 
-    nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # of the devices that J is of
+    nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # varying over the devices like J
     return jax.lax.scan(add, nothing, (row, J, columns))[0]
 
 

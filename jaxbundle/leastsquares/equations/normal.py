@@ -105,7 +105,7 @@ def total(plan: Plan, parts):
     return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
 
 
-def agreed(plan: Plan, value):
+def average_over_devices(plan: Plan, value):
     """The mean over the devices of values that should be the same on all, to make them identical to
     the last digit: devices that decide differently would deadlock."""
     return value if plan.axis is None else jax.lax.pmean(value, plan.axis)
@@ -168,7 +168,7 @@ def normal_equations(
             continue
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
         sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
-    return sums.finished(declared, values)
+    return sums.total(declared, values)
 
 
 def _products_of(part: Part, r, touches, E):
@@ -289,7 +289,7 @@ class Sums:
             *plan.eliminated.shape, *W.shape[1:]
         )
 
-    def finished(self, declared: Declared, values: Values):
+    def total(self, declared: Declared, values: Values):
         plan, e = self.plan, self.plan.eliminated
         kept = lambda tree: {name: x for name, x in tree.items() if name != e}
         own, off, cost, gradient = total(

@@ -27,7 +27,7 @@ class Reduced(eqx.Module):
     own: dict[str, Float[Array, "rows w w"]]
     off: dict[Key, Float[Array, "blocks w v"]]
 
-    def scaled(self, plan: Plan, scale: Tangent) -> "Reduced":
+    def scale_symmetrically(self, plan: Plan, scale: Tangent) -> "Reduced":
         """Rows and columns times `scale`."""
         times = lambda B, s, t: B * s[:, :, None] * t[:, None, :]
         return Reduced(
@@ -40,15 +40,15 @@ class Reduced(eqx.Module):
         """The matrix of some groups; only its lower triangle is right."""
         size = lambda g: plan.groups[g].free.size
         rows = [
-            [self.between(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
+            [self.block(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
              for j, b in enumerate(groups)] for i, a in enumerate(groups)
         ]  # fmt: skip
         return jnp.block(rows) if rows else jnp.zeros((0, 0))
 
-    def between(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
+    def block(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
         """The matrix of two groups; of one with itself only its lower triangle is right."""
         if (b, a) in self.off and a != b:
-            return self.between(plan, b, a).T
+            return self.block(plan, b, a).T
         (n, w), (m, v) = plan.groups[a].free.shape, plan.groups[b].free.shape
         matrix = jnp.zeros((n, m, w, v))
         if (a, b) in self.off:

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-UNSEEN = 1e-2
+SMALLEST_REDUNDANCY = 1e-2
 """Directions with a smaller redundancy number carry no information."""
 
 
@@ -80,7 +80,7 @@ def find_alternatives(
     def explained(*which: int) -> float:
         rows = np.concatenate([observations[i] for i in which])
         size, axes = np.linalg.eigh(R[np.ix_(rows, rows)])
-        seen = size > UNSEEN
+        seen = size > SMALLEST_REDUNDANCY
         along = axes[:, seen].T @ residual[rows]
         return float(along**2 @ (1 / size[seen]))
 

@@ -74,7 +74,7 @@ def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) 
     return {key: rounder(key, size) for key, size in largest.items()}
 
 
-def rounded(number: int) -> int:
+def round_up(number: int) -> int:
     """The next number of the form m·2ⁿ with STEPS ≤ m < 2·STEPS; small ones as they are."""
     step = 1 << max(number.bit_length() - STEPS.bit_length(), 0)
     return -(-number // step) * step

@@ -9,7 +9,7 @@ from jaxbundle.leastsquares.indexing.plan import Key, Pairs
 CHUNK_LENGTHS = (256, 64, 16)
 MOST_EMPTY = 0.1
 """Chunks may pad a part by this fraction."""
-SMALL = 2000
+SMALL_PART = 2000
 """Parts with fewer observations have chunks of length one, and compile in a tenth of the time."""
 PAIR_CHUNKS, FEW_PAIR_CHUNKS = (256, 32, 4), (8,)
 FEW_PAIRS = 50_000
@@ -23,7 +23,7 @@ def chunk_length(major: Int[np.ndarray, " n"]) -> int:
         length for length in CHUNK_LENGTHS
         if (-(-number // length) * length).sum() <= (1 + MOST_EMPTY) * len(major)
     )  # fmt: skip
-    return next(fits, 1) if len(major) >= SMALL else 1
+    return next(fits, 1) if len(major) >= SMALL_PART else 1
 
 
 def lay_out(major: Int[np.ndarray, " n"], minor: Int[np.ndarray, " n"], length: int):

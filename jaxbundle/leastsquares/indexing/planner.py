@@ -11,7 +11,7 @@ from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.indexing.grouping import Choices, Grouping, Share
 from jaxbundle.leastsquares.indexing.indices import Sizes, as_column, as_index, count
 from jaxbundle.leastsquares.indexing.layout import (
-    SMALL,
+    SMALL_PART,
     chunk_length,
     chunk_pairs,
     lay_out,
@@ -56,7 +56,7 @@ class _LaidPart:
 
 @dataclasses.dataclass
 class _LaidIncidences:
-    """Incidences of a group in their chunks; of those that are one: place, both rows."""
+    """Incidences of a group in their chunks; for each incidence: place, both rows."""
 
     incidences: Incidences
     live: Int[np.ndarray, " n"]
@@ -110,7 +110,7 @@ class _Planner:
         minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
         along = ("part", k)
         length = self.choose("length", along, found=chunk_length(major))
-        large = self.choose("large", k, found=len(major) >= SMALL)
+        large = self.choose("large", k, found=len(major) >= SMALL_PART)
         order, used = lay_out(major, minor, length)
         chunk = lambda x: x[order].reshape(-1, length)
         lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)

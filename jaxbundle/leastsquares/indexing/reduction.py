@@ -20,7 +20,7 @@ from jaxtyping import Array, Int
 from jaxbundle.leastsquares.indexing.indices import as_column
 
 FACTORS = ("dense", "banded")
-SMALL = 1000
+ALWAYS_DENSE = 1000
 """Smaller reduced systems are always solved densely."""
 GAIN = 3.0
 """Required saving of operations relative to the dense solver."""
@@ -51,7 +51,7 @@ def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, 
 
     `ties(group)`: row and column of its blocks beside the diagonal."""
     unknowns = sum(n * w for n, w in shapes.values())
-    if not shapes or (len(ways) > 1 and unknowns < SMALL):
+    if not shapes or (len(ways) > 1 and unknowns < ALWAYS_DENSE):
         return "dense", None
     group = max(shapes, key=lambda g: np.prod(shapes[g]))
     (row, column), (rows, w) = ties(group), shapes[group]

@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.indexing.plan import Part, Plan
 from jaxbundle.leastsquares.spaces import Space, Vector
 from jaxbundle.types import AnyArray
 
-WIDE = 64
+MOST_RESIDUALS = 64
 """Residuals of one observation, as of the priors of a spline camera."""
 
 Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
@@ -93,13 +93,13 @@ class Residual:
 
     def __call__(self, blocks, measured, weight, changes=None):
         changes = ((),) * len(self.spaces) if changes is None else changes
-        moved = [s.moved(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
-        return weighted(evaluate(self.kind, moved, measured), weight)
+        moved = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
+        return whiten(evaluate(self.kind, moved, measured), weight)
 
 
     def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
         """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
-        of columns, as scalars of which XLA compiles for minutes."""
+        of columns, which XLA would compile for minutes as scalars."""
         moved = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
@@ -108,7 +108,7 @@ class Residual:
                     columns, of = (jnp.array(x, int) for x in space.moves)
                     block = block.at[columns].add(change[of])
             else:
-                block = _stack(space.moved(block, tuple(change)))
+                block = _stack(space.move(block, tuple(change)))
             moved.append(block)
         given = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is tuple)
         found, w = self.kind.residual(*moved, given), jnp.stack(weight)
@@ -116,8 +116,9 @@ class Residual:
         return jnp.where(w > 0, w * v, 0.0)
 
     def is_wide(self, weight) -> bool:
-        """Whether `array` is the way: the kind is one of arrays, with a weight for each."""
-        return not self.kind.scalars and len(weight) > WIDE and not isinstance(weight[0], tuple)
+        """Whether to use `array`: the kind works on arrays and has a weight per residual."""
+        many = len(weight) > MOST_RESIDUALS
+        return not self.kind.scalars and many and not isinstance(weight[0], tuple)
 
 
 def residual_of(declared: Declared, part: Part) -> Residual:
@@ -144,7 +145,7 @@ def _stack(block) -> Any:
     return block
 
 
-def weighted(v, weight):
+def whiten(v, weight):
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
         rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
@@ -176,16 +177,16 @@ def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
     return dataclasses.replace(plan, parts=tuple(parts)), Laid(tuple(measured), laid.weight)
 
 
-def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) -> Any:
+def map_observations(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) -> Any:
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
     axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
-    return over_rows(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
+    return map_blocks(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
 
 
 @partial(jax.jit, static_argnums=(0, 1), inline=True)
-def over_rows(function, by_row, blocks, measured, weight):
-    """`over` of blocks that are looked up."""
+def map_blocks(function, by_row, blocks, measured, weight):
+    """`map_observations` of blocks that are looked up."""
     axes = tuple(0 if one else None for one in by_row)
     return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
 
@@ -201,12 +202,12 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     prepared, found = prepare(declared, values), []
     for number, part in enumerate(plan.parts):
         kind = declared.kinds[part.observations]
-        rows = over(part, kind, prepared, laid, number, residual_of(declared, part))
+        rows = map_observations(part, kind, prepared, laid, number, residual_of(declared, part))
         found.append(jnp.stack(rows, -1))
     return tuple(found)
 
 
-def in_given_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
+def restore_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
     """Quantities by observation of every part, rearranged by set of observations in the given
     order."""
     found: dict[int, Float[Array, "n ..."]] = {}

@@ -17,7 +17,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.choices import METHODS
 from jaxbundle.leastsquares.equations.damping import times
-from jaxbundle.leastsquares.equations.elimination import EXACT, Factor, damp, factorise, solve
+from jaxbundle.leastsquares.equations.elimination import (
+    FULL_PRECISION,
+    Factor,
+    damp,
+    factorise,
+    solve,
+)
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, dot
 
 
@@ -30,9 +36,9 @@ class Info(optx.FunctionInfo.EvalGradHessian):
     noise: Float[Array, ""]
 
 
-SUFFICIENT = 1e-3
+SUFFICIENT_DECREASE = 1e-3
 """A step is accepted if it achieves this fraction of the predicted decrease."""
-WIDEST = 1e16
+LARGEST_RADIUS = 1e16
 """Radius of the trust region beyond which damping is rounding."""
 UNDAMPED_DATUM = 1e8
 """Steps with less damping need regularised datum directions."""
@@ -44,7 +50,7 @@ class Elimination(lx.AbstractLinearSolver):
     """Solves with N by elimination, for any descent that takes a linear solver."""
 
     regular: bool | Bool[Array, ""] = True
-    tolerance: float = eqx.field(static=True, default=EXACT)
+    tolerance: float = eqx.field(static=True, default=FULL_PRECISION)
 
     def init(self, operator: Normal, options: dict[str, Any]) -> Factor:
         if not isinstance(operator, Normal):
@@ -95,9 +101,9 @@ class RegionState(eqx.Module):
     def after(self, first, kept) -> tuple[Bool[Array, ""], "RegionState"]:
         """Whether a step with this fraction of the predicted decrease is accepted, and the next
         region: widened by the rule of Nielsen (1999), narrowed by 2, 4, 8, …"""
-        accept = first | (kept > SUFFICIENT)
-        finite = jnp.minimum(self.radius, WIDEST)
-        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), WIDEST)
+        accept = first | (kept > SUFFICIENT_DECREASE)
+        finite = jnp.minimum(self.radius, LARGEST_RADIUS)
+        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), LARGEST_RADIUS)
         radius = jnp.where(accept, wider, finite / self.reduction)
         radius = jnp.where(first, self.radius, radius)
         return accept, RegionState(radius, jnp.where(accept, 2.0, 2.0 * self.reduction))

@@ -22,11 +22,11 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.iterations.loop import iterate
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
-DETERMINED = 1e-10
+SMALLEST_EIGENVALUE = 1e-10
 """Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem."""
-MOST = 30
+MOST_EVALUATIONS = 30
 """Evaluations."""
-SETTLED = 1e-8
+LAST_STEP = 1e-8
 """The last step moves no unknown by more than this fraction of its σ; an undamped step follows."""
 
 
@@ -43,16 +43,22 @@ class Fit(eqx.Module):
 
     @property
     def determined(self):
-        return self.weakest > DETERMINED
+        return self.weakest > SMALLEST_EIGENVALUE
 
 
-def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
+def adjust(
+    residuals: Callable, retract: Callable, start, data: tuple, unknowns: int,
+    steps=MOST_EVALUATIONS
+):  # fmt: skip
     """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
     estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
     return finish(residuals, retract, estimate, data, unknowns)
 
 
-def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
+def minimise(
+    residuals: Callable, retract: Callable, start, data: tuple, unknowns: int,
+    steps=MOST_EVALUATIONS
+):  # fmt: skip
     """The estimate at the end of the iterations, and its vᵀv, without derivatives.
 
     **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum
@@ -75,7 +81,7 @@ def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknown
     def tolerance(equations):
         N, _, rows = equations
         zero = jnp.zeros((), N.dtype)
-        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + SETTLED, zero)
+        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + LAST_STEP, zero)
 
     loop = iterate(linearise, step, retract, start, tolerance, steps)
     return loop.at, jnp.where(jnp.isfinite(loop.cost), 2 * loop.cost, jnp.inf)
@@ -89,7 +95,7 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
     scaled = N * scale * scale[:, None]
     weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
-    determined = weakest > DETERMINED
+    determined = weakest > SMALLEST_EIGENVALUE
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)

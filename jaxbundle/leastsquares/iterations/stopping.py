@@ -35,7 +35,7 @@ NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 
 Without redundancy all residuals vanish and there is no σ0 for stopping: this wider floor is used.
 """
-NEAR = 0.1
+NEAR_SOLUTION = 0.1
 """Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction. A
 rejected undamped step makes the limit of its problem ten times narrower, and nothing else: only
 those after a damped step that settled count as `REFUSALS`."""
@@ -43,7 +43,7 @@ KEPT, FALLING = 0.95, 0.5
 """The fraction of its prediction that it must achieve, and its limit relative to the one before."""
 REFUSALS = 2
 """Number of rejected undamped steps, after damped ones settled, that means (nearly) singular."""
-SHORTEST = 1e-20
+SHORTEST_STEP = 1e-20
 """The smallest step size worth trying."""
 
 
@@ -83,7 +83,7 @@ class Approach(eqx.Module):
     @classmethod
     def begin(cls) -> "Approach":
         no = jnp.asarray(False)
-        return cls(jnp.asarray(NEAR), jnp.asarray(0.0), no, no, no, jnp.asarray(0))
+        return cls(jnp.asarray(NEAR_SOLUTION), jnp.asarray(0.0), no, no, no, jnp.asarray(0))
 
     def choose_step(self, step_size, last_size, first, accept, promised, kept, cost):
         """The step size, infinite for an undamped step; and the approach after it."""
@@ -118,7 +118,7 @@ class Approach(eqx.Module):
             (stalled & ~singular, RELATIVE_COST),
             ((small | stalled) & singular, SINGULAR),
             (again, SINGULAR),
-            ((step_size < SHORTEST) & ~small, STUCK),
+            ((step_size < SHORTEST_STEP) & ~small, STUCK),
         )
         termination = jnp.asarray(LIMIT)
         for happened, reason in reversed(reasons):

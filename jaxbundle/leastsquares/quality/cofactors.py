@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.datum.conditions import (
     s_transform_transposed,
     zeros_of_tables,
 )
-from jaxbundle.leastsquares.equations.elimination import Factor, over_pairs, solve
+from jaxbundle.leastsquares.equations.elimination import Factor, solve, sum_over_pairs
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import Reduced
 from jaxbundle.leastsquares.indexing.plan import Plan
@@ -103,7 +103,7 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
             return (totals[0].at[i].add(back).at[j].add(forth),)
         return totals[0].at[i].add(back), totals[1].at[j].add(forth)
 
-    totals = over_pairs(pairs, add, totals)
+    totals = sum_over_pairs(pairs, add, totals)
     # The row that represents nothing has accumulated the padding of chunks.
     return totals[0], totals[0 if within else 1]
 

@@ -18,11 +18,11 @@ from jaxbundle.leastsquares.solution import Solution
 
 ROUNDS = 20
 """Largest number of estimations of variance components."""
-SETTLED = 1e-3
+SMALLEST_CHANGE = 1e-3
 """Components closer to 1 are not estimated again."""
 LEAST_REDUNDANCY = 1.0
 """A group with less redundancy than this has no usable component."""
-EXACT = 1e-9
+ROUNDING_RESIDUAL = 1e-9
 """Residuals below this fraction of their a priori σ are rounding errors: nothing to estimate."""
 
 
@@ -70,7 +70,7 @@ class Component:
     @property
     def usable(self) -> bool:
         """Whether the σ of the group can be estimated from its residuals."""
-        return self.redundancy >= LEAST_REDUNDANCY and self.sigma > EXACT
+        return self.redundancy >= LEAST_REDUNDANCY and self.sigma > ROUNDING_RESIDUAL
 
 
 def variance_components(
@@ -112,7 +112,7 @@ def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estim
         components = variance_components(found, groups, factors)
         usable = {name: c for name, c in components.items() if c.usable}
         factors = {name: c.factor for name, c in usable.items()} | factors
-        unsettled = [name for name, c in usable.items() if abs(c.ratio - 1) >= SETTLED]
+        unsettled = [name for name, c in usable.items() if abs(c.ratio - 1) >= SMALLEST_CHANGE]
         if done == ROUNDS or not unsettled:
             return Estimate(found, factors, unsettled)
         ratios = {name: c.ratio for name, c in usable.items()}

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxbundle.arguments import one_of, positive, whole
+from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.implicit import derivative_along, differentiable_once, implicit_root
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.equations import elimination
@@ -45,12 +45,12 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import find, half_square
 from jaxbundle.leastsquares.iterations.stopping import converged
-from jaxbundle.leastsquares.problem import Problem, given_data, make_solver, without_filling
+from jaxbundle.leastsquares.problem import Problem, complete_data, make_solver, without_filling
 from jaxbundle.system.programs import compile_once
 
 Sensitivity = Literal["exact", "gauss-newton"]
 
-ONCE = (
+FIRST_ORDER_ONLY = (
     'sensitivity = "gauss-newton" has first derivatives only: '
     'take second ones with sensitivity = "exact"'
 )
@@ -82,8 +82,8 @@ def solve(
     form.
     """
     one_of("sensitivity", sensitivity, get_args(Sensitivity))
-    steps, atol = whole("max_iterations", max_iterations), positive("atol", atol)
-    data = given_data(problem, data)
+    steps, atol = integer("max_iterations", max_iterations), positive("atol", atol)
+    data = complete_data(problem, data)
     solver = make_solver(problem, atol=atol, max_steps=steps, **options)
     fixed = jax.lax.stop_gradient(data)
     minimum = find(solver, fixed, fixed.start)
@@ -105,7 +105,7 @@ class Linearised(eqx.Module):
     factor: elimination.Factor
     pins: Tangent
 
-    def given(self, data: Data) -> Values:
+    def hold_given(self, data: Data) -> Values:
         """The solution with held values taken from the start values."""
         free = datum.free_of_tables(self.plan, self.declared, self.values)
         return {
@@ -117,10 +117,10 @@ class Linearised(eqx.Module):
         """v/σ after a change of the unknowns."""
         plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
         change = {name: x * plan.groups[name].free for name, x in change.items()}
-        return residuals(self.declared, plan, self.moved(change, data), laid)
+        return residuals(self.declared, plan, self.move(change, data), laid)
 
-    def moved(self, change: Tangent, data: Data) -> Values:
-        return retract(self.declared, self.plan, self.given(data), change)
+    def move(self, change: Tangent, data: Data) -> Values:
+        return retract(self.declared, self.plan, self.hold_given(data), change)
 
 
 @compile_once
@@ -141,9 +141,9 @@ def attach_derivatives(
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
-        return at.moved(_propagate(change, at, data), data)
+        return at.move(_propagate(change, at, data), data)
     change = implicit_root(gradient_after, _solve_structured, step, at, data)
-    return datum.attach_motion(declared, plan, at.moved(change, data), data.start)
+    return datum.attach_motion(declared, plan, at.move(change, data), data.start)
 
 
 def linearise(
@@ -199,7 +199,7 @@ def _propagate(change: Tangent, at: Linearised, data: Data) -> Tangent:
 @_propagate.def_jvp
 def _(primals, tangents):
     change, at, data = primals
-    data, still = differentiable_once(data, ONCE), zero_tangent(at.plan)
+    data, still = differentiable_once(data, FIRST_ORDER_ONLY), zero_tangent(at.plan)
 
     def right(data):
         # J is constant except for its weights.

@@ -18,7 +18,7 @@ from jaxbundle.types import present
 
 INDETERMINATE = 1e-12
 """Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions."""
-SHARE = 0.05
+SMALLEST_PART = 0.05
 """An unknown with a larger part in undetermined directions is listed."""
 
 
@@ -73,7 +73,7 @@ def undetermined(
     null = vectors[:, eigenvalues < threshold * max(1.0, eigenvalues[-1:].sum())]
     share, names = (null**2).sum(1), kept_unknowns(problem)
     order = np.argsort(-share, kind="stable")
-    return [str(name_of(problem, *names[i])) for i in order if share[i] > SHARE] + rows
+    return [str(name_of(problem, *names[i])) for i in order if share[i] > SMALLEST_PART] + rows
 
 
 def scaled_system(problem: Problem, values: Values):

@@ -23,7 +23,7 @@ from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, fill_places, lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import retract
-from jaxbundle.leastsquares.problem import Problem, given_data, with_factor, without_filling
+from jaxbundle.leastsquares.problem import Problem, complete_data, with_factor, without_filling
 from jaxbundle.leastsquares.quality.cofactors import blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.quality.reliability import reliability
 from jaxbundle.system.programs import compile_once
@@ -54,8 +54,8 @@ def precision(
     """
     problem = with_factor(problem)
     if problem.plan.reduction not in FACTORS:
-        raise InputError("precision: the problem is too large for its covariance; take part of it")
-    declared, plan, data = problem.declared, problem.plan, given_data(problem, data)
+        raise InputError("precision: the problem is too large for its covariance; use a part of it")
+    declared, plan, data = problem.declared, problem.plan, complete_data(problem, data)
 
     def functions(change):
         return jnp.ravel(

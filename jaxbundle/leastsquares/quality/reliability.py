@@ -29,9 +29,9 @@ from jaxbundle.leastsquares.indexing.rows import (
     Laid,
     Values,
     diagonal_of,
-    in_given_order,
     lay_out_data,
     prepare,
+    restore_order,
 )
 from jaxbundle.leastsquares.quality.cofactors import Cofactors
 from jaxbundle.system.programs import compile_once
@@ -59,7 +59,7 @@ def reliability(
     """Redundancy numbers and test statistics of all observations."""
     laid = lay_out_data(plan, data)
     found = hat_diagonal(declared, plan, values, laid, Q)
-    residual, hat, own = (in_given_order(plan, rows) for rows in found)
+    residual, hat, own = (restore_order(plan, rows) for rows in found)
     number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
     r = {o: number(h, diagonal_of(data.weight[o])) for o, h in hat.items()}
     test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)

@@ -26,14 +26,14 @@ from jaxbundle.leastsquares.datum.conditions import attach_motion
 from jaxbundle.leastsquares.equations.elimination import Factor, solve
 from jaxbundle.leastsquares.equations.normal import Tangent, dot, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
-from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, in_given_order
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
 from jaxbundle.leastsquares.iterations.solver import half_square
 from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_after
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
-AT_ONCE = 16
+CHANGES_AT_ONCE = 16
 """Changes handled by one call of the program."""
 REACHED, ENOUGH = 1e-11, 1e-6
 """Relative residual (norm of N⁻¹) at which conjugate gradients stop, and that a result has."""
@@ -50,9 +50,9 @@ def follow(found: Solution, changes: Sequence[Change]) -> Iterator[Values]:
     **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = found.given
     still = jax.tree.map(np.asarray, values)
-    for first in range(0, len(changes), AT_ONCE):
-        some = changes[first : first + AT_ONCE]
-        held = jax.tree.map(lambda x: np.zeros((AT_ONCE, *x.shape)), still)
+    for first in range(0, len(changes), CHANGES_AT_ONCE):
+        some = changes[first : first + CHANGES_AT_ONCE]
+        held = jax.tree.map(lambda x: np.zeros((CHANGES_AT_ONCE, *x.shape)), still)
         for k, change in enumerate(some):
             for table, row, amount in change:
                 jax.tree.map(lambda x, a, k=k, row=row: _add(x, k, row, a), held[table], amount)
@@ -127,12 +127,12 @@ def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: 
 
 @compile_once
 def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
-    """By measurement, by residual, and the residual of the equations."""
+    """Derivatives by measurements and by residuals, and the residual of the equations."""
     at = Linearised(declared, plan, values, data, factor, {})
     still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
     def changes(change):
-        """Of all tables."""
+        """The changes of all tables."""
         moved = _in_datum(at, change, data.start)
         of = lambda name, space: jax.vmap(space.difference)(moved[name], values[name])
         return {name: of(name, space) for name, space in declared.named_spaces}
@@ -150,14 +150,14 @@ def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, facto
         slopes = jax.tree.map(jnp.negative, jax.grad(along)(data.measured))
         residuals = lambda change: at.residuals(change, data)
         of_parts = jax.jvp(residuals, (still,), (adjoint,))[1]
-        return slopes, in_given_order(plan, of_parts), left
+        return slopes, restore_order(plan, of_parts), left
 
     return jax.lax.map(one, rows)
 
 
 def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
     """The tables after a change, in the datum defined by `start`."""
-    moved = at.moved(change, dataclasses.replace(at.data, start=start))
+    moved = at.move(change, dataclasses.replace(at.data, start=start))
     return attach_motion(at.declared, at.plan, moved, start)
 
 

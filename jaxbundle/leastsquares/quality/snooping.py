@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.solution import Solution, take_step
 
-TOGETHER = 0.5
+REMOVED_TOGETHER = 0.5
 """Observations are removed together with the worst if their test is at least this fraction of
 its."""
 STEPPING = 20_000
@@ -187,7 +187,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
     if worst and other > max(critical, largest):
         return [worst]
-    at = np.flatnonzero(together > max(critical, other, TOGETHER * largest))
+    at = np.flatnonzero(together > max(critical, other, REMOVED_TOGETHER * largest))
     if not len(at):
         return []
     pick = lambda by_set: np.array([by_set[o][k] for o, k in zip(of[at], row[at])])

@@ -1,15 +1,16 @@
 """What observations determine in name only: the weakest directions, in the words of the unknowns.
 
-The σ of an unknown says little by itself; compared with an *extent* e of what it measures it does:
-a place with a distance, an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
+The σ of an unknown means little by itself; it is compared with an *extent* e: that of a position
+with a distance, that of an angle with a radian. With E = diag(e), the datum S and Q = N⁻¹, the
 largest eigenvalues μ of
 
     A = E⁻¹·S·Q·Sᵀ·E⁻¹
 
 belong to the weakest directions, and no σ is larger than σ0·√μ₁ extents. They are found by subspace
-iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the factor
-that exists, never an inverse; where the cofactors are at hand, the σ are read from these. What has
-no extent is not judged. Eliminated rows count by the σ they have where everything else is given.
+iteration (Golub and Van Loan, Matrix Computations, section 8.2.4): a few solutions with the
+existing factor, never an inverse; if the cofactors are available, the σ are taken from them.
+Unknowns without an extent are not judged. Eliminated rows are judged by their σ with everything
+else given.
 """
 
 import dataclasses
@@ -30,14 +31,14 @@ from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
 from jaxbundle.system.programs import compile_once
 
-VAGUE = 50.0
+VAGUE_RATIO = 50.0
 """An unknown whose σ is above a fiftieth of its extent is determined in name only."""
-FAR = 10.0
+NONLINEAR_RATIO = 10.0
 """A row whose σ is above a tenth of its extent: errors of the second order in it are as large as
 those that least squares propagate."""
 DIRECTIONS, ROUNDS = 6, 8
-"""Of the subspace iteration: directions looked for, products with A."""
-SMALL = 1000
+"""Numbers of directions and of products with A of the subspace iteration."""
+SMALL_SYSTEM = 1000
 """Reduced systems with fewer unknowns have their cofactors computed for this."""
 
 Extents = dict[str, Float[np.ndarray, "rows *width"]]
@@ -46,9 +47,9 @@ Extents = dict[str, Float[np.ndarray, "rows *width"]]
 
 @dataclasses.dataclass(frozen=True)
 class Weak:
-    """`names` of kept unknowns with a σ above 1/`VAGUE` of their extent, the weakest first;
-    `worst`: the largest of these ratios. `rows`: eliminated ones with a σ above 1/`FAR` of theirs,
-    of so many judged."""
+    """`names` of kept unknowns with a σ above 1/`VAGUE_RATIO` of their extent, the weakest first;
+    `worst`: the largest of these ratios. `rows`: eliminated ones with a σ above 1/`NONLINEAR_RATIO`
+    of theirs, of so many judged."""
 
     names: tuple[str, ...] = ()
     worst: float = 0.0
@@ -57,10 +58,10 @@ class Weak:
 
 
 def find_weak(found: Solution, extents: Extents, sigma0: float) -> Weak:
-    """The weak directions of a solution; none are looked for where there is no factor."""
+    """The weak directions of a solution; none without a factor."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
-    at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL
+    at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL_SYSTEM
     return _weak(found, found.factor, extents, sigma0, at_hand)
 
 
@@ -95,7 +96,7 @@ def _weak(found: Solution, factor: Factor, extents: Extents, sigma0: float, at_h
     else:
         sigma = _sigma_of_weakest(found, factor, per_extent)
     sigma = sigma0 * sigma
-    order = np.argsort(-sigma, kind="stable")[: (VAGUE * sigma > 1).sum()]
+    order = np.argsort(-sigma, kind="stable")[: (VAGUE_RATIO * sigma > 1).sum()]
     names = kept_unknowns(problem) if len(order) else []
     return Weak(
         tuple(str(name_of(problem, *names[k])) for k in order), float(sigma.max(initial=0.0)),
@@ -120,7 +121,7 @@ def _far_rows(problem: Problem, factor: Factor, extents: Extents, sigma0: float)
     judged = free & (extent > 0)
     size = np.sqrt((L[real] ** 2).sum((1, 2))) * sigma0
     ratio = np.where(judged, size / np.where(judged, extent, 1.0), 0.0)
-    far = np.argsort(-ratio, kind="stable")[: (FAR * ratio > 1).sum()]
+    far = np.argsort(-ratio, kind="stable")[: (NONLINEAR_RATIO * ratio > 1).sum()]
     return tuple(rows[far].tolist()), int(judged.sum())
 
 

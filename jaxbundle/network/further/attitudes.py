@@ -46,7 +46,7 @@ def attitude(pose, boresight, measured):
     return omega_phi_kappa_near(M, measured) - measured
 
 
-def turned(boresight, given):
+def boresight_misclosure(boresight, given):
     """The rotation vector of a boresight relative to the given one [3, 3], for small
     differences."""
     R = boresight.matrix() @ given.T
@@ -54,7 +54,7 @@ def turned(boresight, given):
 
 
 ATTITUDE = Kind("attitudes", attitude, ("image", "boresight"), ANGLES)
-PRIOR = Kind("prior of boresight", turned, ("boresight",), ANGLES, snooped="")
+PRIOR = Kind("prior of boresight", boresight_misclosure, ("boresight",), ANGLES, snooped="")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.arguments import positive, shown
+from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, Observations, Table
 from jaxbundle.network.columns import Columns, did_you_mean
@@ -144,7 +144,7 @@ def positive_sigma(
 def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
     """Refuse settings of a section that are not known."""
     if not isinstance(given, Mapping):
-        raise InputError(f"[{section}]: a section of settings is expected, not {shown(given)}")
+        raise InputError(f"[{section}]: a section of settings is expected, not {show(given)}")
     for key in given:
         if key not in known:
             raise InputError(f"[{section}]: unknown key {key!r}{did_you_mean(key, known)}")
@@ -159,7 +159,7 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
     except (TypeError, ValueError):
         found = np.zeros(0)
     if found.shape != (length,) or not np.isfinite(found).all():
-        raise InputError(f"[{section}]: {key} is {shown(value)}; {length} numbers are expected")
+        raise InputError(f"[{section}]: {key} is {show(value)}; {length} numbers are expected")
     return found
 
 
@@ -192,10 +192,10 @@ class Parameters:
         **Raises:** `InputError`."""
         free, sigma = settings.get("free", ()), settings.get("sigma", {})
         if isinstance(free, str) or not isinstance(free, Sequence):
-            raise InputError(f"[{section}]: free is {shown(free)}; a list of names is expected")
+            raise InputError(f"[{section}]: free is {show(free)}; a list of names is expected")
         if not isinstance(sigma, Mapping):
             raise InputError(
-                f"[{section}]: sigma is {shown(sigma)}; a table of names and numbers is expected"
+                f"[{section}]: sigma is {show(sigma)}; a table of names and numbers is expected"
             )
         for name in (*free, *sigma):
             if name not in names:

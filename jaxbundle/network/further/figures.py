@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
@@ -38,7 +38,7 @@ from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
 from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
 
-EXACT = 1e-3
+EXACT_SIGMA = 1e-3
 """The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with
 its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
 conditioned."""
@@ -109,7 +109,7 @@ class Figures(Further):
         )  # fmt: skip
         for row, word in enumerate(made.type):
             if word not in TYPES:
-                raise InputError(f"{table.source(row)}: type is {shown(word)}"
+                raise InputError(f"{table.source(row)}: type is {show(word)}"
                                  f"{did_you_mean(word, TYPES)}")  # fmt: skip
         first: dict[str, int] = {}
         for row, name in enumerate(made.figure):
@@ -135,7 +135,7 @@ class Figures(Further):
     def declare(self, network, origin) -> Declared:
         point = rows_of(self.point, network.points)
         place = network.points.position - origin
-        exact = EXACT * across_rays(network)
+        exact = EXACT_SIGMA * across_rays(network)
         declared = [
             self._of_type(type, point, place, exact) for type in TYPES if type in self.type
         ]
@@ -160,7 +160,7 @@ class Figures(Further):
                       parameters=tuple(DIRECTIONS[c] for c in columns))  # fmt: skip
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
         if type not in ROUND:
-            seen = self._seen(type, (type,), (figure,), point[rows], sigma)
+            seen = self._observe_points(type, (type,), (figure,), point[rows], sigma)
             return Declared((frame,), (seen,), ((type, move_pose),))
         known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
                           for k in range(len(names))])  # fmt: skip
@@ -171,13 +171,14 @@ class Figures(Further):
             those = np.flatnonzero((known > 0)[figure] == given)
             if len(those):
                 touched = (figure[those],) * 2
-                seen.append(self._seen(type, (type, size.name), touched, point[rows[those]],
-                                       sigma[those], not given))  # fmt: skip
+                seen.append(self._observe_points(
+                    type, (type, size.name), touched, point[rows[those]], sigma[those], not given
+                ))  # fmt: skip
         actions = (type, move_pose), (size.name, _move_radius)
         return Declared((frame, size), tuple(seen), actions)
 
     @staticmethod
-    def _seen(type, tables, figure, point, sigma, invariant=True):
+    def _observe_points(type, tables, figure, point, sigma, invariant=True):
         """The conditions of points on figures. A figure of unknown size moves with its points;
         residuals of points not yet on it must not count as observations of scale or rotation
         (`invariant`)."""
@@ -228,7 +229,7 @@ class Shapes(Further):
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
                       labels=list(names), parameters=DIRECTIONS)  # fmt: skip
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT * across_rays(network))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
         return Declared((frame,), (seen,), (("shape", move_pose),))

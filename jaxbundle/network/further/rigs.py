@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.further.base import Declared, Further, check_settings
-from jaxbundle.network.further.figures import EXACT, across_rays
+from jaxbundle.network.further.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -35,7 +35,7 @@ SECTION, MOUNTING = "rig", "mounting"
 AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
 
 
-def mounted(one, other, mounting_of_one, mounting_of_other, given):
+def mounting_misclosure(one, other, mounting_of_one, mounting_of_other, given):
     """Difference of position and rotation of the reference camera derived from two cameras, in the
     frame of the first; the rotation as a vector. The reference has no mounting.
     """
@@ -52,7 +52,7 @@ def mounted(one, other, mounting_of_one, mounting_of_other, given):
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
 MOUNTED = Kind(
-    "mountings", mounted, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
+    "mountings", mounting_misclosure, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
 )  # fmt: skip
 
 
@@ -127,12 +127,12 @@ class Rigs(Further):
             "mounting of",
         )  # fmt: skip
         across = across_rays(network)
-        length = self.settings.get("sigma_position", EXACT * across)
+        length = self.settings.get("sigma_position", EXACT_SIGMA * across)
         depth = np.median(np.linalg.norm(
             network.points.position[network.observations.point]
             - images.position[network.observations.image], axis=1,
         ))  # fmt: skip
-        angle = self.settings.get("sigma_angle", EXACT * across / depth / radians) * radians
+        angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
         return Declared((mounting,), (seen,), ((MOUNTING, _move_mounting),))

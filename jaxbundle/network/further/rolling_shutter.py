@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import positive, shown
+from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from_matrix
 from jaxbundle.leastsquares.declarations import Kind, Table
@@ -109,7 +109,7 @@ class RollingShutter(Further):
         by_camera = given if isinstance(given, Mapping) else dict.fromkeys(ids, given)
         for value in by_camera.values():
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"[{SECTION}]: line_time is {shown(value)}; a number is expected")
+                raise InputError(f"[{SECTION}]: line_time is {show(value)}; a number is expected")
         return np.array([float(by_camera.get(id, 0.0)) for id in ids])
 
     def lines(self, network) -> Float[np.ndarray, " rays"]:
@@ -184,7 +184,7 @@ def between_neighbours(velocity, before, after, time):
 
 def _check_neighbours(given: Any, table: Columns) -> None:
     if not isinstance(given, Mapping) or set(given) - {"v", "w"}:
-        raise InputError(f"[{SECTION}]: neighbours is {shown(given)}; the σ of velocities and "
+        raise InputError(f"[{SECTION}]: neighbours is {show(given)}; the σ of velocities and "
                          "turns are expected, { v = 0.5, w = 0.02 }")  # fmt: skip
     for name, value in given.items():
         positive(f"[{SECTION}]: neighbours, σ of {name}", value)

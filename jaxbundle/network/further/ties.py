@@ -21,10 +21,10 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import Declared, Further
-from jaxbundle.network.further.figures import EXACT, sigma_or_exact
+from jaxbundle.network.further.figures import EXACT_SIGMA, sigma_or_exact
 from jaxbundle.system.programs import compile_once
 
-SAMPLE = 256
+SAMPLED_RAYS = 256
 """Number of rays used for the effect of a parameter on image points."""
 
 
@@ -102,7 +102,7 @@ class Ties(Further):
         index = {camera.id: c for c, camera in enumerate(network.cameras)}
         place = {int(c): (t, k) for t in camera_tables(network.cameras)
                  for k, c in enumerate(t.cameras)}  # fmt: skip
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT * self._from_rays(network, index))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * self._from_rays(network, index))
         sets: dict[tuple, list] = {}
         for row, (a, b, name) in enumerate(zip(self.camera, self.other, self.parameter)):
             (one, k), (other, m) = place[index[a]], place[index[b]]
@@ -136,10 +136,10 @@ def parameter_sigmas(network, c: int) -> dict[str, float]:
     camera, rays = network.cameras[c], network.observations
     model = get_model(camera.model)
     own = np.flatnonzero(network.images.camera[rays.image] == c)
-    sample = own[np.linspace(0, len(own) - 1, SAMPLE).astype(int)]
+    sample = own[np.linspace(0, len(own) - 1, SAMPLED_RAYS).astype(int)]
     slope = np.asarray(_slopes(model, np.array(start_of(camera)), rays.xy[sample]))
     weight = np.nan_to_num(slope / rays.sigma[sample, :, None])
-    information = (weight**2).sum((0, 1)) * len(own) / SAMPLE
+    information = (weight**2).sum((0, 1)) * len(own) / SAMPLED_RAYS
     sigma = 1 / np.sqrt(np.maximum(information, np.finfo(float).tiny))
     return dict(zip(model.parameters, sigma.tolist()))
 

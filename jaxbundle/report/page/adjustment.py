@@ -40,8 +40,8 @@ class Addition(NamedTuple):
 
 
 ALONE = Addition()
-BELOW = ("Note", "Redundancy", "σ0", "Image precision", "χ² test")
-"""Lines of the summary that are said again below it."""
+REPEATED_LINES = ("Note", "Redundancy", "σ0", "Image precision", "χ² test")
+"""Lines of the summary that are repeated below it."""
 
 
 def compose(
@@ -93,7 +93,8 @@ def find(adjustment, also: Addition = ALONE) -> list[Finding]:
 def _whole(adjustment) -> list[str]:
     """Summary numbers."""
     return [
-        "<h3>Result</h3>\n", facts(row for row in summary(adjustment) if row[0] not in BELOW),
+        "<h3>Result</h3>\n",
+        facts(row for row in summary(adjustment) if row[0] not in REPEATED_LINES),
         "<h3>Variance factor</h3>\n", facts(head.variance_facts(adjustment)),
         "<h3>Counts</h3>\n", grid(("", "", ""), head.count_rows(adjustment), "words"),
         paragraph(A_POSTERIORI),

@@ -21,7 +21,7 @@ from jaxbundle.report.page.verdict import DOUBTFUL, GOOD, Finding, judge_fit
 from jaxbundle.statistics.global_test import chi_squared_test
 
 KIND = "refinement of scanner images"
-LARGE = 3.29
+CRITICAL_W = 3.29
 """Critical value of |w| at 0.1 %."""
 MOST_CORRELATED = 40
 """With more unknowns the matrix is only in result.json."""
@@ -75,7 +75,7 @@ def _image_points(result) -> list[dict]:
 def _judge(result, used, w) -> list[Finding]:
     r = np.concatenate([row["r"] for row in used])
     weak, loose = count_weak(r)
-    large, expected = int((np.abs(w) > LARGE).sum()), 0.001 * len(w)
+    large, expected = int((np.abs(w) > CRITICAL_W).sum()), 0.001 * len(w)
     over = large > expected + 3 * np.sqrt(expected) + 1
     findings = [
         _fit(result),
@@ -83,8 +83,8 @@ def _judge(result, used, w) -> list[Finding]:
                 f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), 'coordinate')} "
                 f"weakly controlled (r < 0.1), {loose} uncontrolled"),
         Finding("Blunders", DOUBTFUL if over else GOOD,
-                f"{large} of {count(len(w), 'coordinate')} with |w| over {LARGE} (by chance about "
-                f"{expected:.2g}); {len(result.removed)} removed by data snooping"),
+                f"{large} of {count(len(w), 'coordinate')} with |w| over {CRITICAL_W} (by chance "
+                f"about {expected:.2g}); {len(result.removed)} removed by data snooping"),
     ]  # fmt: skip
     check = result.check
     if check is not None:
@@ -93,7 +93,7 @@ def _judge(result, used, w) -> list[Finding]:
         rms = ", ".join(significant(value) for value in check.rms)
         words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
                  f"difference {significant(largest)} times its σ")  # fmt: skip
-        findings.append(Finding("Check points", GOOD if largest <= LARGE else DOUBTFUL, words))
+        findings.append(Finding("Check points", GOOD if largest <= CRITICAL_W else DOUBTFUL, words))
     return findings
 
 

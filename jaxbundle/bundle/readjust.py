@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.minimum import require_solved, solved
+from jaxbundle.bundle.minimum import inspect_solution, require_solved
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
@@ -75,11 +75,11 @@ def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
     return robust_scale(without(problem, suspects), lengths)
 
 
-def robustly(problem: Problem, minimum, again, estimator: str):
+def adjust_robustly(problem: Problem, minimum, again, estimator: str):
     """The solution with the weights of a robust estimator, and its minimum. The first weights come
     from the minimum, or from the start values without a solution."""
     repeat = _Repeat(problem, again, "by robust estimation", minimum)
-    first = minimum.values if solved(problem, minimum) else problem.data.start
+    first = minimum.values if inspect_solution(problem, minimum) else problem.data.start
     reweighted = reweight(problem.system, problem.layout.tables(first), repeat, estimator)
     if not reweighted.rests:
         raise NotSolvedError(

@@ -23,7 +23,7 @@ from jaxbundle.pushbroom.image import PushbroomImage, no_offsets
 from jaxbundle.pushbroom.interpolation import Table, span
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
-from jaxbundle.refinement.freedom import Change, Form, changed, changed_optics
+from jaxbundle.refinement.freedom import Change, Form, change_image, change_optics
 from jaxbundle.system.programs import compile_once
 
 TOLERANCE = 1e-9
@@ -32,15 +32,15 @@ MARGIN = 2
 """Rows of the old table kept before the first line and after the last."""
 FEWEST = 2048
 """Rows that are computed at a time, at least."""
-LONGEST = 200_000
+LONGEST_TABLE = 200_000
 """Largest length of a table."""
-SAME = 1e-12
+SLOPE_TOLERANCE = 1e-12
 """Tolerance of slopes for equal optics."""
 
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
-    moved = changed(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
+    moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)), image.times,
         _optics(image, change), moved.mounting, no_offsets(), image.corrections,
@@ -91,17 +91,17 @@ def _attitude(image, form, change) -> Attitude:
         half = rotations[left] @ _pad(_exponentials, turn / 2)
         wrong = np.linalg.norm(_turns(half, there), axis=1) > TOLERANCE
         wrong &= ~np.isin(times[left + 1], gaps)
-        # both halves of what was split are looked at again
+        # both halves of a split interval are checked again
         order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
         split = np.zeros(len(times) - 1, bool)
         split[left[wrong]] = True
         pending = np.repeat(split, 1 + split)
         times = np.r_[times, middle[wrong]][order]
         rotations = np.concatenate([rotations, there[wrong]])[order]
-        if len(times) > LONGEST:
+        if len(times) > LONGEST_TABLE:
             raise InputError(
-                f"attitude: more than {LONGEST} rows would be needed to write it; the table is too "
-                "rough between its rows"
+                f"attitude: more than {LONGEST_TABLE} rows would be needed to write it; the "
+                "table is too rough between its rows"
             )
     quaternions = _pad(_quaternions, rotations)
     longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
@@ -139,7 +139,7 @@ def _pad(function, rows):
 
 def _optics(image, change) -> Optics:
     """Optics of the same kind if possible, else a table of angles."""
-    wanted = changed_optics(image, change)
+    wanted = change_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters
@@ -150,7 +150,7 @@ def _optics(image, change) -> Optics:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
     target = _slopes(wanted, u)
-    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SAME:
+    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SLOPE_TOLERANCE:
         return candidate
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
 

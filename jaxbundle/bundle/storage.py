@@ -1,8 +1,8 @@
-"""What of an adjustment goes into a file: all that its result follows from without iterating.
+"""The part of an adjustment that is saved: all that its result follows from without iterating.
 
 The network, the start values, weights and free unknowns that the adjustment ended with, and the
 adjusted values. Everything else (covariances, redundancy numbers, tests, tables) is computed from
-these when it is asked for, as in the process that adjusted.
+these on demand, as in the process that adjusted.
 """
 
 import dataclasses

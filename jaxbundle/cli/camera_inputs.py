@@ -7,9 +7,9 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
-from jaxbundle.io.cameras.camera_files import LOOKS, chosen_camera, is_camera_file, read_cameras
-from jaxbundle.io.cameras.nearest_camera import fits_told
-from jaxbundle.io.formats import FORMATS, recognised_format
+from jaxbundle.io.cameras.camera_files import LOOKS, choose_camera, is_camera_file, read_cameras
+from jaxbundle.io.cameras.nearest_camera import fit_messages
+from jaxbundle.io.formats import FORMATS, recognise_format
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
@@ -38,15 +38,15 @@ def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
         cameras, found = [camera for camera, _ in results], {c.id: C for c, C in results}
     elif is_camera_file(path):
         cameras = read_cameras(path)
-    elif path.exists() and recognised_format(path) is None:
+    elif path.exists() and recognise_format(path) is None:
         raise InputError(
             f"{path}: not recognised; expected a camera file ({LOOKS}), the result.json "
             f"of calibrate or adjust, or a network ({', '.join(FORMATS)})"
         )
     else:
         cameras = read_network(path).cameras
-    camera = chosen_camera(cameras, id, f"{file} (FILE#ID)")
-    for told in fits_told([camera]):
+    camera = choose_camera(cameras, id, f"{file} (FILE#ID)")
+    for told in fit_messages([camera]):
         print(f"warning: {told}", file=sys.stderr)
     return camera, found.get(camera.id)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.calibration.files import COMMAND
 from jaxbundle.choices import EXPLORED
-from jaxbundle.cli.cameras_given import calibration_given, pair
+from jaxbundle.cli.camera_inputs import calibration_given, pair
 from jaxbundle.cli.outputs import trace_files, trace_origin
 from jaxbundle.cli.progress import iterating
 from jaxbundle.cli.pushbroom.shared import open_scanner
@@ -21,7 +21,7 @@ from jaxbundle.explore.view import View
 from jaxbundle.io import read_network
 from jaxbundle.io.cameras.calibrated import is_result
 from jaxbundle.io.cameras.camera_files import is_camera_file
-from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.text.csv_tables import read_text, read_toml
 from jaxbundle.io.writing.folders import MARKER
@@ -49,7 +49,7 @@ def recognise(input: str) -> str:
         return SCANNER
     if is_of_calibrate(path):
         return CAMERA
-    if recognised_format(path) is not None:
+    if recognise_format(path) is not None:
         return NETWORK
     if path.suffix.lower() == ".xml":
         return SCANNER

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.arguments import positive, shown
+from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
-from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.networks.project import project_file
 from jaxbundle.io.text.csv_tables import read_csv, read_toml
 from jaxbundle.network.columns import Columns
@@ -17,7 +17,7 @@ from jaxbundle.network_design.conditions import Box
 def sigma_of(project: Path, network: Network) -> float | None:
     """`sigma_image` of a project without image points; None if image points or no setting give
     it."""
-    if len(network.observations) or recognised_format(project) != "project":
+    if len(network.observations) or recognise_format(project) != "project":
         return None
     given = read_toml(project_file(project))["project"].get("sigma_image")
     if given is None or network.image_unit != units_of(network.cameras):
@@ -25,8 +25,8 @@ def sigma_of(project: Path, network: Network) -> float | None:
     return positive("sigma_image", given)
 
 
-def aimed_at(given: list[str] | None):
-    """What the aim is about.
+def parse_aim(given: list[str] | None):
+    """The quantities of the aim.
 
     **Raises:** `InputError`.
     """
@@ -98,4 +98,4 @@ def normals_of(text: str, network: Network):
     try:
         return np.array([[float(x) for x in rows[id]] for id in used])
     except ValueError as error:
-        raise InputError(f"{text}: a normal is not a number: {shown(str(error))}") from None
+        raise InputError(f"{text}: a normal is not a number: {show(str(error))}") from None

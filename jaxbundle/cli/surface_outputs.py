@@ -11,7 +11,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.surface.inputs import check_points, read_views, tie_points
 from jaxbundle.surface.orthophoto import ToViews
-from jaxbundle.surface.pairs import given_partners
+from jaxbundle.surface.pairs import parse_partners
 from jaxbundle.surface.reconstruct import Surface, find_bounds, ground_bounds, reconstruct
 from jaxbundle.surface.relative import align_all
 from jaxbundle.surface.scanner_inputs import from_map, read_ground_views, system_of, to_map
@@ -65,7 +65,7 @@ def choose(views, names):
 
 
 def _partners(pairs: Sequence[str] | None, views):
-    return given_partners(pairs, [v.name for v in views]) if pairs else None
+    return parse_partners(pairs, [v.name for v in views]) if pairs else None
 
 
 def _with_messages(found: Surface, messages: Sequence[str]) -> Surface:
@@ -75,7 +75,7 @@ def _with_messages(found: Surface, messages: Sequence[str]) -> Surface:
     return dataclasses.replace(found, messages=everything)
 
 
-def telling(bar) -> Callable[[str, int, int], None]:
+def report_stages(bar) -> Callable[[str, int, int], None]:
     tasks = {}
 
     def tell(stage, done, total):

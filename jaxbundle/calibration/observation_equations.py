@@ -78,7 +78,7 @@ def _linearise(of, spaces, columns, touched, xy, weight):
         def v(change):
             *changes, b = jnp.split(change, ends)
             pose, interior, ray = (
-                s.moved(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
+                s.move(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
             )
             p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
             residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))

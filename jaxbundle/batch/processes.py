@@ -2,10 +2,10 @@
 that see the same folder.
 
 JAX tells every process its number, and ends all of them when one is lost. Each computes its part of
-the inputs (`run_batch`) into a file of its own beside that of the results; the first adds the parts
-to the results, in the order of the inputs, and removes them. Parts of a run that was ended are
-added by the next one, whatever the number of its processes. The processes wait for each other by
-files, since a collective waits for half a minute only.
+the inputs (`run_batch`) into its own file beside that of the results; the first adds the parts to
+the results, in the order of the inputs, and removes them. Parts of a run that was ended are added
+by the next one, whatever the number of its processes. The processes wait for each other through
+files, since a collective waits only half a minute.
 """
 
 import glob
@@ -26,12 +26,12 @@ from jax.experimental.multihost_utils import broadcast_one_to_all
 from jaxbundle.batch.run import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.json_lines import JsonLines
-from jaxbundle.io.writing.locks import locked
-from jaxbundle.leastsquares.sharding import alone
+from jaxbundle.io.writing.locks import hold_lock
+from jaxbundle.leastsquares.sharding import use_own_devices
 
 ROWS_AT_ONCE = 256
 PAUSE = 0.2
-"""Seconds between two looks for the files of other processes."""
+"""Seconds between checks for the files of other processes."""
 
 
 def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Counter:
@@ -57,7 +57,7 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
             _tell(waiting, "begin")
         if not _wait(waiting, ["begin"])["begin"]:
             part = f"{file}.part-{index + 1}-of-{number}"
-            with alone():
+            with use_own_devices():
                 run_batch(inputs, part, part=(index + 1, number), known=file, **own)
     except Exception as error:
         failed = error
@@ -84,7 +84,7 @@ def _in_words(error: Exception) -> str:
 
 
 def _clear(file: str | Path, waiting: str) -> None:
-    """Add the parts that a run that was ended has left, and make the folder of this one."""
+    """Add the parts left by an interrupted run, and make the folder of this one."""
     add_parts(file)
     try:
         os.mkdir(waiting)
@@ -99,7 +99,7 @@ def _tell(waiting: str, name: str, words: str = "") -> None:
 
 
 def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
-    """What each of these has told, when all have."""
+    """The reports of these processes, once all are there."""
     while True:
         found = {name: Path(waiting, name).read_text() for name in names
                  if Path(waiting, name).exists()}  # fmt: skip
@@ -109,8 +109,8 @@ def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def add_parts(file: str | Path) -> None:
-    """Add the lines of all parts beside a file of results to it, and remove what joined processes
-    have left.
+    """Add the lines of all parts beside a file of results to it, and remove other files left by
+    joined processes.
 
     **Raises:** `InputError` while a run writes one of them."""
     found = [(int(end[1]), path) for path in glob.glob(f"{glob.escape(str(file))}.part-*")
@@ -119,9 +119,9 @@ def add_parts(file: str | Path) -> None:
     if not found and not waited:
         return
     with ExitStack() as held:
-        held.enter_context(locked(file))
+        held.enter_context(hold_lock(file))
         for _, path in found:
-            held.enter_context(locked(path))
+            held.enter_context(hold_lock(path))
         parts = [JsonLines(path) for _, path in sorted(found)]
         lines, some = JsonLines(file), []
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
