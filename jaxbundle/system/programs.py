@@ -26,6 +26,7 @@ import jax
 import jaxlib
 import numpy as np
 from jax import export
+from jax.core import Tracer
 
 from jaxbundle.system.configuration import folder_of_programs
 from jaxbundle.system.temporaries import temporary
@@ -62,7 +63,7 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
     @functools.wraps(function)
     def run(*args, **kwargs):
         folder = folder_of_programs()
-        if folder is None or jax.config.jax_disable_jit or jax.process_count() > 1:
+        if folder is None or _setting("jax_disable_jit") or jax.process_count() > 1:
             return jitted(*args, **kwargs)
         given = _Given(args, kwargs, positions)
         try:
@@ -98,7 +99,7 @@ class _Given:
 
     def key_for(self, function: Callable) -> str:
         """What the program depends on, as a digest."""
-        settings = [(name, repr(getattr(jax.config, name))) for name in SETTINGS]
+        settings = [(name, repr(_setting(name))) for name in SETTINGS]
         number = jax.dtypes.canonicalize_dtype(float)
         place = jax.default_backend(), jax.device_count(), number
         found = [_state_of_package(), repr(settings), repr(place)]
@@ -179,6 +180,11 @@ class _CannotDescribe(Exception):
     """An argument on which the program depends in an unknown way."""
 
 
+def _setting(name: str) -> Any:
+    """A setting of JAX, as it is here: some can be changed within a block."""
+    return getattr(jax.config, name)
+
+
 @functools.cache
 def _state_of_package() -> str:
     """The sources of this package, and the versions of all that generate code."""
@@ -198,7 +204,7 @@ def _describe(x: Any, found: list[str], is_data: Callable | None) -> None:
     `is_data` None: everything is compiled in.
 
     **Raises:** `_CannotDescribe`."""
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         raise _CannotDescribe
     if is_data is not None and is_data(x):
         _describe_data(x, found)
