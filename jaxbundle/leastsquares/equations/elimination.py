@@ -31,6 +31,7 @@ from jaxbundle.leastsquares.equations.normal import (
 )
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
 from jaxbundle.leastsquares.indexing.plan import Pairs, Plan
+from jaxbundle.leastsquares.indexing.rows import look_up
 from jaxbundle.types import present
 
 FULL_PRECISION = 1e-12
@@ -163,7 +164,7 @@ def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
 
     def add(sums, i, j, k):
         rows = i.shape[1] * depth
-        left, right = a[i].reshape(-1, rows, m), b[j].reshape(-1, rows, n)
+        left, right = look_up(a, i).reshape(-1, rows, m), look_up(b, j).reshape(-1, rows, n)
         product = jnp.einsum("cki,ckj->cij", left, right)
         return sums.at[k].add(product, indices_are_sorted=True)
 
@@ -206,7 +207,7 @@ def inverse_cholesky(V: Float[Array, "n w w"]) -> Float[Array, "n w w"]:
 def _lower_times(L, at, W):
     """L[at]·W of every incidence, L lower triangular; written out: half the time of a product."""
     w = L.shape[-1]
-    of = L.reshape(-1, w * w)[at]
+    of = look_up(L.reshape(-1, w * w), at)
     row = lambda i: sum(of[..., w * i + j, None] * W[..., j, :] for j in range(i + 1))
     return jnp.stack([row(i) for i in range(w)], -2)
 
