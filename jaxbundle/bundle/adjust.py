@@ -100,7 +100,8 @@ def adjust(
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance component
       is 1; the factors are `Adjustment.sigma_factors`.
-    - `progress(step, cost, λ)`: called after every evaluation.
+    - `progress(step, cost, λ)`: called for every evaluation; up to 200 000 observations at the end
+      of the iterations.
 
     **Returns:** an `Adjustment`; check `converged` first.
 

@@ -218,7 +218,8 @@ def adjust(
     - `robust`: "huber", "cauchy" or "tukey"; `snooping`: "pope" or "baarda", at the level
       `significance`.
     - `estimate_components`: scale the σ of every kind until its variance component is 1.
-    - `progress(step, cost, λ)`: called after every evaluation.
+    - `progress(step, cost, λ)`: called for every evaluation; up to 200 000 observations at the end
+      of the iterations.
 
     **Returns:** a `Result`.
 

@@ -79,7 +79,7 @@ def find_minimum(
     minimise_from = minimise_from(problem, make_solver(problem, **options))
     first = minimum = minimise_from(start)
     if not large and progress is not None:
-        report(minimum, progress)
+        _report_progress(minimum, progress)
     for _ in range(RETURNS):
         there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
@@ -97,7 +97,7 @@ def find_minimum(
     return dataclasses.replace(first, termination=minimum.termination, values=values)
 
 
-def report(minimum: Minimum[Values], progress: Callable) -> None:
+def _report_progress(minimum: Minimum[Values], progress: Callable) -> None:
     """Call `progress(step, cost, λ)` for every evaluation of a search that has ended."""
     history = jax.tree.map(np.asarray, minimum.history)
     steps = min(int(minimum.iterations), len(history.cost))
