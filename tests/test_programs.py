@@ -16,7 +16,7 @@ from jaxbundle.cameras import project
 from jaxbundle.cameras.catalogue import get_model
 from jaxbundle.leastsquares.spaces import PoseValue, Vector
 from jaxbundle.leastsquares.spaces import turn_by as rotate
-from jaxbundle.system import configuration, programs
+from jaxbundle.system import configuration, program_keys, programs
 from jaxbundle.system.programs import compile_once
 
 RAYS = np.array([[0.1, 0.2, -1.0], [-0.3, 0.1, -1.0]])
@@ -32,13 +32,13 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def traces(monkeypatch):
     """The names of the functions traced, in order."""
-    found, trace = [], programs._trace
+    found, export = [], programs.export.export
 
-    def count(function, *rest):
+    def count(function, **options):
         found.append(function.__name__)
-        return trace(function, *rest)
+        return export(function, **options)
 
-    monkeypatch.setattr(programs, "_trace", count)
+    monkeypatch.setattr(programs.export, "export", count)
     return found
 
 
@@ -71,7 +71,7 @@ def test_other_shapes_types_and_compiled_in_values_are_other_programs(folder, tr
 
 def test_everything_a_key_depends_on_changes_it(monkeypatch):
     def key(function=rotate, *args, static=()):
-        return programs._Given(args or (1.0,), {}, static).key_for(function)
+        return programs._Given(function, args or (1.0,), {}, static).full_key()
 
     column = Vector(3, (0,))
     others = [
@@ -85,7 +85,7 @@ def test_everything_a_key_depends_on_changes_it(monkeypatch):
     ]  # fmt: skip
     with jax.numpy_dtype_promotion("strict"):
         others.append(key())
-    monkeypatch.setattr(programs, "_state_of_package", lambda: "another version")
+    monkeypatch.setattr(program_keys, "state_of_package", lambda: ("another version", {}))
     others.append(key())
     assert len(set(others)) == len(others)
     monkeypatch.undo()
@@ -109,27 +109,35 @@ def test_derivatives_and_batches_go_through(folder, traces):
 
 def test_results_keep_their_structure(folder):
     make = lambda x: {"pose": PoseValue(x, 2 * x), "word": "kept", "none": None, "number": 3}
-    for _ in range(2):
-        program = programs._Program(*trace_of(make, folder), {})
-        found = program([np.ones(3)])
-        assert found["word"] == "kept" and found["none"] is None and found["number"] == 3
-        np.testing.assert_array_equal(found["pose"].rotation, [2, 2, 2])
-
-
-def trace_of(function, folder):
     file = folder / "one-traced"
-    return programs._read(file) or programs._trace(
-        function, programs._Given((np.ones(3),), {}, None), file
-    )
+    for _ in range(2):
+        found = programs._read(file) or programs._trace(
+            make, programs._Given(make, (np.ones(3),), {}, None), file
+        )
+        result = found[1]
+        assert result["word"] == "kept" and result["none"] is None and result["number"] == 3
+        assert isinstance(result["pose"], PoseValue)
 
 
-@pytest.mark.parametrize("damage", [b"", b"damaged", None])
+def test_a_number_traced_is_an_array_of_the_same_type_in_every_process(folder):
+    for _ in range(2):
+        found = compile_once(rotate, ())((0.1, 0.0, 0.0), (0.0, 1.0, 0.0))
+        assert all(isinstance(x, jax.Array) and not x.weak_type for x in found)
+
+
+@pytest.mark.parametrize("damage", ["empty", "half", "zeros", "others may write"])
 def test_damaged_programs_are_traced_again_and_replaced(folder, traces, damage):
     arguments = tuple(np.full(3, 0.1)), tuple(RAYS[0])
     expected = compile_once(rotate, ())(*arguments)
     (file,) = folder.glob("*-traced")
-    content = file.read_bytes()
-    file.write_bytes(content[: len(content) // 2] if damage is None else damage)
+    content = bytearray(file.read_bytes())
+    half = len(content) // 2
+    content[half : half + 100] = bytes(100)
+    damaged = {"empty": b"", "half": content[:half], "zeros": content}.get(damage)
+    if damaged is None:
+        file.chmod(0o666)
+    else:
+        file.write_bytes(damaged)
     assert compile_once(rotate, ())(*arguments) == expected
     assert programs._read(file) is not None and traces == ["turn_by"] * 2
 
@@ -149,8 +157,8 @@ import sys, jaxbundle
 from jaxbundle.system import programs
 jaxbundle.enable_x64(compile_quickly=True)
 jaxbundle.keep_programs(sys.argv[1])
-traced, trace = [], programs._trace
-programs._trace = lambda *x: traced.append(x[0].__name__) or trace(*x)
+traced, export = [], programs.export.export
+programs.export.export = lambda f, **x: traced.append(f.__name__) or export(f, **x)
 told = []
 result = jaxbundle.adjust(jaxbundle.read_network(sys.argv[2]), progress=lambda *x: told.append(x))
 result.table("residuals")
@@ -175,10 +183,77 @@ def test_a_second_process_traces_nothing_and_finds_the_same(tmp_path, convergent
     np.testing.assert_allclose(float(sigma0), convergent4.sigma0, rtol=1e-9)
 
 
-def test_classes_from_outside_the_package_are_not_described():
+def test_nothing_from_outside_the_package_is_described():
     class Local(eqx.Module):
         x: jax.Array
 
-    given = programs._Given((Local(jnp.ones(2)),), {}, None)
-    with pytest.raises(programs._CannotDescribe):
-        given.key_for(rotate)
+    @functools.wraps(rotate)
+    def disguised(*x):
+        return SCALE * rotate(*x)[0]
+
+    class Dict(dict):
+        pass
+
+    class Partial(functools.partial):
+        pass
+
+    for x in Local(jnp.ones(2)), disguised, Dict(a=1.0), Partial(rotate, 1.0), object():
+        with pytest.raises(program_keys.CannotDescribe):
+            program_keys.describe(x, [], None)
+
+
+SCALE = 1.0
+
+
+def test_a_changed_package_keeps_nothing(folder, traces, monkeypatch):
+    arguments = tuple(np.full(3, 0.1)), tuple(RAYS[0])
+
+    def is_kept():
+        compile_once(rotate, ())(*arguments)
+        return bool(files(folder))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "LONGEST_UNUSED", -1.0)
+        assert not is_kept(), "a constant"
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "_is_own", lambda file: True)
+        assert not is_kept(), "a function"
+    with monkeypatch.context() as patch:
+        patch.setattr(program_keys, "IMPORTED", 0)
+        program_keys._are_older_than_import.cache_clear()
+        assert not is_kept(), "a source"
+    program_keys._are_older_than_import.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(program_keys, "ROOT", folder)
+        patch.setattr(program_keys, "_list_sources", program_keys._list_sources.__wrapped__)
+        program_keys.state_of_package.cache_clear()
+        assert not is_kept(), "sources that are not there, as in an archive"
+    program_keys.state_of_package.cache_clear()
+    monkeypatch.undo()
+    monkeypatch.setattr(configuration, "_folders", [str(folder)])
+    assert is_kept()
+
+
+def test_what_cannot_be_kept_runs_all_the_same(folder, traces):
+    told = []
+    turn = compile_once(tell_and_rotate, 0)
+    for _ in range(2):
+        turn(told.append, (0.1, 0.0, 0.0), (0.0, 1.0, 0.0))
+    jax.effects_barrier()
+    assert len(told) == 2 and not files(folder)
+    with pytest.raises(IndexError, match="out of range"):
+        compile_once(project, 0)(get_model("kannala-brandt"), (1.0,), *RAYS[0])
+
+
+def tell_and_rotate(tell, angle, x):
+    jax.debug.callback(tell, angle[0])
+    return rotate(angle, x)
+
+
+def test_compiled_in_arguments_may_be_given_by_name(folder):
+    p = tuple(np.r_[2.0, np.zeros(10)])
+    image = compile_once(project, 0)
+    expected = image(get_model("brown"), p, *RAYS[0])
+    r, s, q = RAYS[0]
+    assert image(model=get_model("brown"), p=p, r=r, s=s, q=q) == expected
+    assert len(files(folder)) == 1

@@ -77,9 +77,9 @@ def find_minimum(
     start = given if start is None else pad_values(problem, start)
     minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
     minimise_from = minimise_from(problem, make_solver(problem, **options))
-    first = minimum = minimise_from(start)
     if not large and progress is not None:
-        _report_progress(minimum, progress)
+        minimise_from = _report_after(minimise_from, progress)
+    first = minimum = minimise_from(start)
     for _ in range(RETURNS):
         there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
@@ -97,12 +97,17 @@ def find_minimum(
     return dataclasses.replace(first, termination=minimum.termination, values=values)
 
 
-def _report_progress(minimum: Minimum[Values], progress: Callable) -> None:
-    """Call `progress(step, cost, λ)` for every evaluation of a search that has ended."""
-    history = jax.tree.map(np.asarray, minimum.history)
-    steps = min(int(minimum.iterations), len(history.cost))
-    for step in range(steps):
-        progress(step, history.cost[step], history.damping[step])
+def _report_after(minimise_from: Callable, progress: Callable) -> Callable:
+    """A search that calls `progress(step, cost, λ)` for every evaluation when it has ended."""
+
+    def minimise_and_report(start) -> Minimum[Values]:
+        minimum = minimise_from(start)
+        history = jax.tree.map(np.asarray, minimum.history)
+        for step in range(min(int(minimum.iterations), len(history.cost))):
+            progress(step, history.cost[step], history.damping[step])
+        return minimum
+
+    return minimise_and_report
 
 
 def _on_one_device(problem: Problem, solver: LeastSquares):

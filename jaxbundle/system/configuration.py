@@ -11,7 +11,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 
 _folders: list[str] = []
-"""The last one is that of kept programs."""
+"""That of kept programs, if some are kept."""
 SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
@@ -54,10 +54,11 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         usable = False
     # JAX has already read the variable, and would warn of a bad folder for every program.
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
+    _folders.clear()
     if not usable:
         return False
     watch_cache(folder)
-    _folders.append(os.fspath(folder))
+    _folders.append(os.path.abspath(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
     return True

@@ -4,47 +4,44 @@ JAX keeps compiled programs (`keep_programs`) but finds them by their code, for 
 must be traced and lowered first: of a small adjustment in a second process that took longer than
 everything after the imports. Hence the code is kept as well (StableHLO, by `jax.export`), under a
 key of everything it depends on: the sources of this package, versions, settings, the shapes and
-types of all arrays, and everything else in the arguments. If an argument cannot be described, such
-as a function from outside the package, the function is traced as usual.
+types of all arrays, and everything that is compiled in (`program_keys`). Where this is not known,
+as for a function from outside the package, the function is traced as usual.
 """
 
 import dataclasses
-import enum
 import functools
 import hashlib
+import inspect
 import os
 import pickle
-import sys
-import threading
-import types
+import re
+import time
+import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
-import jaxlib
-import numpy as np
+import jax.numpy as jnp
 from jax import export
-from jax.core import Tracer
 
 from jaxbundle.system.configuration import folder_of_programs
+from jaxbundle.system.program_keys import (
+    CannotDescribe,
+    describe,
+    describe_surroundings,
+    quick_key,
+    setting,
+)
 from jaxbundle.system.temporaries import temporary
 
-SETTINGS = (
-    "jax_debug_infs", "jax_debug_nans", "jax_default_device", "jax_default_matmul_precision",
-    "jax_default_prng_impl", "jax_disable_jit", "jax_numpy_dtype_promotion",
-    "jax_numpy_rank_promotion", "jax_threefry_partitionable",
-)  # fmt: skip
-"""JAX's settings on which the code of a program depends."""
-DESCRIBABLE = frozenset(
-    ("builtins", "equinox", "functools", "jax", "jaxbundle", "jaxlib", "lineax", "numpy",
-     "operator", "optimistix")
-)  # fmt: skip
-"""Packages whose functions and classes are described by their names: their versions are in the
-key."""
 LAYOUT = export.DisabledSafetyCheck.custom_call("LayoutConstraint")
 """`elimination.py` requests a memory layout; the same version of JAX reads it back."""
+CHECKSUM = 32
+"""Bytes at the beginning of a file: JAX does not survive damaged code."""
+LONGEST_UNUSED = 30 * 86400.0
+"""Seconds after which the file of an unused program is removed."""
 
 
 def compile_once(function: Callable, static: Sequence[int] | int | None = None, **options) -> Any:
@@ -53,8 +50,7 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
     `static`: the positions of arguments compiled in; None: everything that is no array, as by
     `equinox.filter_jit`. `options`: of `jax.jit`."""
     positions = (static,) if isinstance(static, int) else static
-    programs: dict[str, _Program] = {}
-    lock = threading.RLock()
+    known: dict[Any, Callable] = {}
     if positions is None:
         jitted = eqx.filter_jit(function, **options)
     else:
@@ -63,19 +59,20 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
     @functools.wraps(function)
     def run(*args, **kwargs):
         folder = folder_of_programs()
-        if folder is None or _setting("jax_disable_jit") or jax.process_count() > 1:
+        if folder is None or setting("jax_disable_jit") or jax.process_count() > 1:
             return jitted(*args, **kwargs)
-        given = _Given(args, kwargs, positions)
+        given = _Given(function, args, kwargs, positions)
         try:
-            key = given.key_for(function)
-        except _CannotDescribe:
+            key = given.quick_key() or given.full_key()
+            program = known.get(key)
+            if program is None:
+                program = known.setdefault(key, _find(function, given, Path(folder), options))
+        except CannotDescribe:
             return jitted(*args, **kwargs)
-        with lock:
-            if key not in programs:
-                file = Path(folder) / f"{function.__name__}-{key}-traced"
-                exported, result = _read(file) or _trace(function, given, file)
-                programs[key] = _Program(exported, result, options)
-        return programs[key](given.leaves)
+        except (NotImplementedError, TypeError, ValueError):
+            # It cannot be exported; an error of the function itself is raised again.
+            return jitted(*args, **kwargs)
+        return program(given.leaves)
 
     return run
 
@@ -83,30 +80,34 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
 class _Given:
     """The arguments of a call: `leaves`, the arrays, and everything else."""
 
-    def __init__(self, args: tuple, kwargs: dict, static: Sequence[int] | None):
-        is_data = eqx.is_array if static is None else eqx.is_array_like
-        self.static = frozenset(static or ())
-        fixed = lambda i: jax.tree.map(lambda _: i not in self.static, args[i])
-        chosen = tuple(fixed(i) for i in range(len(args))), jax.tree.map(lambda _: True, kwargs)
-        data = jax.tree.map(lambda x, chosen: chosen and is_data(x), (args, kwargs), chosen)
-        self.args, self.kwargs, self.is_data = args, kwargs, is_data
-        arrays, self.others = eqx.partition((args, kwargs), data)
-        self.leaves, self.tree = jax.tree.flatten(arrays)
+    def __init__(self, function: Callable, args: tuple, kwargs: dict, static):
+        if kwargs and static:
+            bound = inspect.signature(function).bind(*args, **kwargs)
+            args, kwargs = bound.args, bound.kwargs
+        self.function, self.args, self.kwargs = function, args, kwargs
+        self.static, self.all_data = frozenset(static or ()), static is not None
+        self.is_data = eqx.is_array_like if self.all_data else eqx.is_array
+        traced = tuple(None if i in self.static else x for i, x in enumerate(args)), kwargs
+        self.arrays, self.others = eqx.partition(traced, self.is_data)
+        self.leaves, self.tree = jax.tree.flatten(self.arrays)
 
-    def with_leaves(self, leaves) -> tuple[tuple, dict]:
+    def with_leaves(self, leaves) -> tuple[list, dict]:
         """The arguments with other arrays."""
-        return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.others)
+        traced, kwargs = eqx.combine(jax.tree.unflatten(self.tree, leaves), self.others)
+        return [self.args[i] if i in self.static else x for i, x in enumerate(traced)], kwargs
 
-    def key_for(self, function: Callable) -> str:
-        """What the program depends on, as a digest."""
-        settings = [(name, repr(_setting(name))) for name in SETTINGS]
-        number = jax.dtypes.canonicalize_dtype(float)
-        place = jax.default_backend(), jax.device_count(), number
-        found = [_state_of_package(), repr(settings), repr(place)]
-        _describe(function, found, None)
+    def quick_key(self) -> Any:
+        """The key of a program in this process."""
+        compiled_in = tuple(self.args[i] for i in sorted(self.static))
+        return quick_key(self.leaves, self.tree, self.others, compiled_in)
+
+    def full_key(self) -> str:
+        """The key of a program in any process, as a digest."""
+        found = describe_surroundings()
+        describe(self.function, found, None)
         for i, x in enumerate(self.args):
-            _describe(x, found, None if i in self.static else self.is_data)
-        _describe(self.kwargs, found, self.is_data)
+            describe(x, found, None if i in self.static else self.is_data)
+        describe(self.kwargs, found, self.is_data)
         return hashlib.blake2b("\n".join(found).encode(), digest_size=16).hexdigest()
 
 
@@ -117,31 +118,40 @@ class _Place:
     number: int
 
 
-class _Program:
-    """A program of a list of arrays. `result`: its result with a `_Place` for every array."""
+def _find(function: Callable, given: _Given, folder: Path, options: dict) -> Callable:
+    """The program of a call: read, or traced and kept."""
+    name = re.sub(r"\W", "_", function.__name__)
+    file = folder / f"{name}-{given.full_key()}-traced"
+    exported, result = _read(file) or _trace(function, given, file)
 
-    def __init__(self, exported: export.Exported, result: Any, options: dict):
-        def call(*leaves):
-            return exported.call(*leaves)
+    def call(*leaves):
+        return exported.call(*leaves)
 
-        call.__name__ = exported.fun_name
-        self.call, self.result = jax.jit(call, **options), result
+    call.__name__ = exported.fun_name
+    compiled, is_place = jax.jit(call, **options), lambda x: isinstance(x, _Place)
 
-    def __call__(self, leaves: list) -> Any:
-        found = self.call(*leaves)
-        place = lambda x: isinstance(x, _Place)
-        fill = lambda x: found[x.number] if place(x) else x
-        return jax.tree.map(fill, self.result, is_leaf=place)
+    def run(leaves: list) -> Any:
+        found = compiled(*leaves)
+        fill = lambda x: found[x.number] if is_place(x) else x
+        return jax.tree.map(fill, result, is_leaf=is_place)
+
+    return run
 
 
 def _trace(function: Callable, given: _Given, file: Path) -> tuple[export.Exported, Any]:
-    """Trace a function, and keep the code if it can be written."""
+    """Trace a function, and keep the code if it can be written. The result has a `_Place` for
+    every array."""
     result: Any = None
 
     def of_leaves(*leaves):
         nonlocal result
         args, kwargs = given.with_leaves(leaves)
-        arrays, rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+        found = function(*args, **kwargs)
+        if given.all_data:
+            found = jax.tree.map(jnp.asarray, found)
+        arrays, rest = eqx.partition(found, eqx.is_array)
+        # Weak types are lost in a file.
+        arrays = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), arrays)
         found, shape = jax.tree.flatten(arrays)
         result = eqx.combine(jax.tree.unflatten(shape, map(_Place, range(len(found)))), rest)
         return found
@@ -153,12 +163,17 @@ def _trace(function: Callable, given: _Given, file: Path) -> tuple[export.Export
 
 
 def _read(file: Path) -> tuple[export.Exported, Any] | None:
-    """A kept program; None if there is none, or it is damaged."""
+    """A kept program; None if there is none, if it is damaged, or not the user's own."""
     try:
-        code, result = pickle.loads(file.read_bytes())
+        content = file.read_bytes()
+        check, content = content[:CHECKSUM], content[CHECKSUM:]
+        if check != _checksum(content) or not _is_own(file):
+            return None
+        code, result = pickle.loads(content)
+        os.utime(file)
         return export.deserialize(code), result
     except Exception:
-        # Whatever a damaged file raises: it is traced again and replaced.
+        # Of another version, say: it is traced again and replaced.
         return None
 
 
@@ -166,127 +181,32 @@ def _write(file: Path, exported: export.Exported, result: Any) -> None:
     """Keep a program; without a word if that is impossible, as for a full disk."""
     try:
         content = pickle.dumps((bytes(exported.serialize()), result))
-        with temporary(file.with_name(f".{file.name}.{os.getpid()}")) as new:
-            new.write_bytes(content)
-            new.replace(file)
-    except (OSError, ImportError, pickle.PickleError, AttributeError, TypeError):
+        with temporary(file.with_name(f".{uuid.uuid4().hex}")) as new:
+            with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+                opened.write(_checksum(content) + content)
+            os.replace(new, file)
+        _remove_unused(file.parent)
+    except (OSError, ImportError, NotImplementedError, pickle.PickleError, AttributeError,
+            TypeError, ValueError):  # fmt: skip
         pass
 
 
-# ---------------------------------------------------------------------- the key of a program
+def _checksum(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=CHECKSUM).digest()
 
 
-class _CannotDescribe(Exception):
-    """An argument on which the program depends in an unknown way."""
-
-
-def _setting(name: str) -> Any:
-    """A setting of JAX, as it is here: some can be changed within a block."""
-    return getattr(jax.config, name)
+def _is_own(file: Path) -> bool:
+    """Whether nobody else can have written a file."""
+    if not hasattr(os, "geteuid"):
+        return True
+    state = file.stat()
+    return state.st_uid == os.geteuid() and not state.st_mode & 0o022
 
 
 @functools.cache
-def _state_of_package() -> str:
-    """The sources of this package, and the versions of all that generate code."""
-    digest = hashlib.blake2b(digest_size=16)
-    root = Path(__file__).parents[1]
-    for file in sorted(root.rglob("*.py")):
-        digest.update(str(file.relative_to(root)).encode())
-        digest.update(file.read_bytes())
-    modules = [sys.modules[name] for name in ("equinox", "lineax", "optimistix", "jaxtyping")
-               if name in sys.modules]  # fmt: skip
-    versions = [str(module.__version__) for module in (jax, jaxlib, np, *modules)]
-    return " ".join((digest.hexdigest(), sys.version, *versions))
-
-
-def _describe(x: Any, found: list[str], is_data: Callable | None) -> None:
-    """Append what a program can depend on in `x`: of the leaves that are data only shape and type;
-    `is_data` None: everything is compiled in.
-
-    **Raises:** `_CannotDescribe`."""
-    if isinstance(x, Tracer):
-        raise _CannotDescribe
-    if is_data is not None and is_data(x):
-        _describe_data(x, found)
-    elif x is None or isinstance(x, bool | int | float | complex | str | bytes):
-        found.append(f"{type(x).__name__} {x!r}")
-    elif eqx.is_array(x):
-        _describe_data(x, found)
-        found.append(hashlib.blake2b(np.asarray(x).tobytes()).hexdigest())
-    elif isinstance(x, list | tuple | range):
-        _describe_name(type(x), found)
-        found.append(str(len(x)))
-        for item in x:
-            _describe(item, found, is_data)
-    elif isinstance(x, dict):
-        found.append(f"dict {len(x)}")
-        for key, value in x.items():
-            _describe(key, found, None)
-            _describe(value, found, is_data)
-    elif isinstance(x, enum.Enum):
-        _describe_name(type(x), found)
-        found.append(x.name)
-    elif isinstance(x, jax.sharding.Mesh):
-        found.append(f"mesh {x} {[device.id for device in x.devices.flat]}")
-    elif type(x) is object:  # a sentinel
-        found.append("object")
-    elif isinstance(x, type | types.FunctionType) or not dataclasses.is_dataclass(x):
-        _describe_function(x, found)
-    else:
-        _describe_name(type(x), found)
-        for field in (f for f in dataclasses.fields(x) if f.compare):
-            # A dataclass that is no module of equinox is one leaf to JAX.
-            inside = isinstance(x, eqx.Module) and not field.metadata.get("static")
-            found.append(field.name)
-            _describe(getattr(x, field.name, None), found, is_data if inside else None)
-
-
-def _describe_data(x, found):
-    kind, weak = getattr(x, "dtype", type(x).__name__), getattr(x, "weak_type", False)
-    spread = isinstance(x, jax.Array) and len(x.devices()) > 1
-    found.append(f"data {kind} {np.shape(x)} {weak} {x.sharding if spread else ''}")
-
-
-def _describe_function(x, found):
-    """A function or class by its name; a function inside another one by its code and what it
-    encloses."""
-    if _is_named(x):
-        return _describe_name(x, found)
-    if isinstance(x, functools.partial):
-        parts = [x.func, x.args, x.keywords]
-    elif isinstance(x, types.MethodType):
-        parts = [x.__func__, x.__self__]
-    elif isinstance(x, types.FunctionType) and _is_known(x):
-        code = x.__code__
-        constants = [c for c in code.co_consts if not isinstance(c, types.CodeType)]
-        found.append(f"{x.__module__} {x.__qualname__} {code.co_code.hex()} {constants!r}")
-        found.append(repr(list(code.co_positions())))
-        cells = [cell.cell_contents for cell in x.__closure__ or ()]
-        parts = [x.__defaults__, x.__kwdefaults__, cells]
-    elif _is_known(type(x)) and hasattr(x, "__wrapped__"):  # of jax.jit, say
-        parts = [x.__wrapped__]
-    else:
-        raise _CannotDescribe
-    found.append(type(x).__name__)
-    for part in parts:
-        _describe(part, found, None)
-
-
-def _describe_name(x, found):
-    if not _is_named(x):
-        raise _CannotDescribe
-    found.append(f"{x.__module__} {x.__qualname__}")
-
-
-def _is_named(x) -> bool:
-    """Whether `x` can be found by its name in a known module."""
-    if not _is_known(x) or not isinstance(getattr(x, "__qualname__", None), str):
-        return False
-    there: Any = sys.modules.get(x.__module__)
-    for name in x.__qualname__.split("."):
-        there = getattr(there, name, None)
-    return there is x
-
-
-def _is_known(x) -> bool:
-    return str(getattr(x, "__module__", "")).partition(".")[0] in DESCRIBABLE
+def _remove_unused(folder: Path) -> None:
+    """Remove programs that have not been used for long; once per process."""
+    latest = time.time() - LONGEST_UNUSED
+    for file in folder.glob("*-traced"):
+        if file.stat().st_mtime < latest:
+            file.unlink(missing_ok=True)
