@@ -192,7 +192,7 @@ def test_check_points_have_the_sigma_of_the_estimated_weights(estimated):
 
 
 def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
-    for module in ("leastsquares.quality.components", "bundle.repeated"):
+    for module in ("leastsquares.quality.components", "bundle.readjust"):
         monkeypatch.setattr(f"jaxbundle.{module}.ROUNDS", 1)
     network = simulation.network
     observations = dataclasses.replace(

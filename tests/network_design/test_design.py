@@ -304,7 +304,7 @@ def test_refusals_in_one_line(command, project, tmp_path):
         (("--aim", "mena"), "did you mean 'mean'"),
         (("--incidence", "60"), "incidence needs the normals"),
         (("--incidence", "60", "--normals", normals), "no row for point '2'"),
-        (("--order", "second"), "how many"),
+        (("--order", "second"), "needs the number of candidates"),
         (("--stations", "1,77"), "there is no image '77'"),
         (("--order", "zero", "--photographs", "2", "--aim", "reliability"), "order \"zero\""),
     ):
