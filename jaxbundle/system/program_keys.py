@@ -240,14 +240,14 @@ def _describe_function(x: Any, found: list[str]) -> None:
     elif isinstance(x, types.FunctionType) and _runs_in_known(x):
         parts = _code_of(x)
     elif type(x) is JITTED:
-        parts = [x.__wrapped__]
+        parts = [vars(x)["__wrapped__"]]
     elif isinstance(x, jax.custom_jvp):
         parts = [x.fun, x.jvp]
     elif type(x) is object and x is NO_AXIS:
         parts = []
     else:
         raise CannotDescribe
-    found.append(type(x).__name__)
+    found.append(str(type(x).__name__))
     for part in parts:
         describe(part, found, None)
 
