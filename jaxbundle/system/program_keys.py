@@ -291,10 +291,14 @@ def _is_known(module: str) -> bool:
     return module.partition(".")[0] in KNOWN
 
 
-def _no_axis() -> Any:
+def _find_no_axis(function: Any) -> Any:
     """The sentinel that `jax.vmap` encloses where no axis has a name."""
-    cells = [cell.cell_contents for cell in getattr(jax.vmap(abs), "__closure__", None) or ()]
-    return next((x for x in cells if type(x) is object), None)
+    for cell in getattr(function, "__closure__", None) or ():
+        x = cell.cell_contents
+        found = x if type(x) is object else _find_no_axis(x)
+        if found is not None:
+            return found
+    return None
 
 
-NO_AXIS = _no_axis()
+NO_AXIS = _find_no_axis(jax.vmap(abs))

@@ -50,7 +50,7 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
     `static`: the positions of arguments compiled in; None: everything that is no array, as by
     `equinox.filter_jit`. `options`: of `jax.jit`."""
     positions = (static,) if isinstance(static, int) else static
-    known: dict[Any, Callable] = {}
+    known: dict[Any, Callable | None] = {}
     if positions is None:
         jitted = eqx.filter_jit(function, **options)
     else:
@@ -64,15 +64,12 @@ def compile_once(function: Callable, static: Sequence[int] | int | None = None, 
         given = _Given(function, args, kwargs, positions)
         try:
             key = given.quick_key() or given.full_key()
-            program = known.get(key)
-            if program is None:
-                program = known.setdefault(key, _find(function, given, Path(folder), options))
         except CannotDescribe:
             return jitted(*args, **kwargs)
-        except (NotImplementedError, TypeError, ValueError):
-            # It cannot be exported; an error of the function itself is raised again.
-            return jitted(*args, **kwargs)
-        return program(given.leaves)
+        if key not in known:
+            known[key] = _find(function, given, Path(folder), options)
+        program = known[key]
+        return jitted(*args, **kwargs) if program is None else program(given.leaves)
 
     return run
 
@@ -118,11 +115,15 @@ class _Place:
     number: int
 
 
-def _find(function: Callable, given: _Given, folder: Path, options: dict) -> Callable:
-    """The program of a call: read, or traced and kept."""
+def _find(function: Callable, given: _Given, folder: Path, options: dict) -> Callable | None:
+    """The program of a call: read, or traced and kept; None if it cannot be kept."""
     name = re.sub(r"\W", "_", function.__name__)
-    file = folder / f"{name}-{given.full_key()}-traced"
-    exported, result = _read(file) or _trace(function, given, file)
+    try:
+        file = folder / f"{name}-{given.full_key()}-traced"
+        exported, result = _read(file) or _trace(function, given, file)
+    except (CannotDescribe, NotImplementedError, TypeError, ValueError):
+        # An error of the function itself is raised again without a program.
+        return None
 
     def call(*leaves):
         return exported.call(*leaves)
