@@ -11,7 +11,7 @@ MOST_EMPTY = 0.1
 """Chunks may pad a part by this fraction."""
 SMALL_PART = 2000
 """Parts with fewer observations have chunks of length one, and compile in a tenth of the time."""
-PAIR_CHUNKS, FEW_PAIR_CHUNKS = (256, 32, 4), (8,)
+PAIR_CHUNKS, FEW_PAIR_CHUNKS = (256, 64, 12), (8,)
 FEW_PAIRS = 50_000
 """Lists of fewer pairs have chunks of one length, which compiles in a third of the time."""
 
