@@ -37,6 +37,8 @@ LEAST_SPREAD = 25.0
 MOST_COSTS = 4e8
 """Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory, and
 paths from below are also followed."""
+STRIP_MARGIN = 128
+"""Rows above and below a strip that are matched with it: paths begin there."""
 UNIQUENESS = 5
 """Percent by which the best cost must be below the second."""
 SMALLEST_REGION = 80
@@ -121,20 +123,30 @@ def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows col
 
 def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     """Disparities by OpenCV, pixels; NaN if removed by the left-right check, the uniqueness or the
-    speckle filter."""
+    speckle filter. OpenCV follows the paths of a large image on one core: it is matched in strips
+    of rows, one for each core."""
     cv2 = need_opencv()
     number = max(16, -(-(span + 1) // 16) * 16)
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
-        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUENESS,
-        speckleWindowSize=SMALLEST_REGION, speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
-        else cv2.STEREO_SGBM_MODE_SGBM,
-    )  # fmt: skip
+    large, rows = left.size * number >= MOST_COSTS, len(left)
+    mode = cv2.STEREO_SGBM_MODE_SGBM if large else cv2.STEREO_SGBM_MODE_HH4
     eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
     # columns of the left image without a full range of disparities are matched with a margin
     wide = [cv2.copyMakeBorder(a, 0, 0, number, 0, cv2.BORDER_REPLICATE) for a in eight]
-    found = matcher.compute(*wide)[:, number:].astype(np.float32) / 16
+    strip = -(-rows // available_cores()) if large else rows
+
+    def of_strip(first):
+        low, high = max(first - STRIP_MARGIN, 0), min(first + strip + STRIP_MARGIN, rows)
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
+            P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUENESS,
+            speckleWindowSize=SMALLEST_REGION, speckleRange=2, mode=mode,
+        )  # fmt: skip
+        found = matcher.compute(*(np.ascontiguousarray(a[low:high]) for a in wide))
+        return found[first - low : first - low + strip, number:]
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        found = np.concatenate([*pool.map(of_strip, range(0, rows, strip))])
+    found = found.astype(np.float32) / 16
     return np.where((found >= 0) & (found <= span), found, np.nan)
 
 
