@@ -42,8 +42,8 @@ PIVOT = 1e-13
 PAIR_ROWS_AT_ONCE = 4096
 """Pairs whose products are in memory at the same time."""
 LONGEST_TURNED = 100
-"""Chunks of pairs up to this length take two thirds of the time if the left factor of the product
-is transposed as it is gathered; with longer ones the transposition takes more than it saves."""
+"""Chunks of up to this many pairs take three quarters of the time if the left factor of the product
+is transposed as it is gathered; in longer ones the transposition costs more than it saves."""
 LIFT = 1e-10
 """Added to unsolvable normal equations, relative to their diagonal."""
 
