@@ -22,6 +22,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
+from jaxbundle.reconstruction.datum import choose_datum_points
 
 GROSS, DOUBTFUL = 4.0, 5.0
 LAST_CHANGE = 0.004
@@ -102,6 +103,7 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
         total[rows] = _factors(w, r, kinds[rows])
         beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[rows, None]
         doubtful = _name(result, beyond.any(1))
+        network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(ROUNDS):
         tell("data snooping")
         network = _with_sigma(network, given * total[:, None])
