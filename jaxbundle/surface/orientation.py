@@ -10,6 +10,7 @@ adjustment: the true part may be smaller or larger. σ of 0, or none, adds nothi
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -19,10 +20,14 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.surface.views import FrameView, OrientedImage, pixel_of, run_in_lanes
+from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.programs import compile_once
 
-PORTION = 1 << 16
+PORTION = 1 << 15
 """Points computed at once."""
+SMALLEST = 1e-14
+"""Added to the normal equations of a point, relative to their trace: some directions may be
+undetermined."""
 
 
 def is_uncertain(view: OrientedImage) -> bool:
@@ -37,29 +42,39 @@ def orientation_covariance(
 ) -> Float[np.ndarray, "n 3 3"]:
     """The covariance of points due to that of the orientations of their images."""
     C = np.zeros((len(X), 3, 3))
-    if any(map(is_uncertain, views)):
-        for first in range(0, len(X), PORTION):
+    uncertain = [k for k, view in enumerate(views) if is_uncertain(view)]
+    if uncertain:
+        joint = np.block([[_covariance(views[k], views[l]) for l in uncertain] for k in uncertain])
+        root = _root(joint)
+
+        def add(first):
             rows = slice(first, first + PORTION)
-            C[rows] = _of_portion(views, X[rows], used[rows])
+            T = _by_orientations(views, uncertain, X[rows], used[rows])
+            factor = (T.reshape(-1, len(root)) @ root).reshape(len(T), 3, -1)
+            C[rows] = factor @ np.swapaxes(factor, 1, 2)
+
+        with ThreadPoolExecutor(available_cores()) as pool:
+            list(pool.map(add, range(0, len(X), PORTION)))
     return C
 
 
-def _of_portion(views, X, used):
+def _root(C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """A matrix W with W·Wᵀ = C, of units as different as those of orientations."""
+    unit = np.sqrt(np.diagonal(C))
+    scale = np.where(unit > 0, unit, 1.0)
+    values, vectors = np.linalg.eigh(C / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0))
+
+
+def _by_orientations(views, uncertain, X, used) -> Float[np.ndarray, "n 3 k"]:
+    """The matrices Sₖ of these views, side by side."""
     J = np.stack([view.derivative(X) for view in views], 1) * used[:, :, None, None]
     N = np.einsum("nkij,nkil->njl", J, J)
     scale = np.trace(N, axis1=1, axis2=2)[:, None, None]
-    Q = np.linalg.pinv(N / scale) / scale
-    S = {
-        k: Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(view, X)
-        for k, view in enumerate(views) if isinstance(view, FrameView) and is_uncertain(view)
-    }  # fmt: skip
-    C = np.zeros((len(X), 3, 3))
-    for k, one in S.items():
-        for l, other in S.items():
-            between = _covariance(views[k], views[l])
-            if between.any():
-                C += one @ between @ np.swapaxes(other, 1, 2)
-    return C
+    Q = np.linalg.inv(N / scale + SMALLEST * np.eye(3)) / scale
+    return np.concatenate([
+        Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(views[k], X) for k in uncertain
+    ], axis=2)  # fmt: skip
 
 
 def _covariance(one: FrameView, other: FrameView) -> Float[np.ndarray, "k l"]:

@@ -12,17 +12,21 @@ Source: Fusiello, Trucco and Verri (2000), A compact algorithm for rectification
 """
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
 from jaxbundle.surface.views import FrameView
+from jaxbundle.system.configuration import available_cores
 
 ROOM, LEAST_ROOM = 0.15, 8.0
 """Margin of disparities beyond those of the points: relative to their range, and pixels."""
 LARGEST_ANGLE = 1.25
 """Radians from the axis of the rectified camera to the farthest ray."""
+PIXELS_AT_ONCE = 1 << 18
+"""Pixels looked up together."""
 LARGEST_SIZE_RATIO = 5.0
 """Pixels of the rectified image, as a multiple of those of the base image."""
 
@@ -134,15 +138,19 @@ def _look_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
     coefficients = ndimage.spline_filter(np.asarray(view.grey, np.float32), 3, np.float32)
     out = np.empty(shape, np.float32)
     x = (np.arange(columns) + origin[0]) / f
-    together = max(1, (1 << 20) // columns)
-    for first in range(0, rows, together):
+    together = max(1, PIXELS_AT_ONCE // columns)
+
+    def fill(first):
         y = (np.arange(first, min(first + together, rows)) + origin[1]) / f
         d = np.stack([*np.meshgrid(x, y), np.ones((len(y), columns))], -1).reshape(-1, 3)
         uv = view.project(view.X0 + d @ R)
         inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
-        place = np.where(inside[:, None], uv, 0.0)
-        grey = ndimage.map_coordinates(
-            coefficients, [place[:, 1], place[:, 0]], order=3, prefilter=False, mode="nearest"
+        grey = np.full(len(uv), np.nan, np.float32)
+        grey[inside] = ndimage.map_coordinates(
+            coefficients, uv[inside, ::-1].T, order=3, prefilter=False, mode="nearest"
         )
-        out[first : first + together] = np.where(inside, grey, np.nan).reshape(len(y), -1)
+        out[first : first + together] = grey.reshape(len(y), -1)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(fill, range(0, rows, together)))
     return out

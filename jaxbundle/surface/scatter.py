@@ -13,6 +13,8 @@ from scipy import stats
 
 FEWEST_VALUES = 100
 """Minimum values for a factor."""
+MOST_VALUES = 4_000_000
+"""Values of a larger grid are sampled, in strips."""
 WEIGHTS = 1.0, -3.0, 3.0, -1.0
 
 
@@ -32,19 +34,28 @@ def scatter_factor(
     over `step`, of blocks of `side`; none if no block has enough values."""
     found = []
     for a, s in ((d, sigma), (d.T, sigma.T)):
-        n = a.shape[1] - 3 * step
+        rows, n = a.shape[0], a.shape[1] - 3 * step
         if n < side:
             continue
-        parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(WEIGHTS)]
-        difference = sum(w * a[:, part] for w, part in parts)
-        square = sum(w * w * s[:, part] ** 2 for w, part in parts)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = difference / np.sqrt(square)
-        blocks = [
-            ratio[r : r + side, c : c + side].ravel()
-            for r in range(0, ratio.shape[0], side) for c in range(0, n, side)
-        ]  # fmt: skip
-        full = [robust_factor(b) for b in blocks if np.isfinite(b).sum() > side**2 / 3]
+        every = side * max(1, round(a.size / MOST_VALUES))
+        full = [
+            robust_factor(block)
+            for first in range(0, rows, every)
+            for block in _blocks(a[first : first + side], s[first : first + side], step, side)
+        ]
         if full:
             found.append(float(np.quantile(full, quantile)))
     return found
+
+
+def _blocks(a, s, step, side):
+    """Third differences over their σ along some rows, in blocks of `side` columns of which a third
+    or more is known."""
+    n = a.shape[1] - 3 * step
+    parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(WEIGHTS)]
+    difference = sum(w * a[:, part] for w, part in parts)
+    square = sum(w * w * s[:, part] ** 2 for w, part in parts)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = difference / np.sqrt(square)
+    blocks = (ratio[:, first : first + side] for first in range(0, n, side))
+    return [b for b in blocks if np.isfinite(b).sum() > side**2 / 3]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from jaxbundle.surface import dense
+from jaxbundle.surface import dense, disparity_search
 from jaxbundle.surface.dense import match_dense
 
 SHAPE, SHIFT, SPAN = (160, 460), 50, 90
@@ -39,11 +39,11 @@ def test_strips_of_a_large_image_match_as_the_whole(monkeypatch):
     y, x = np.indices(right.shape)
     true = 20 + 8 * np.sin(y / 60) + 5 * np.sin(x / 50)
     left = ndimage.map_coordinates(right, [y, x - true], order=3, mode="nearest")
-    monkeypatch.setattr(dense, "MOST_COSTS", 0)
+    monkeypatch.setattr(disparity_search, "MOST_COSTS", 0)
 
     def match(cores):
-        monkeypatch.setattr(dense, "available_cores", lambda: cores)
-        return dense.semi_global(left, right, 47)
+        monkeypatch.setattr(disparity_search, "available_cores", lambda: cores)
+        return disparity_search.semi_global(left, right, 47)
 
     whole, strips = match(1), match(4)
     inner = np.s_[10:-10, 60:-10]

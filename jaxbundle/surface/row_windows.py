@@ -1,0 +1,110 @@
+"""Least squares of windows along rows, at every pixel of a piece of a rectified pair.
+
+With R the right image, moved by the disparities found so far,
+
+    left + v = h₀ + h₁·R + g_x·δ + g_y·ε
+
+is solved for a correction δ of the disparity, a shift ε across the rows, brightness and contrast.
+All sums are sums over windows, reduced to their means, of single precision: the mean of the piece
+is subtracted first.
+
+Sources: Lucas and Kanade (1981); Ackermann (1984).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float32
+
+from jaxbundle.system.programs import compile_once
+
+MOST_RATIO = 5.0
+"""Maximum ratio of the contrasts of two windows that may be alike."""
+INNER, SIGNIFICANT = 2, 3.0
+"""Margin of the window around its middle, which must have texture of its own: variance above that
+of noise by this many σ. Otherwise the window shows the surroundings of its pixel."""
+LEAST_CONTRAST = 1.0
+"""Standard deviation of a window, grey values of 256."""
+LEAST_DETERMINANT = 1e-9
+"""Of the normal equations, relative to the product of their diagonal."""
+
+
+class Corrections(NamedTuple):
+    """δ, its σ, ε over its σ, ρ of the window, h₁ (NaN: not determined), and whether it has
+    texture."""
+
+    delta: Float32[Array, "rows columns"]
+    sigma: Float32[Array, "rows columns"]
+    across: Float32[Array, "rows columns"]
+    rho: Float32[Array, "rows columns"]
+    contrast: Float32[Array, "rows columns"]
+    textured: Bool[Array, "rows columns"]
+
+
+def _correct(left, right, half: int) -> Corrections:
+    n = (2 * half + 1) ** 2
+    offset = jnp.mean(left)
+    L, R = left - offset, right - offset
+    mean = lambda a: _sum_windows(a, half) / n
+    mean_L, mean_R = mean(L), mean(R)
+    LL, RR = n * (mean(L * L) - mean_L**2), n * (mean(R * R) - mean_R**2)
+    LR = n * (mean(L * R) - mean_L * mean_R)
+    # gradients in grey values of the left image, for any exposure of the right one; the disparity
+    # moves the right image against its columns: −∂R/∂x
+    ratio = jnp.sqrt(jnp.maximum(LL, n) / jnp.maximum(RR, n)).clip(1 / MOST_RATIO, MOST_RATIO)
+    x, y = (-(_gradient(L, axis) + ratio * _gradient(R, axis)) / 2 for axis in (1, 0))
+    mean_x, mean_y = mean(x), mean(y)
+    a = n * (mean(x * x) - mean_x**2)
+    b = n * (mean(x * y) - mean_x * mean_y)
+    c = n * (mean(x * R) - mean_x * mean_R)
+    d = n * (mean(y * y) - mean_y**2)
+    e = n * (mean(y * R) - mean_y * mean_R)
+    f = RR
+    g = n * (mean(x * L) - mean_x * mean_L), n * (mean(y * L) - mean_y * mean_L), LR
+    # the inverse of the symmetric matrix of a, b, c; d, e; f
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * A + b * B + c * C
+    textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
+    good = textured & (determinant > LEAST_DETERMINANT * a * d * f) & (a * d * f > 0)
+    determinant = jnp.where(good, determinant, jnp.nan)
+    delta, epsilon, contrast = (
+        (u * g[0] + v * g[1] + w * g[2]) / determinant
+        for u, v, w in ((A, B, C), (B, D, E), (C, E, F))
+    )
+    rest = jnp.maximum(LL - delta * g[0] - epsilon * g[1] - contrast * g[2], 0)
+    variance = rest / (n - 4)
+    # half of the variance is the noise of the left image
+    inner = half // INNER
+    number = (2 * inner + 1) ** 2
+    beyond = 1 + SIGNIFICANT * float(np.sqrt(2 / (number - 1)))
+    own = _sum_windows(L * L, inner) / number - (_sum_windows(L, inner) / number) ** 2
+    textured &= own > LEAST_CONTRAST**2 + beyond * variance / 2
+    return Corrections(
+        delta, jnp.sqrt(variance * A / determinant),
+        epsilon / jnp.sqrt(variance * D / determinant), LR / jnp.sqrt(LL * RR), contrast, textured,
+    )  # fmt: skip
+
+
+correct = compile_once(_correct, static=2)
+"""Corrections of a piece: `correct(left, right, half)`, windows of 2·`half` + 1 pixels, those at
+the edges continued by reflection."""
+
+
+def _sum_windows(a, half):
+    side = 2 * half + 1
+    a = jnp.pad(a, half, mode="reflect")
+    for window in ((side, 1), (1, side)):
+        a = lax.reduce_window(a, np.float32(0), lax.add, window, (1, 1), "valid")
+    return a
+
+
+def _gradient(a, axis):
+    """Derivative of the cubic spline through the pixels' neighbours (fourth order central
+    difference)."""
+    n = a.shape[axis]
+    a = jnp.pad(a, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+    m2, m1, p1, p2 = (lax.slice_in_dim(a, k, k + n, axis=axis) for k in (0, 1, 3, 4))
+    return (m2 - 8 * m1 + 8 * p1 - p2) / 12
