@@ -8,6 +8,8 @@ line. So the errors of pairs k and l have the covariance ½·σₖ·σₗ·eₖ�
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +22,9 @@ from jaxbundle.surface.guide import Guide
 from jaxbundle.surface.orientation import orientation_covariance
 from jaxbundle.surface.rectification import Rectified, disparity_range, rectify
 from jaxbundle.surface.views import FrameView
+from jaxbundle.system.configuration import available_cores
 
-PIXELS_AT_ONCE = 1 << 19
+PIXELS_AT_ONCE = 1 << 18
 """Pixels looked up together."""
 ONE_SURFACE = 1.0
 """Maximum difference of the four neighbours for interpolation of disparities, pixels."""
@@ -40,7 +43,11 @@ def dense_cloud(
     the guide.
     """
     found_points, all_points = guide_points(base, guide), bound_points(base, bounds)
-    pairs, partners, used, left_out = [], [], [], []
+    columns, rows = base.size
+    v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
+    uv = np.stack([u, v], 1).astype(float)
+    found: list[_Found] = []
+    used, left_out = [], []
     for other in others:
         span = disparity_range(base, other, all_points)
         X = all_points if span is not None and span < MOST_DISPARITIES else found_points
@@ -49,22 +56,16 @@ def dense_cloud(
             left_out.append(other.name)
             continue
         pair, span = rectified
-        found = match_dense(pair, span)
-        pairs.append((pair, found))
-        partners.append(other)
-        used.append((other.name, found.factor))
-    columns, rows = base.size
-    v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
-    uv = np.stack([u, v], 1).astype(float)
-    parts = [
-        _points((base, *partners), pairs, uv[k : k + PIXELS_AT_ONCE])
-        for k in range(0, len(uv), PIXELS_AT_ONCE) if pairs
-    ]
-    if not parts:
+        disparities = match_dense(pair, span)
+        found.append(_look_up(base, other, uv, pair, disparities))
+        used.append((other.name, disparities.factor))
+    if not found:
         none = np.zeros
         empty = Cloud(none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)),
                       (base.name,))  # fmt: skip
         return empty, used, left_out
+    parts = [_points(base, found, uv, slice(k, k + PIXELS_AT_ONCE))
+             for k in range(0, len(uv), PIXELS_AT_ONCE)]  # fmt: skip
     X, covariance, rays, places = (np.concatenate(p) for p in zip(*parts))
     cloud = Cloud(X, covariance, rays, np.zeros(len(X), np.int16), places, (base.name,))
     return cloud, used, left_out
@@ -86,27 +87,50 @@ def bound_points(base: FrameView, bounds: Bounds) -> Float[np.ndarray, "n 3"]:
     return ends[np.isfinite(ends).all(1)]
 
 
-def _points(views, pairs, uv):
-    """Points, their covariance, numbers of rays, and their pixels."""
-    base = views[0]
-    d = base.points(uv, np.ones(len(uv))) - base.X0
-    found = [_inverse_distance(base, d, *pair) for pair in pairs]
-    q, s = (np.stack(a) for a in zip(*found))
-    across = np.stack([pair.R[0] for pair, _ in pairs])
+class _Found(NamedTuple):
+    """What a pair says of the pixels of the base: inverse distances and their σ (NaN: nothing); the
+    direction of the base, and its length."""
+
+    other: FrameView
+    q: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    axis: Float[np.ndarray, "3"]
+    length: float
+
+
+def _look_up(base, other, uv, pair: Rectified, disparities: Disparities) -> _Found:
+    """What the disparities of a pair say of pixels of the base."""
+    q, sigma = np.empty(len(uv)), np.empty(len(uv))
+
+    def fill(first):
+        rows = slice(first, first + PIXELS_AT_ONCE)
+        d = base.points(uv[rows], np.ones(len(uv[rows]))) - base.X0
+        q[rows], sigma[rows] = _inverse_distance(base, d, pair, disparities)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(fill, range(0, len(uv), PIXELS_AT_ONCE)))
+    return _Found(other, q, sigma, pair.R[0], pair.base)
+
+
+def _points(base, found: Sequence[_Found], uv, rows):
+    """Points of some pixels, their covariance, numbers of rays, and their pixels."""
+    q, s = (np.stack([getattr(one, name)[rows] for one in found]) for name in ("q", "sigma"))
+    across = np.stack([one.axis for one in found])
     across = across - (across @ base.M[2])[:, None] * base.M[2]
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     q, variance, number = combine(q, s, across @ across.T)
     good = np.isfinite(q) & (q > 0)
-    uv, d, q, variance, number = (a[good] for a in (uv, d, q, variance, number))
+    uv, q, variance, number = (a[good] for a in (uv[rows], q, variance, number))
+    d = base.points(uv, np.ones(len(uv))) - base.X0
     length = 1 / q
     along = variance / q**4
     # across the line of sight: the part of a match's error due to the base image
-    pair = pairs[0][0]
-    pixel = np.sqrt(variance / 2) * pair.base * length
+    pixel = np.sqrt(variance / 2) * found[0].length * length
     dd = d[:, :, None] * d[:, None]
     covariance = along[:, None, None] * dd + (pixel**2)[:, None, None] * (np.eye(3) - dd)
     X = base.X0 + length[:, None] * d
     used = np.concatenate([np.ones((1, len(X)), bool), np.isfinite(s[:, good])]).T
+    views = [base, *(one.other for one in found)]
     covariance += orientation_covariance(views, X, used)
     return X, covariance.astype(np.float32), (number + 1).astype(np.int16), uv.astype(np.float32)
 
