@@ -13,6 +13,7 @@ from jaxbundle.bundle.far_points import angle_of_rays
 from jaxbundle.bundle.result import Adjustment
 
 FEWEST_RAYS = 3
+"""Minimum rays of a datum point; two in a pair of photographs."""
 WIDE = np.radians(5.0)
 """Angle between two rays that suffices for a datum point; if most angles are narrower, their
 median does."""
@@ -33,7 +34,8 @@ def choose_datum_points(result: Adjustment) -> tuple[str, ...]:
     image, point = problem.image[used], problem.point[used]
     rays = np.bincount(point, minlength=len(network.points))
     angle = angle_of_rays(problem, result.values)
-    good = (rays >= FEWEST_RAYS) & problem.network.points.has_role("tie")
+    tie = problem.network.points.has_role("tie")
+    good = tie & (rays >= min(FEWEST_RAYS, rays[tie].max(initial=0))) & (rays > 1)
     if not good.any():
         return ()
     good &= angle >= min(WIDE, float(np.median(angle[good])))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from jaxbundle.surface import dense, disparity_search
+from jaxbundle.surface import dense, disparity_refinement, disparity_search
 from jaxbundle.surface.dense import match_dense
 
 SHAPE, SHIFT, SPAN = (160, 460), 50, 90
@@ -50,3 +50,44 @@ def test_strips_of_a_large_image_match_as_the_whole(monkeypatch):
     assert (np.abs(strips - true) < 0.5)[inner].mean() > 0.97
     # Paths from above begin at other rows; nothing else may differ.
     assert (np.abs(strips - whole) < 0.5)[np.isfinite(whole)].mean() > 0.999
+
+
+def wavy_pair():
+    """A surface with waves and a step, and its disparities."""
+    rng = np.random.default_rng(6)
+    shape = (400, 600)
+    right = 128 + 90 * ndimage.gaussian_filter(rng.standard_normal(shape), 1.3)
+    y, x = np.indices(shape)
+    true = 40 + 6 * np.sin(y / 60) + 9 * np.sin(x / 90) + 12 * ((abs(x - 350) < 60) & (y > 150))
+    left = ndimage.map_coordinates(right, [y, x - true], order=3, mode="nearest")
+    noisy = [np.float32(a + rng.standard_normal(shape)) for a in (left, right)]
+    return SimpleNamespace(left=noisy[0], right=noisy[1]), true
+
+
+@pytest.mark.parametrize("levels", [0, 1, 2])
+def test_a_large_pair_is_matched_at_half_its_size_first(monkeypatch, levels):
+    pair, true = wavy_pair()
+    span = 80
+    monkeypatch.setattr(dense, "MOST_SEARCHED", pair.left.size * span / 8**levels * 1.2)
+    found = match_dense(pair, span)
+    e, inner = found.disparity - true, np.s_[10:-10, span:-10]
+    known = np.isfinite(e[inner])
+    assert known.mean() > 0.9
+    assert (np.abs(e[inner][known]) < 0.2).mean() > 0.985
+    w = (e / found.sigma)[inner][known]
+    assert 0.8 < np.median(np.abs(w)) / 0.6745 < 1.2
+    assert (np.abs(w) < 3).mean() > 0.98
+
+
+def test_pieces_do_not_matter(monkeypatch):
+    pair, true = wavy_pair()
+    start = np.where(true > 0, np.rint(4 * true) / 4, np.nan).astype(np.float32)
+    found = []
+    for piece in ((256, 512), (120, 200)):
+        monkeypatch.setattr(disparity_refinement, "PIECE", piece)
+        found.append(disparity_refinement.refine_disparities(pair.left, pair.right, start))
+    one, other = found
+    assert (np.isfinite(one.disparity) == np.isfinite(other.disparity)).mean() > 0.999
+    off = np.abs(one.disparity - other.disparity)
+    # OpenCV tabulates the weights of means by the range of disparities in a piece
+    assert np.nanpercentile(off, 99.5) < 0.02
