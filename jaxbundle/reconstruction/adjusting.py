@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.errors import NotSolvedError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.reconstruction.datum import choose_datum_points
@@ -60,16 +60,23 @@ def adjust_weighted(
 
     **Raises:** as `jaxbundle.adjust`.
     """
+    found, failed = None, None
     try:
         found = _without_lost(network, kinds, names, significance, tell)
         if found.adjustment.converged:
             return found
-    except NotSolvedError:
-        pass
+    except NotSolvedError as error:
+        failed = error
     rays = network.observations
     number = np.bincount(rays.point, minlength=len(network.points))
     clear, kinds = _keep(network, kinds, (number > 2) | ~network.points.has_role("tie"))
-    return _without_lost(clear, kinds, names, significance, tell)
+    try:
+        return _without_lost(clear, kinds, names, significance, tell)
+    except InputError:
+        # a photograph has hardly any of these points
+        if found is not None:
+            return found
+        raise failed from None
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
