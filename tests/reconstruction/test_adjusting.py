@@ -13,7 +13,8 @@ from jaxbundle.reconstruction import adjusting
 @pytest.mark.parametrize("first", ["fails", "does not converge"])
 def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, first):
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
-    network = simulate(ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.002)
+    targets = grid_of_targets(4, 4, 0.5)
+    network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
     attempts = []
     unfinished = adjusting.Weighted(SimpleNamespace(converged=False), {})
 
