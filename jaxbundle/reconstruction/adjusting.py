@@ -74,9 +74,10 @@ def adjust_weighted(
         return _without_lost(clear, kinds, names, significance, tell)
     except InputError:
         # a photograph has hardly any of these points
-        if found is not None:
-            return found
-        raise failed from None
+        if failed is not None:
+            raise failed from None
+        assert found is not None, "an attempt ends with a result or an error"
+        return found
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:

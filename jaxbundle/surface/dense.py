@@ -45,12 +45,13 @@ def _search(left, right, inside, right_inside, span) -> Float[np.ndarray, "rows 
     """Disparities to about a quarter of a pixel, NaN where none was found; a large pair at half
     its size."""
     if left.size * (span + 1) <= MOST_SEARCHED:
-        found = semi_global(*alike(left, right, inside, right_inside), span)
+        left, right = alike(left, right, inside, right_inside)
+        found = semi_global(left, right, span)
     else:
-        halves = _halve(left), _halve(right)
-        whole = [_halve(a.astype(np.float32)) == 1 for a in (inside, right_inside)]
-        coarse = _search(*halves, *whole, span // 2 + 1)
-        finer = refine_disparities(*halves, coarse).disparity
+        half, right_half = _halve(left), _halve(right)
+        whole, right_whole = (_halve(a.astype(np.float32)) == 1 for a in (inside, right_inside))
+        coarse = _search(half, right_half, whole, right_whole, span // 2 + 1)
+        finer = refine_disparities(half, right_half, coarse).disparity
         found = _double(np.where(np.isfinite(finer), finer, coarse), left.shape)
     return np.where(inside & (found <= span), found, np.nan)
 

@@ -99,7 +99,10 @@ class _Spline(NamedTuple):
         flat = self.coefficients.ravel()
         t2, t3 = t * t, t * t * t
         weights = 1 - 3 * t + 3 * t2 - t3, 4 - 6 * t2 + 3 * t3, 1 + 3 * (t + t2 - t3), t3
-        return sum(w * flat.take(first + k + 1) for k, w in enumerate(weights)) / 6
+        found = np.zeros(first.shape, np.float32)
+        for k, weight in enumerate(weights):
+            found += weight * flat.take(first + k + 1)
+        return found / 6
 
 
 def _with_windows(left, spline, start, half, wanted):
@@ -114,9 +117,9 @@ def _with_windows(left, spline, start, half, wanted):
         inner = tuple(slice(k, k + n) for k, n in zip(corner, (height, width)))
         if not wanted[inner].any():
             return
-        around = [_reflect(np.arange(n) + k - margin, size)
-                  for k, n, size in zip(corner, PIECE, left.shape)]  # fmt: skip
-        found = _refine(left, spline, start, *around, half)
+        v, u = (_reflect(np.arange(n) + k - margin, size)
+                for k, n, size in zip(corner, PIECE, left.shape))  # fmt: skip
+        found = _refine(left, spline, start, v, u, half)
         for out, piece in zip((d, sigma, rho, across), found):
             place = out[inner]
             place[:] = piece[margin:, margin:][: place.shape[0], : place.shape[1]]

@@ -34,7 +34,9 @@ COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
 from which the texture repeats itself; minimum part of the image for a surface of such a texture."""
 
 
-def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows columns"]]:
+def alike(
+    left, right, inside, right_inside
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
     """Grey values around 128 without differences of exposure and light."""
     cv2 = need_opencv()
     mean = lambda a: cv2.blur(a.astype(np.float32), (2 * MEAN_WINDOW + 1,) * 2)
@@ -44,7 +46,7 @@ def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows col
         own = float(np.std(away[there])) if there.any() else 0.0
         spread = spread or max(own, LEAST_SPREAD)
         found.append(np.clip(128 + away * (spread / max(own, 1.0)), 0, 255).astype(np.float32))
-    return found
+    return found[0], found[1]
 
 
 def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:

@@ -42,9 +42,13 @@ def orientation_covariance(
 ) -> Float[np.ndarray, "n 3 3"]:
     """The covariance of points due to that of the orientations of their images."""
     C = np.zeros((len(X), 3, 3))
-    uncertain = [k for k, view in enumerate(views) if is_uncertain(view)]
+    uncertain = {
+        k: view for k, view in enumerate(views)
+        if isinstance(view, FrameView) and is_uncertain(view)
+    }  # fmt: skip
     if uncertain:
-        joint = np.block([[_covariance(views[k], views[l]) for l in uncertain] for k in uncertain])
+        joint = np.block([[_covariance(one, other) for other in uncertain.values()]
+                          for one in uncertain.values()])  # fmt: skip
         root = _root(joint)
 
         def add(first):
@@ -73,7 +77,8 @@ def _by_orientations(views, uncertain, X, used) -> Float[np.ndarray, "n 3 k"]:
     scale = np.trace(N, axis1=1, axis2=2)[:, None, None]
     Q = np.linalg.inv(N / scale + SMALLEST * np.eye(3)) / scale
     return np.concatenate([
-        Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(views[k], X) for k in uncertain
+        Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(view, X)
+        for k, view in uncertain.items()
     ], axis=2)  # fmt: skip
 
 
