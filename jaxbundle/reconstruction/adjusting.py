@@ -31,6 +31,9 @@ ROUNDS = 4
 FEWEST = 60
 """Minimum measurements of a kind with a separate factor."""
 SMALLEST, LARGEST = 0.3, 8.0
+MANY = 0.25
+"""Share of gross errors above which points of two rays are not used: most of theirs are not
+detectable."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 400
@@ -53,8 +56,9 @@ def adjust_weighted(
     significance: float,
     tell: Callable[[str], None],
 ) -> Weighted:
-    """Adjust with variance components of the kinds and data snooping; without a solution
-    again without points of two rays, whose gross errors are not detectable.
+    """Adjust with variance components of the kinds and data snooping; without a solution, or with
+    very many gross errors, again without points of two rays, whose gross errors are hardly
+    detectable.
 
     **Arguments:** `kinds`: of every observation of the network.
 
@@ -63,7 +67,7 @@ def adjust_weighted(
     found, failed = None, None
     try:
         found = _without_lost(network, kinds, names, significance, tell)
-        if found.adjustment.converged:
+        if found.adjustment.converged and not _removed_many(found.adjustment):
             return found
     except NotSolvedError as error:
         failed = error
@@ -71,13 +75,27 @@ def adjust_weighted(
     number = np.bincount(rays.point, minlength=len(network.points))
     clear, kinds = _keep(network, kinds, (number > 2) | ~network.points.has_role("tie"))
     try:
-        return _without_lost(clear, kinds, names, significance, tell)
-    except InputError:
-        # a photograph has hardly any of these points
+        clearer = _without_lost(clear, kinds, names, significance, tell)
+        if clearer.adjustment.converged or found is None or not found.adjustment.converged:
+            return clearer
+    except (InputError, NotSolvedError):
+        # a photograph has hardly any of these points, or they do not determine it
         if failed is not None:
             raise failed from None
-        assert found is not None, "an attempt ends with a result or an error"
-        return found
+    assert found is not None, "an attempt ends with a result or an error"
+    if found.adjustment.converged:
+        raise NotSolvedError(
+            f"not solved: {len(found.adjustment.removed)} of {len(rays)} measurements are gross "
+            "errors, and the points of three rays alone do not confirm the others: the object "
+            "repeats itself; take photographs with shorter bases",
+            list(network.images.id),
+        )
+    return found
+
+
+def _removed_many(result: Adjustment) -> bool:
+    """Whether so many measurements were gross errors that many of points of two rays remain."""
+    return len(result.removed) > MANY * len(result.network.observations)
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:

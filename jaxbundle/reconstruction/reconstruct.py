@@ -58,9 +58,8 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
-FOLDED = 1 / 2
-"""Minimum share of measurements that agree with a result: 0.8 in a room with reflections; 0.4 for a
-long facade with superimposed windows."""
+FOLDED = 1 / 3
+"""Minimum share of measurements that agree with a result."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
