@@ -32,8 +32,8 @@ FEWEST = 60
 """Minimum measurements of a kind with a separate factor."""
 SMALLEST, LARGEST = 0.3, 8.0
 MANY = 0.25
-"""Share of gross errors above which points of two rays are not used: most of theirs are not
-detectable."""
+"""Share of gross errors above which points of two rays are not used: most of their gross errors
+cannot be detected."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 400
@@ -56,18 +56,21 @@ def adjust_weighted(
     significance: float,
     tell: Callable[[str], None],
 ) -> Weighted:
-    """Adjust with variance components of the kinds and data snooping; without a solution, or with
-    very many gross errors, again without points of two rays, whose gross errors are hardly
-    detectable.
+    """Adjust with variance components of the kinds and data snooping. Without a solution, or with
+    very many gross errors, adjust again without points of two rays, whose gross errors can hardly
+    be detected.
 
     **Arguments:** `kinds`: of every observation of the network.
 
-    **Raises:** as `jaxbundle.adjust`.
+    **Raises:** as `jaxbundle.adjust`; `NotSolvedError` if, with very many gross errors, points of
+    three rays do not confirm the result.
     """
     found, failed = None, None
     try:
         found = _without_lost(network, kinds, names, significance, tell)
-        if found.adjustment.converged and not _removed_many(found.adjustment):
+        if found.adjustment.converged and (
+            len(network.images) < 3 or not _removed_many(found.adjustment)
+        ):
             return found
     except NotSolvedError as error:
         failed = error
@@ -94,7 +97,8 @@ def adjust_weighted(
 
 
 def _removed_many(result: Adjustment) -> bool:
-    """Whether so many measurements were gross errors that many of points of two rays remain."""
+    """Whether so many measurements were gross errors that those of points of two rays are not
+    reliable."""
     return len(result.removed) > MANY * len(result.network.observations)
 
 

@@ -27,14 +27,17 @@ FEWEST = 12
 def choose_datum_points(result: Adjustment) -> tuple[str, ...]:
     """The ids of the datum points, in the order of the points; none if the datum is given
     otherwise, or all tie points are to define it."""
-    network, problem = result.network, result.problem
+    problem = result.problem
+    network = problem.network
     if network.datum != "inner" or network.datum_points:
+        return ()
+    if network.points.has_role("control", "fixed").any():
         return ()
     used = (np.asarray(problem.data.image_weight) > 0).any(1)
     image, point = problem.image[used], problem.point[used]
     rays = np.bincount(point, minlength=len(network.points))
     angle = angle_of_rays(problem, result.values)
-    tie = problem.network.points.has_role("tie")
+    tie = network.points.has_role("tie")
     good = tie & (rays >= min(FEWEST_RAYS, rays[tie].max(initial=0))) & (rays > 1)
     if not good.any():
         return ()
@@ -48,8 +51,7 @@ def choose_datum_points(result: Adjustment) -> tuple[str, ...]:
     chosen = np.unique(point[order][first])
     if len(chosen) < FEWEST:
         return ()
-    ids = problem.network.points.id
-    return tuple(ids[k] for k in chosen.tolist())
+    return tuple(network.points.id[k] for k in chosen.tolist())
 
 
 def _cells(

@@ -5,8 +5,8 @@ With R the right image, moved by the disparities found so far,
     left + v = h₀ + h₁·R + g_x·δ + g_y·ε
 
 is solved for a correction δ of the disparity, a shift ε across the rows, brightness and contrast.
-All sums are sums over windows, reduced to their means, of single precision: the mean of the piece
-is subtracted first.
+All sums are over windows, relative to the means of the windows. They are of single precision, so
+the mean of the piece is subtracted first.
 
 Sources: Lucas and Kanade (1981); Ackermann (1984).
 """

@@ -56,3 +56,7 @@ def test_a_datum_given_by_control_is_left_alone():
     held = dataclasses.replace(images, sigma=np.full((len(images), 6), 0.01))
     result = jaxbundle.adjust(network.replace(images=held, datum="control"))
     assert choose_datum_points(result) == ()
+    points = network.points
+    role = tuple("fixed" if k < 4 else role for k, role in enumerate(points.role))
+    fixed = dataclasses.replace(points, role=role)
+    assert choose_datum_points(jaxbundle.adjust(network.replace(points=fixed))) == ()
