@@ -13,19 +13,15 @@ from jaxbundle.reconstruction.named import Named
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.tiepoints.refinement import Measurements
 
-PRIORS = {"fx": 0.2, "cx": 0.02, "cy": 0.02}
-"""σ of start values, relative to the principal distance, or the longer side: large enough to
-matter only if photographs determine nothing."""
-K1_PRIOR = 0.3
+PRIORS = {"fx": 0.2, "cx": 0.01, "cy": 0.01, "k1": 0.3, "k2": 0.1, "k3": 0.05, "p1": 1e-3, "p2": 1e-3}
+"""σ of the free parameters of an unknown camera before the adjustment: of fx relative to itself, of
+cx and cy to the longer side. Many photographs determine the parameters much better; of few, the σ of
+the result contain what is not known of the camera."""
 FEWEST_PHOTOGRAPHS = 8
 """Minimum photographs of a camera for pixels that need not be square."""
 FEWEST_CONTROL = 3
 """Minimum control points in a part to transform it into their frame."""
-BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2",)))
-"""Free parameters by the minimum number of photographs of a lens."""
-TANGENTIAL = 5
-"""Minimum photographs of a camera for free P1 and P2."""
-OF_THE_LENS = ("fx", "k1", "k2")
+OF_THE_LENS = ("fx", "k1", "k2", "k3")
 """Common parameters of cameras with one lens."""
 
 
@@ -105,18 +101,14 @@ def _with_ties(network: Network, lens: Sequence[int]) -> Network:
 
 
 def _free(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
-    """A camera with the parameters determined by the number of its photographs, and of its lens."""
+    """A camera with free parameters, observed with their `PRIORS`; a calibrated one is held."""
     if given:
         return camera
-    free = tuple(n for least, names in BY_NUMBER if of_lens >= least for n in names)
-    free += ("p1", "p2") * (own >= TANGENTIAL)
-    f, size = camera.parameters["fx"], max(camera.image_size or (1, 1))
-    sigma = {"fx": PRIORS["fx"] * f, "cx": PRIORS["cx"] * size, "cy": PRIORS["cy"] * size,
-             "k1": K1_PRIOR}  # fmt: skip
+    free = tuple(PRIORS)
+    units = dict.fromkeys(free, 1.0) | dict.fromkeys(("cx", "cy"), max(camera.image_size or (1, 1)))
+    units["fx"] = camera.parameters["fx"]
+    sigma = {name: relative * units[name] for name, relative in PRIORS.items()}
     if own >= FEWEST_PHOTOGRAPHS and own == of_lens:
-        camera, free, sigma["fy"] = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:]), (
-            sigma["fx"]
-        )
-    return dataclasses.replace(
-        camera, free=free, sigma={n: s for n, s in sigma.items() if n in free}
-    )
+        camera, free = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:])
+        sigma["fy"] = sigma["fx"]
+    return dataclasses.replace(camera, free=free, sigma=sigma)

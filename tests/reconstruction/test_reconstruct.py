@@ -7,7 +7,7 @@ import numpy as np
 import pyproj
 import pytest
 from PIL import Image
-from rendered_photographs import SIZE, F, corner, write_photographs
+from rendered_photographs import CAMERA, SIZE, F, corner, write_photographs
 
 import jaxbundle
 from jaxbundle.errors import InputError
@@ -114,6 +114,20 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert {"features", "matching", "verification", "start values"} <= set(stages)
     assert all(done == total for stage, (done, total) in stages.items() if "data" not in stage)
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
+
+
+def test_the_principal_point_of_few_photographs_is_estimated(made, tmp_path):
+    """Held at the centre of the photographs it would bias the principal distance by many σ."""
+    for k in range(3):
+        (tmp_path / f"a{k}.png").write_bytes((made[3].parent / f"a{k}.png").read_bytes())
+    found = reconstruct([tmp_path], settings=SETTINGS).parts[0].adjustment
+    parameters = found.cameras[found.network.cameras[0].id]["parameters"]
+    for name, true in CAMERA.parameters.items():
+        one = parameters[name]
+        assert one["free"] or name == "fy"
+        assert abs(one["value"] - true) < 3.5 * one["sigma"], name
+    centre = (SIZE[0] - 1) / 2
+    assert abs(centre - CAMERA.parameters["cx"]) > 3.5 * parameters["cx"]["sigma"]
 
 
 @pytest.mark.further
