@@ -37,8 +37,8 @@ cannot be detected."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 2000
-"""Iterations of one adjustment. Photographs with the same viewing direction determine the principal
-distance of an unknown camera only weakly, and the search then needs more than a hundred."""
+"""Iterations of one adjustment. Two photographs, or many with the same viewing direction, determine
+an unknown camera only weakly, and the search then needs several hundred."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,10 @@ CELLS = 10
 """Cells along the longer side of a photograph."""
 MERGING_DISTANCE = 0.0015
 """Tracks nearer than this part of the longer side, in two photographs, are one point."""
+WINDOW = 17
+"""Side, pixels, of the windows by which tracks are measured. Tracks with the same pixels in their
+windows have correlated errors: more of them hardly make the result better, but would reduce its σ
+(by 1.3 to 2 with 1500 points in photographs of less than a megapixel)."""
 
 
 def make_tracks(
@@ -75,7 +79,8 @@ def choose_tracks(
     sizes: Sequence[tuple[int, int]],
     number: int,
 ) -> Bool[np.ndarray, " tracks"]:
-    """Which tracks to keep, for about `number` points in every photograph, evenly distributed.
+    """Which tracks to keep, for about `number` points in every photograph, evenly distributed; on
+    average their windows do not overlap in two photographs.
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
@@ -106,7 +111,8 @@ def _cells(xy, sizes):
         column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
         cell.append(row * nx + column)
         shape.append((nx, ny))
-        fine = np.floor(places / (MERGING_DISTANCE * max(columns, rows))).astype(int)
+        apart = max(WINDOW, MERGING_DISTANCE * max(columns, rows))
+        fine = np.floor(places / apart).astype(int)
         near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
     return cell, near, shape
 

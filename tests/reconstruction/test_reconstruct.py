@@ -125,9 +125,10 @@ def test_the_principal_point_of_few_photographs_is_estimated(made, tmp_path):
     for name, true in CAMERA.parameters.items():
         one = parameters[name]
         assert one["free"] or name == "fy"
-        assert abs(one["value"] - true) < 3.5 * one["sigma"], name
+        # nine parameters, and windows that contain edges of the plate
+        assert abs(one["value"] - true) < 4 * one["sigma"], name
     centre = (SIZE[0] - 1) / 2
-    assert abs(centre - CAMERA.parameters["cx"]) > 3.5 * parameters["cx"]["sigma"]
+    assert abs(centre - CAMERA.parameters["cx"]) > 4 * parameters["cx"]["sigma"]
 
 
 @pytest.mark.further

@@ -192,6 +192,8 @@ def test_chosen_tracks_cover_the_photographs():
     kept = choose_tracks(tracks, [xy, xy], [(1000, 1000)] * 2, 300)
     assert kept[3000:3150].mean() > 0.7 and kept[:3000].sum() < 100
     assert not np.any(kept[:20] & kept[3150:])
+    # however many are wanted, their windows do not overlap on average
+    assert choose_tracks(tracks, [xy, xy], [(1000, 1000)] * 2, 10**6)[:3000].sum() <= 200**2 / 15**2
 
 
 def test_matches_are_those_of_both_sides():
