@@ -21,6 +21,9 @@ WINDOW = 17
 """Side, pixels, of the windows by which tracks are measured. Tracks with the same pixels in their
 windows have correlated errors: more of them hardly make the result better, but would reduce its σ
 (by 1.3 to 2 with 1500 points in photographs of less than a megapixel)."""
+FEW = 400
+"""Points of a photograph up to which those with overlapping windows are kept, too: with few points
+it matters more that gross errors are found."""
 
 
 def make_tracks(
@@ -79,42 +82,53 @@ def choose_tracks(
     sizes: Sequence[tuple[int, int]],
     number: int,
 ) -> Bool[np.ndarray, " tracks"]:
-    """Which tracks to keep, for about `number` points in every photograph, evenly distributed; on
-    average their windows do not overlap in two photographs.
+    """Which tracks to keep, for about `number` points in every photograph, evenly distributed. On
+    average their windows do not overlap in two photographs, unless there are `FEW`.
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
-    cell, near, shape = _cells(xy, sizes)
+    cell, shape = _cells(xy, sizes)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
     filled = [np.zeros(nx * ny, int) for nx, ny in shape]
-    taken: list[set] = [set() for _ in xy]
-    kept = np.zeros(len(tracks), bool)
-    for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
-        track = tracks[k]
-        wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
-        double = sum(near[i][f] in taken[i] for i, f in track)
-        if wanted < 2 or double >= 2:
-            continue
-        kept[k] = True
-        for i, f in track:
-            filled[i][cell[i][f]] += 1
-            taken[i].add(near[i][f])
+    kept, count = np.zeros(len(tracks), bool), np.zeros(len(xy), int)
+    order = np.argsort([-len(track) for track in tracks], kind="stable").tolist()
+    merged = [MERGING_DISTANCE * max(size) for size in sizes]
+    for sides, most in (([max(WINDOW, side) for side in merged], np.inf), (merged, FEW)):
+        near = [_fine_cells(places, side) for places, side in zip(xy, sides)]
+        taken = [set() for _ in xy]
+        for k in np.flatnonzero(kept).tolist():
+            for i, f in tracks[k]:
+                taken[i].add(near[i][f])
+        for k in order:
+            track = tracks[k]
+            wanted = sum(filled[i][cell[i][f]] < quota[i] and count[i] < most for i, f in track)
+            double = sum(near[i][f] in taken[i] for i, f in track)
+            if kept[k] or wanted < 2 or double >= 2:
+                continue
+            kept[k] = True
+            for i, f in track:
+                filled[i][cell[i][f]] += 1
+                count[i] += 1
+                taken[i].add(near[i][f])
     return kept
 
 
 def _cells(xy, sizes):
-    """For every feature its cell of the grid, and that of a fine grid; shape of the grids."""
-    cell, near, shape = [], [], []
+    """For every feature its cell of the grid; shape of the grids."""
+    cell, shape = [], []
     for places, (columns, rows) in zip(xy, sizes):
         side = max(columns, rows) / CELLS
         nx, ny = (max(1, int(np.ceil(n / side))) for n in (columns, rows))
         column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
         cell.append(row * nx + column)
         shape.append((nx, ny))
-        apart = max(WINDOW, MERGING_DISTANCE * max(columns, rows))
-        fine = np.floor(places / apart).astype(int)
-        near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
-    return cell, near, shape
+    return cell, shape
+
+
+def _fine_cells(places, side) -> list[int]:
+    """For every feature its cell of a fine grid."""
+    fine = np.floor(places / side).astype(int)
+    return (fine[:, 1] * 100_000 + fine[:, 0]).tolist()
 
 
 def flatten(
