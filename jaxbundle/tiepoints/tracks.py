@@ -22,8 +22,8 @@ WINDOW = 17
 windows have correlated errors: more of them hardly make the result better, but would reduce its σ
 (by 1.3 to 2 with 1500 points in photographs of less than a megapixel)."""
 FEW = 400
-"""Points of a photograph up to which those with overlapping windows are kept, too: with few points
-it matters more that gross errors are found."""
+"""Points of a photograph up to which windows may overlap: with so few it matters more that gross
+errors are found."""
 
 
 def make_tracks(
@@ -83,34 +83,33 @@ def choose_tracks(
     number: int,
 ) -> Bool[np.ndarray, " tracks"]:
     """Which tracks to keep, for about `number` points in every photograph, evenly distributed. On
-    average their windows do not overlap in two photographs, unless there are `FEW`.
+    average their windows do not overlap in two photographs with more than `FEW`.
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
     cell, shape = _cells(xy, sizes)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
-    filled = [np.zeros(nx * ny, int) for nx, ny in shape]
-    kept, count = np.zeros(len(tracks), bool), np.zeros(len(xy), int)
-    order = np.argsort([-len(track) for track in tracks], kind="stable").tolist()
-    merged = [MERGING_DISTANCE * max(size) for size in sizes]
-    for sides, most in (([max(WINDOW, side) for side in merged], np.inf), (merged, FEW)):
+    merged = np.array([MERGING_DISTANCE * max(size) for size in sizes])
+
+    def choose(sides):
         near = [_fine_cells(places, side) for places, side in zip(xy, sides)]
-        taken = [set() for _ in xy]
-        for k in np.flatnonzero(kept).tolist():
-            for i, f in tracks[k]:
-                taken[i].add(near[i][f])
-        for k in order:
+        filled = [np.zeros(nx * ny, int) for nx, ny in shape]
+        taken: list[set] = [set() for _ in xy]
+        kept = np.zeros(len(tracks), bool)
+        for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
             track = tracks[k]
-            wanted = sum(filled[i][cell[i][f]] < quota[i] and count[i] < most for i, f in track)
+            wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
             double = sum(near[i][f] in taken[i] for i, f in track)
-            if kept[k] or wanted < 2 or double >= 2:
+            if wanted < 2 or double >= 2:
                 continue
             kept[k] = True
             for i, f in track:
                 filled[i][cell[i][f]] += 1
-                count[i] += 1
                 taken[i].add(near[i][f])
-    return kept
+        return kept, np.array([count.sum() for count in filled])
+
+    _, found = choose(merged)
+    return choose(np.where(found > FEW, np.maximum(merged, WINDOW), merged))[0]
 
 
 def _cells(xy, sizes):
