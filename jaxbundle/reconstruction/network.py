@@ -17,8 +17,8 @@ PRIORS = {
     "fx": 0.2, "cx": 0.01, "cy": 0.01, "k1": 0.3, "k2": 0.1, "k3": 0.05, "p1": 1e-3, "p2": 1e-3,
 }  # fmt: skip
 """σ of the parameters of an unknown camera before the adjustment, all of them free: of fx relative
-to itself, of cx and cy to the longer side. The σ of the result contain what few photographs do not
-tell of the camera; parameters held at usual values would bias the others by many σ."""
+to itself, of cx and cy to the longer side. What few photographs do not determine is then part of
+the σ of the result; parameters held at usual values would bias the others by many σ."""
 FEWEST_PHOTOGRAPHS = 8
 """Minimum photographs of a camera for pixels that need not be square."""
 FEWEST_CONTROL = 3

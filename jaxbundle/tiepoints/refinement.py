@@ -21,10 +21,10 @@ from jaxbundle.measure.least_squares_matching import MatchingStatus, match_least
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.system.programs import compile_once
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.tracks import WINDOW, flatten
+from jaxbundle.tiepoints.tracks import flatten
 
-PIECE = 41
-"""Side of the part of another photograph in which a window is matched."""
+WINDOW, PIECE = 17, 41
+"""Sides of the window, and of the part of another photograph in which it is matched."""
 FINEST = 7.0
 """Diameter, pixels, of features matched in the original; larger ones are matched on a coarser
 level, with about this size."""

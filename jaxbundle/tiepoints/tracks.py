@@ -17,13 +17,6 @@ CELLS = 10
 """Cells along the longer side of a photograph."""
 MERGING_DISTANCE = 0.0015
 """Tracks nearer than this part of the longer side, in two photographs, are one point."""
-WINDOW = 17
-"""Side, pixels, of the windows by which tracks are measured. Tracks with the same pixels in their
-windows have correlated errors: more of them hardly make the result better, but would reduce its σ
-(by 1.3 to 2 with 1500 points in photographs of less than a megapixel)."""
-FEW = 400
-"""Points of a photograph up to which windows may overlap: with so few it matters more that gross
-errors are found."""
 
 
 def make_tracks(
@@ -82,52 +75,40 @@ def choose_tracks(
     sizes: Sequence[tuple[int, int]],
     number: int,
 ) -> Bool[np.ndarray, " tracks"]:
-    """Which tracks to keep, for about `number` points in every photograph, evenly distributed. On
-    average their windows do not overlap in two photographs with more than `FEW`.
+    """Which tracks to keep, for about `number` points in every photograph, evenly distributed.
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
-    cell, shape = _cells(xy, sizes)
+    cell, near, shape = _cells(xy, sizes)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
-    merged = np.array([MERGING_DISTANCE * max(size) for size in sizes])
-
-    def choose(sides):
-        near = [_fine_cells(places, side) for places, side in zip(xy, sides)]
-        filled = [np.zeros(nx * ny, int) for nx, ny in shape]
-        taken: list[set] = [set() for _ in xy]
-        kept = np.zeros(len(tracks), bool)
-        for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
-            track = tracks[k]
-            wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
-            double = sum(near[i][f] in taken[i] for i, f in track)
-            if wanted < 2 or double >= 2:
-                continue
-            kept[k] = True
-            for i, f in track:
-                filled[i][cell[i][f]] += 1
-                taken[i].add(near[i][f])
-        return kept, np.array([count.sum() for count in filled])
-
-    _, found = choose(merged)
-    return choose(np.where(found > FEW, np.maximum(merged, WINDOW), merged))[0]
+    filled = [np.zeros(nx * ny, int) for nx, ny in shape]
+    taken: list[set] = [set() for _ in xy]
+    kept = np.zeros(len(tracks), bool)
+    for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
+        track = tracks[k]
+        wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
+        double = sum(near[i][f] in taken[i] for i, f in track)
+        if wanted < 2 or double >= 2:
+            continue
+        kept[k] = True
+        for i, f in track:
+            filled[i][cell[i][f]] += 1
+            taken[i].add(near[i][f])
+    return kept
 
 
 def _cells(xy, sizes):
-    """For every feature its cell of the grid; shape of the grids."""
-    cell, shape = [], []
+    """For every feature its cell of the grid, and that of a fine grid; shape of the grids."""
+    cell, near, shape = [], [], []
     for places, (columns, rows) in zip(xy, sizes):
         side = max(columns, rows) / CELLS
         nx, ny = (max(1, int(np.ceil(n / side))) for n in (columns, rows))
         column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
         cell.append(row * nx + column)
         shape.append((nx, ny))
-    return cell, shape
-
-
-def _fine_cells(places, side) -> list[int]:
-    """For every feature its cell of a fine grid."""
-    fine = np.floor(places / side).astype(int)
-    return (fine[:, 1] * 100_000 + fine[:, 0]).tolist()
+        fine = np.floor(places / (MERGING_DISTANCE * max(columns, rows))).astype(int)
+        near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
+    return cell, near, shape
 
 
 def flatten(

@@ -14,7 +14,7 @@ from jaxbundle.tiepoints.matching import Matches, distances_within, match_featur
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.tracks import WINDOW, choose_tracks, make_tracks
+from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair, verify_pairs
 
 SIZE, F, K1 = (1200, 900), 1000.0, -0.1
@@ -192,15 +192,6 @@ def test_chosen_tracks_cover_the_photographs():
     kept = choose_tracks(tracks, [xy, xy], [(1000, 1000)] * 2, 300)
     assert kept[3000:3150].mean() > 0.7 and kept[:3000].sum() < 100
     assert not np.any(kept[:20] & kept[3150:])
-
-
-def test_many_chosen_tracks_have_windows_that_do_not_overlap():
-    side = 600
-    xy = np.random.default_rng(0).uniform(0, side, (8000, 2))
-    tracks = [[(0, k), (1, k)] for k in range(len(xy))]
-    choose = lambda k: choose_tracks(tracks[:k], [xy, xy], [(1000, 1000)] * 2, 10**6).sum()
-    assert 0.9 * side**2 / WINDOW**2 < choose(8000) <= np.ceil(side / WINDOW) ** 2
-    assert choose(300) > 290  # few may overlap
 
 
 def test_matches_are_those_of_both_sides():
