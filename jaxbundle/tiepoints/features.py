@@ -85,7 +85,10 @@ def find_features(
 def _detector(cv2, settings: Detection):
     ample = int(SEARCH_FACTOR * settings.number)
     if settings.kind == "sift":
-        return cv2.SIFT_create(nfeatures=ample, contrastThreshold=0.02)
+        # without precise upscaling, features are a quarter of a pixel too far right and down
+        return cv2.SIFT_create(
+            nfeatures=ample, contrastThreshold=0.02, enable_precise_upscale=True
+        )
     if settings.kind == "orb":
         return cv2.ORB_create(nfeatures=ample)
     return cv2.AKAZE_create(threshold=0.0005)

@@ -6,7 +6,10 @@ the similarity of the two features, on the level of the pyramid with equal scale
 the variance of a match is due to the noise of the window, which shifts all of its matches: the
 measurement in the first photograph has the mean of these halves, every other one its own half.
 
-Unmatched measurements keep the position of their feature, with σ `FEATURE` times its size.
+The prior σ of terms of second order (`BEND`) is that of perspective and curved surfaces. Without
+them, errors on hills were up to 2 σ at 400 × 300 pixels, systematic, and correlated over 40 pixels.
+
+Unmatched measurements are at the position of their feature, with σ `FEATURE` times its size.
 """
 
 import dataclasses
@@ -40,6 +43,9 @@ CORRELATED_OVER = 7
 """Pixels over which residuals within a window are correlated."""
 LEAST_SIGMA = 0.01
 """Minimum σ, pixels of its level: interpolation and sampling add as much."""
+BEND = 1.0
+"""σ of the terms of second order of a match, times the longer side of the photograph: perspective
+and curvature of the surface bend a window by about (side of the window)²/(principal distance)."""
 FEATURE = 0.12
 """σ of the position of a feature relative to its diameter."""
 
@@ -89,20 +95,21 @@ def measure_tracks(
     start = _starts(xy, size, angle, scale, centre, window_of)
     corner = np.rint(start[:, :, 2]) - PIECE // 2
     corner[first] = centre[first] - WINDOW // 2
-    windows, pieces, inside, colour = _cut_out(
+    windows, pieces, inside, colour, longer = _cut_out(
         len(features), image, first, level, corner, xy, read, advance
     )
     others = np.flatnonzero(~first & inside & inside[window_of])
     start[:, :, 2] -= corner
-    found = _match_in_portions(windows[track[others]], pieces, others, start)
-    return _collect(track, image, xy, size, first, level, corner, colour, others, found)
+    bend = BEND * (WINDOW // 2) ** 2 * scale / longer[image]
+    found = _match_in_portions(windows[track[others]], pieces, others, start, bend)
+    return _collect(track, image, xy, size, first, level, corner, colour, others, start, found)
 
 
 def prepare() -> None:
     """Compile the matching, ahead of its data."""
     pieces = np.random.default_rng(0).integers(0, 255, (LANES, PIECE, PIECE), np.uint8)
     start = np.tile(np.array([[1, 0, PIECE // 2], [0, 1, PIECE // 2]], np.float32), (LANES, 1, 1))
-    _match(pieces[:, :WINDOW, :WINDOW], pieces, start)
+    _match(pieces[:, :WINDOW, :WINDOW], pieces, start, np.ones(LANES, np.float32))
 
 
 def _roles(track, size):
@@ -134,18 +141,21 @@ def _starts(xy, size, angle, scale, centre, window_of):
 
 
 def _cut_out(photographs, image, first, level, corner, xy, read, advance):
-    """Windows by track, parts by measurement, which are inside, and the colours of the points."""
+    """Windows by track, parts by measurement, which are inside, the colours of the points, and the
+    longer sides of the photographs."""
     cv2 = need_opencv()
     n = len(image)
     windows = np.zeros((int(first.sum()), WINDOW, WINDOW), np.uint8)
     track_of = np.cumsum(first) - 1
     pieces = np.zeros((n, PIECE, PIECE), np.uint8)
     inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
+    longer = np.ones(photographs)
     order = np.argsort(image, kind="stable")
     for k in range(photographs):
         rows = order[slice(*np.searchsorted(image[order], [k, k + 1]))]
         if len(rows):
             picture = read(k)
+            longer[k] = max(picture.shape[:2])
             at = np.clip(np.rint(xy[rows]), 0, np.array(picture.shape[1::-1]) - 1).astype(int)
             colour[rows] = picture[at[:, 1], at[:, 0]]
             pyramid = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
@@ -159,7 +169,7 @@ def _cut_out(photographs, image, first, level, corner, xy, read, advance):
                     else:
                         pieces[chosen] = cut
         advance()
-    return windows, pieces, inside, colour
+    return windows, pieces, inside, colour, longer
 
 
 def _pieces(picture, corner, side):
@@ -175,28 +185,29 @@ def _pieces(picture, corner, side):
 
 
 @partial(compile_once, static=())
-def _match(windows: Array, pieces: Array, start: Array):
-    found = jax.vmap(partial(match_least_squares, reach=CORRELATED_OVER))(
-        windows.astype(np.float32), pieces.astype(np.float32), start
+def _match(windows: Array, pieces: Array, start: Array, bend: Array):
+    match = lambda window, piece, start, bend: match_least_squares(
+        window.astype(np.float32), piece.astype(np.float32), start, reach=CORRELATED_OVER, bend=bend
     )
+    found = jax.vmap(match)(windows, pieces, start, bend)
     return found.affine, found.covariance, found.correlation, found.status
 
 
-def _match_in_portions(windows, pieces, others, start):
+def _match_in_portions(windows, pieces, others, start, bend):
     """A, covariance, correlation and status of the matches."""
     parts = []
     for begin in range(0, len(others), LANES):
         rows = np.minimum(np.arange(begin, begin + LANES), len(others) - 1)
         some = others[rows]
-        found = _match(windows[rows], pieces[some], start[some].astype(np.float32))
-        parts.append(found)
+        begin_at, second = (a[some].astype(np.float32) for a in (start, bend))
+        parts.append(_match(windows[rows], pieces[some], begin_at, second))
     if not parts:
         return np.zeros((0, 2, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, int)
     columns = (np.concatenate([np.asarray(p) for p in column]) for column in zip(*parts))
     return tuple(column[: len(others)] for column in columns)
 
 
-def _collect(track, image, xy, size, first, level, corner, colour, others, found):
+def _collect(track, image, xy, size, first, level, corner, colour, others, start, found):
     affine, covariance, rho, status = found
     scale = 2.0**level
     place = affine[:, :, 2] + corner[others]
@@ -206,14 +217,16 @@ def _collect(track, image, xy, size, first, level, corner, colour, others, found
     good &= (own < LARGEST_SIGMA).all(1)
     own = np.hypot(own, LEAST_SIGMA)
     rows = others[good]
-    place_of = xy.copy()
     sigma = np.repeat(FEATURE * size[:, None], 2, 1)
-    place_of[rows] = place[good] * scale[rows, None]
     sigma[rows] = own[good] * scale[rows, None]
     matched = np.zeros(len(track), bool)
     matched[rows] = True
     windows = np.flatnonzero(first)
     number = np.bincount(track[rows], minlength=len(windows))
+    # the point is the centre of the window, if that is matched, else the feature
+    from_window = (start[:, :, 2] + corner) * scale[:, None]
+    place_of = np.where(number[track, None] > 0, from_window, xy)
+    place_of[rows] = place[good] * scale[rows, None]
     sums = [np.bincount(track[rows], own[good, i] ** 2, len(windows)) for i in (0, 1)]
     square = np.stack(sums, 1)
     use = number > 0
