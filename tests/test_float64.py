@@ -94,6 +94,22 @@ def test_the_policy_is_in_one_module():
     assert [f for f, text in texts.items() if any(w in text for w in words)] == ["float64.py"]
 
 
+PROGRAMS_AT_ONCE = """
+import threading
+import jaxbundle
+jaxbundle.enable_x64()
+import jax, numpy as np
+from jaxbundle.system.configuration import available_cores
+A = np.eye(8) + 0.01 * np.random.default_rng(0).normal(size=(2000, 8, 8))
+solve = jax.jit(lambda A: jax.numpy.linalg.inv(A @ A.mT))
+solve(A)
+many = lambda: [np.asarray(solve(A)) for _ in range(100)]
+threads = [threading.Thread(target=many) for _ in range(available_cores() + 1)]
+for thread in threads:
+    thread.start()
+"""
+
+
 FACTORISATIONS_AT_ONCE = """
 import jax, jaxbundle
 jaxbundle.enable_x64()
@@ -111,6 +127,13 @@ def test_batched_factorisations_at_once_come_to_an_end():
     here = {k: v for k, v in os.environ.items() if k != "NPROC"}
     program = [sys.executable, "-c", FACTORISATIONS_AT_ONCE]
     subprocess.run(program, env=here, check=True, timeout=120)
+
+
+def test_programs_in_as_many_threads_as_cores_end():
+    """They wait for their factorisations in XLA's pool, and deadlock if all of it waits."""
+    here = {k: v for k, v in os.environ.items() if k != "NPROC"}
+    program = [sys.executable, "-c", PROGRAMS_AT_ONCE]
+    subprocess.run(program, env=here, check=True, timeout=240)
 
 
 def test_small_inputs_are_compiled_quickly(tmp_path, monkeypatch):
