@@ -32,6 +32,7 @@ from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import Part, reconstruct
+from jaxbundle.system.configuration import allow_programs_at_once
 
 SETS = SETS | LIFELIKE
 LIMIT = 4.0
@@ -174,6 +175,7 @@ def main():
     parser.add_argument("--colmap", action="store_true")
     parser.add_argument("--json", type=machine.target, metavar="FILE")
     given = parser.parse_args()
+    allow_programs_at_once()
     jaxbundle.enable_x64()
     figures: dict = {"machine": machine.machine()}
     wrong = []

@@ -16,18 +16,12 @@ import os
 from contextlib import AbstractContextManager
 from importlib.metadata import version
 
-from jaxbundle.system.configuration import available_cores
-
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """Use the older of XLA's two loop emitters: half the compile time and memory, the same speed."""
 ONE_AFTER_THE_OTHER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
 """Disable concurrent operations in XLA's thread pool. jaxlib waits there for the parts of a batched
 factorisation or triangular solve: as many of them at once as there are threads, as under `vmap`,
 deadlock. Programs are equally fast, and smaller."""
-THREADS, THREADS_PER_CORE = "NPROC", 2
-"""XLA's environment variable of the size of its thread pool, and the size set. Programs that run
-side by side, up to one for each core and one more, could deadlock in the same way in a pool of one
-thread for each core."""
 LITTLE_OPTIMISATION = "--xla_backend_optimization_level=0"
 """Half the compile time; programs take three to five times as long."""
 
@@ -36,8 +30,7 @@ def enable_x64(*, compile_quickly: bool = False) -> None:
     """Switch JAX to the required 64-bit floats; call it before the first JAX computation.
 
     It also sets the CPU compiler options `QUICK_LOOPS` and `ONE_AFTER_THE_OTHER` in the environment
-    variable XLA_FLAGS (jaxlib 0.10), unless the variable already sets them, and the number of
-    threads of XLA's pool in NPROC, unless it is set.
+    variable XLA_FLAGS (jaxlib 0.10), unless the variable already sets them.
 
     `compile_quickly`: also `LITTLE_OPTIMISATION`, for a process that computes one small problem,
     such as `jaxbundle adjust` of up to some 3000 image points.
@@ -50,7 +43,6 @@ def enable_x64(*, compile_quickly: bool = False) -> None:
         ours = [QUICK_LOOPS, ONE_AFTER_THE_OTHER, *[LITTLE_OPTIMISATION] * compile_quickly]
         ours = [flag for flag in ours if flag.partition("=")[0] not in said]
         os.environ["XLA_FLAGS"] = " ".join(flags + ours)
-        os.environ.setdefault(THREADS, str(THREADS_PER_CORE * available_cores() + 2))
     jax.config.update("jax_enable_x64", True)
 
 

@@ -97,9 +97,10 @@ def test_the_policy_is_in_one_module():
 PROGRAMS_AT_ONCE = """
 import threading
 import jaxbundle
+from jaxbundle.system.configuration import allow_programs_at_once, available_cores
+allow_programs_at_once()
 jaxbundle.enable_x64()
 import jax, numpy as np
-from jaxbundle.system.configuration import available_cores
 A = np.eye(8) + 0.01 * np.random.default_rng(0).normal(size=(2000, 8, 8))
 solve = jax.jit(lambda A: jax.numpy.linalg.inv(A @ A.mT))
 solve(A)

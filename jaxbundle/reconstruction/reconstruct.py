@@ -35,7 +35,7 @@ from jaxbundle.reconstruction.photographs import (
 )
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
@@ -159,9 +159,11 @@ class _Making:
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
             # compiled during the search and matching of features, and the verification of pairs
-            prepared = [ahead.submit(one) for one in (prepare, refinement.prepare, many.prepare)]
+            programs = (prepare, refinement.prepare, many.prepare) if can_run_two_programs() else ()
+            prepared = [ahead.submit(one) for one in programs]
             features, matches = self._matches()
-            prepared[0].result()
+            for first in prepared[:1]:
+                first.result()
             self._calibrate(features, matches)
             pairs = self._verify(features, matches)
             for one in prepared:

@@ -16,6 +16,25 @@ SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
 
+THREADS = "NPROC"
+"""XLA's environment variable of the number of threads of its pool; default: one for each core."""
+
+
+def allow_programs_at_once() -> None:
+    """Let programs with batched factorisations run at once, from several threads; call it before
+    the first JAX computation.
+
+    jaxlib 0.10 waits in XLA's pool for the parts of such a factorisation: as many programs as it
+    has threads wait for ever. With more threads than cores large networks take a tenth longer.
+    """
+    os.environ.setdefault(THREADS, str(available_cores() + 2))
+
+
+def can_run_two_programs() -> bool:
+    """Whether XLA's pool has a thread left while two programs wait in it."""
+    given = os.environ.get(THREADS, "")
+    return (int(given) if given.isdecimal() else available_cores()) > 2
+
 
 def use_cores(number: int | None = None) -> None:
     """Use all cores of the processor, or this number, for large networks, as JAX devices; call it
