@@ -58,6 +58,8 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
+MISFIT = 4.0
+"""Factor of σ above which a result is called doubtful; factors are up to 2 on rendered sets."""
 FOLDED = 1 / 3
 """Minimum share of measurements that agree with a result: 0.41 of a building with identical windows
 agree with the right one, 0.15 of a long facade with a wrong one (`building` and `chain` of the
@@ -313,6 +315,7 @@ class _Making:
         self._begin("")
         _refuse_folded(weighted.adjustment, measured, self.names)
         self.notes += [note] if note else []
+        self.notes += _doubt_misfit(name, weighted)
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
@@ -375,6 +378,16 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
         f"not solved: impossible principal distance {found}; take photographs from "
         "positions farther apart, or give --camera"
     )
+
+
+def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
+    """A note on measurements that contradict each other by far more than their σ."""
+    worst = max(weighted.factors.values(), default=1.0)
+    if worst < MISFIT:
+        return []
+    return [f"{name}: measurements fit {worst:.1f} times worse than their σ from matching: the "
+            "object repeats itself or moves, or the camera model does not fit the lens; compare "
+            "the result with the object"]  # fmt: skip
 
 
 def _refuse_folded(result: Adjustment, measured: Measurements, names: Sequence[str]) -> None:
