@@ -243,7 +243,7 @@ def _bend(p, J, v, variance, bend, x, y, reach):
     second = [J[:, k] * term for k in (2, 5) for term in (x * x, x * y, y * y)]
     # in units of their σ: of size 0 if there are none
     J = jnp.column_stack([J, *(bend * column for column in second)])
-    weight = jnp.diag(jnp.repeat(jnp.stack([0 * variance, variance]), np.array([8, 6])))
+    weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
     Q, _ = _inverse(J.T @ J + weight)
     step = Q @ (J.T @ v)
     C = Q @ (_gather(J * (v - J @ step)[:, None], reach) + weight**2) @ Q

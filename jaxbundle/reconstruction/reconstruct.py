@@ -59,7 +59,8 @@ NAMED = 99
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
 MISFIT = 4.0
-"""Factor of σ above which a result is called doubtful; factors are up to 2 on rendered sets."""
+"""Factor of σ above which a result is called doubtful; right results of rendered sets have up to
+2."""
 FOLDED = 1 / 3
 """Minimum share of measurements that agree with a result: 0.41 of a building with identical windows
 agree with the right one, 0.15 of a long facade with a wrong one (`building` and `chain` of the

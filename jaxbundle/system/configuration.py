@@ -24,8 +24,9 @@ def allow_programs_at_once() -> None:
     """Let programs with batched factorisations run at once, from several threads; call it before
     the first JAX computation.
 
-    jaxlib 0.10 waits in XLA's pool for the parts of such a factorisation: as many programs as it
-    has threads wait for ever. With more threads than cores large networks take a tenth longer.
+    jaxlib 0.10 waits in XLA's pool for the parts of such a factorisation: as many programs as the
+    pool has threads deadlock. More threads than cores make large networks up to a sixth slower
+    (`NPROC=4 python benchmarks/bal_ours.py FILE --devices 2`).
     """
     os.environ.setdefault(THREADS, str(available_cores() + 2))
 
