@@ -9,7 +9,6 @@ import os
 import sys
 import warnings
 
-from jaxbundle.system.configuration import allow_programs_at_once
 from jaxbundle.system.interrupts import handle_interrupts, set_status
 
 GC_THRESHOLDS = 50_000, 20, 100
@@ -23,6 +22,8 @@ def main() -> None:
     gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "reconstruct" in sys.argv[1:2]:
+        from jaxbundle.system.configuration import allow_programs_at_once
+
         allow_programs_at_once()
     from jaxbundle.cli import main
 
