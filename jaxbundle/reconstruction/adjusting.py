@@ -22,6 +22,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
+from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 
 GROSS, DOUBTFUL = 4.0, 5.0
@@ -34,6 +35,12 @@ SMALLEST, LARGEST = 0.3, 8.0
 MANY = 0.25
 """Share of gross errors above which points of two rays are not used: most of their gross errors
 cannot be detected."""
+MISFIT = 2.0
+"""Factor of σ above which a result is compared with that of points of three rays."""
+AGREEING = 0.001
+"""Maximum misclosure of an agreeing ray, relative to the image extent."""
+SIMILAR = 1.25
+"""Ratio of the largest factors of σ of two similarly good results."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 2000
@@ -43,10 +50,18 @@ an unknown camera only weakly, and the search then needs several hundred."""
 
 @dataclasses.dataclass(frozen=True)
 class Weighted:
-    """The adjustment, and the factor of σ of each kind of measurement."""
+    """The adjustment, and the factor of σ of each kind of measurement; the number of measurements
+    that agree with it, and of `unused` points of two rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
+    agreeing: int
+    unused: int = 0
+
+    @property
+    def worst(self) -> float:
+        """The largest factor."""
+        return max(self.factors.values(), default=1.0)
 
 
 def adjust_weighted(
@@ -57,8 +72,8 @@ def adjust_weighted(
     tell: Callable[[str], None],
 ) -> Weighted:
     """Adjust with variance components of the kinds and data snooping. Without a solution, or with
-    very many gross errors, adjust again without points of two rays, whose gross errors can hardly
-    be detected.
+    a doubtful one, adjust again without points of two rays, whose gross errors can hardly be
+    detected: where an object repeats itself, some agree with its photographs by chance.
 
     **Arguments:** `kinds`: of every observation of the network.
 
@@ -68,25 +83,30 @@ def adjust_weighted(
     found, failed = None, None
     try:
         found = _without_lost(network, kinds, names, significance, tell)
-        if found.adjustment.converged and (
-            len(network.images) < 3 or not _removed_many(found.adjustment)
-        ):
+        if found.adjustment.converged and (len(network.images) < 3 or not _is_doubtful(found)):
             return found
     except NotSolvedError as error:
         failed = error
+    solved = found is not None and found.adjustment.converged
     rays = network.observations
     number = np.bincount(rays.point, minlength=len(network.points))
     clear, kinds = _keep(network, kinds, (number > 2) | ~network.points.has_role("tie"))
     try:
         clearer = _without_lost(clear, kinds, names, significance, tell)
-        if clearer.adjustment.converged or found is None or not found.adjustment.converged:
-            return clearer
     except (InputError, NotSolvedError):
         # a photograph has hardly any of these points, or they do not determine it
         if failed is not None:
             raise failed from None
+    else:
+        if not clearer.adjustment.converged and not solved:
+            return found or clearer
+        if clearer.adjustment.converged and _is_better(clearer, found if solved else None):
+            return dataclasses.replace(
+                clearer, agreeing=_count_agreeing(network, clearer.adjustment),
+                unused=len(network.points) - len(clear.points),
+            )  # fmt: skip
     assert found is not None, "an attempt ends with a result or an error"
-    if found.adjustment.converged:
+    if solved and _removed_many(found.adjustment):
         raise NotSolvedError(
             f"not solved: {len(found.adjustment.removed)} of {len(rays)} measurements are gross "
             "errors, and the points of three rays alone do not confirm the others: the object "
@@ -96,10 +116,32 @@ def adjust_weighted(
     return found
 
 
+def _is_doubtful(found: Weighted) -> bool:
+    return _removed_many(found.adjustment) or found.worst > MISFIT
+
+
 def _removed_many(result: Adjustment) -> bool:
     """Whether so many measurements were gross errors that those of points of two rays are not
     reliable."""
     return len(result.removed) > MANY * len(result.network.observations)
+
+
+def _is_better(clearer: Weighted, found: Weighted | None) -> bool:
+    """Whether the result of points of three rays replaces that of all points."""
+    return found is None or _removed_many(found.adjustment) or SIMILAR * clearer.worst < found.worst
+
+
+def _count_agreeing(network: Network, result: Adjustment) -> int:
+    """The number of measurements of all points that agree with the result of some of them."""
+    cameras = tuple(
+        dataclasses.replace(c, parameters=result.camera_parameters(c.id)) for c in network.cameras
+    )
+    values, points = result.image_values, network.points
+    tie = points.has_role("tie")[:, None]
+    images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
+    points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
+    placed = network.replace(cameras=cameras, images=images, points=points)
+    return len(find_start_values(placed, tolerance=AGREEING).network.observations)
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
@@ -150,19 +192,22 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
         doubtful = _name(result, ~used.any(1))
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
-    return Weighted(result, kept)
+    return Weighted(result, kept, len(result.network.observations) - len(result.removed))
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
     """For every image point of a result its row in the network, without excluded ones."""
-    rays = network.observations
-    index = {one: k for k, one in enumerate(_ids(network, rays.image, rays.point))}
+    index = {one: k for k, one in enumerate(_all_ids(network))}
     return np.array([index[one] for one in _name(result, slice(None))], int)
 
 
 def _ids(network: Network, image, point):
     images, points = network.images.id, network.points.id
     return [(images[i], points[p]) for i, p in zip(image.tolist(), point.tolist())]
+
+
+def _all_ids(network: Network):
+    return _ids(network, network.observations.image, network.observations.point)
 
 
 def _name(result: Adjustment, rows) -> list[tuple[str, str]]:

@@ -314,9 +314,9 @@ class _Making:
         self._begin("start values")
         oriented, weighted, note = self._adjust_first(network, measured)
         self._begin("")
-        _refuse_folded(weighted.adjustment, measured, self.names)
+        _refuse_folded(weighted, measured, self.names)
         self.notes += [note] if note else []
-        self.notes += _doubt_misfit(name, weighted)
+        self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
@@ -381,6 +381,13 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
     )
 
 
+def _name_unused(name: str, weighted: Weighted) -> list[str]:
+    if not weighted.unused:
+        return []
+    return [f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
+            "measurements contradict each other, as on an object that repeats itself"]  # fmt: skip
+
+
 def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
     """A note on measurements that contradict each other by far more than their σ."""
     worst = max(weighted.factors.values(), default=1.0)
@@ -391,13 +398,13 @@ def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
             "the result with the object"]  # fmt: skip
 
 
-def _refuse_folded(result: Adjustment, measured: Measurements, names: Sequence[str]) -> None:
+def _refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[str]) -> None:
     """Refuse a result that disagrees with most measurements in its photographs."""
-    placed = set(result.network.images.id)
+    placed = set(weighted.adjustment.network.images.id)
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
     found = int(rays[rays > 1].sum())
-    agree = len(result.network.observations) - len(result.removed)
+    agree = weighted.agreeing
     if agree < FOLDED * found:
         raise NotSolvedError(
             f"not solved: of {found} measurements in {count(len(placed), 'photograph')} {agree} "

@@ -1,5 +1,6 @@
 """The adjustment of a reconstruction: what is tried again, and what is said at the end."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.reconstruction import adjusting
+
+COLUMNS = 18
 
 
 @pytest.mark.parametrize("first", ["fails", "does not converge"])
@@ -16,7 +20,7 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
     targets = grid_of_targets(4, 4, 0.5)
     network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
     attempts = []
-    unfinished = adjusting.Weighted(SimpleNamespace(converged=False), {})
+    unfinished = adjusting.Weighted(SimpleNamespace(converged=False), {}, 0)
 
     def without_lost(given, *_):
         attempts.append(len(given.observations))
@@ -45,15 +49,55 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
     targets = grid_of_targets(4, 4, 0.5)
     network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
     result = lambda converged: adjusting.Weighted(
-        SimpleNamespace(converged=converged, removed=range(removed), network=network), {}
+        SimpleNamespace(converged=converged, removed=range(removed), network=network), {}, 64
     )
     results = [result(True), result(confirmed)]
     attempts = iter(results)
     monkeypatch.setattr(adjusting, "_without_lost", lambda *_: next(attempts))
+    monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)
     kinds = np.zeros(len(network.observations), int)
     call = lambda: adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
     if confirmed:
-        assert call() is results[removed > 16]
+        assert call().adjustment is results[removed > 16].adjustment
     else:
         with pytest.raises(NotSolvedError, match="40 of 64 measurements are gross errors"):
             call()
+
+
+def photographs_of_columns(share):
+    """Six photographs of a grid, most points in two of them; of these, a share is measured at
+    the neighbouring column in the second one."""
+    rng = np.random.default_rng(4)
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c", "K1", "x0", "y0"))
+    targets = grid_of_targets(COLUMNS, 12, 0.5, relief=0.1)
+    angle = np.radians(np.linspace(-30, 30, 6))
+    X0 = np.c_[12 * np.sin(angle), 0.3 * rng.normal(size=6), 12 * np.cos(angle)]
+    stations = stations_looking_at(X0, np.zeros((6, 3)))
+    network = simulate(stations, targets, camera, noise=0.0005, seed=2)
+    rays, number = network.observations, len(targets)
+    two, first = rng.random(number) < 0.9, rng.integers(0, 5, number)
+    point = np.arange(number)
+    wrong = two & (rng.random(number) < share) & (point % COLUMNS < COLUMNS - 1)
+    xy = np.full((6, number, 2), np.nan)
+    xy[rays.image, rays.point] = rays.xy
+    xy[first[wrong] + 1, point[wrong]] = xy[first[wrong] + 1, point[wrong] + 1]
+    after = rays.image - first[rays.point]
+    kept = ~two[rays.point] | (after == 0) | (after == 1)
+    rays = dataclasses.replace(rays, xy=xy[rays.image, rays.point]).take(kept)
+    return network.replace(observations=rays), two, wrong
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_points_of_two_rays_at_different_columns_do_not_distort_the_others(share):
+    network, two, wrong = photographs_of_columns(share)
+    number = len(network.observations)
+    done = adjusting.adjust_weighted(
+        network, np.zeros(number, int), {0: "all"}, 0.001, lambda _: None
+    )
+    found = done.adjustment.cameras["cam"]["parameters"]
+    for name, true in {"c": 24.0, "K1": 0.0, "x0": 0.0, "y0": 0.0}.items():
+        assert abs(found[name]["value"] - true) < 3 * found[name]["sigma"]
+    assert done.factors["all"] == pytest.approx(1, abs=0.1)
+    assert done.unused == (two.sum() if wrong.any() else 0)
+    # those at the neighbouring column agree only by chance
+    assert number - 2 * wrong.sum() <= done.agreeing <= number - wrong.sum()
