@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
@@ -35,12 +35,11 @@ SMALLEST, LARGEST = 0.3, 8.0
 MANY = 0.25
 """Share of gross errors above which points of two rays are not used: most of their gross errors
 cannot be detected."""
-MISFIT = 2.0
-"""Factor of σ above which a result is compared with that of points of three rays."""
+SOME, MISFIT = 0.05, 2.0
+"""Share of gross errors, and factor of σ of the others, above which both together make a result as
+doubtful: undetected ones may distort it."""
 AGREEING = 0.001
 """Maximum misclosure of an agreeing ray, relative to the image extent."""
-SIMILAR = 1.25
-"""Ratio of the largest factors of σ of two similarly good results."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 2000
@@ -117,18 +116,20 @@ def adjust_weighted(
 
 
 def _is_doubtful(found: Weighted) -> bool:
-    return _removed_many(found.adjustment) or found.worst > MISFIT
+    return _removed_many(found.adjustment) or (
+        _removed_many(found.adjustment, SOME) and found.worst > MISFIT
+    )
 
 
-def _removed_many(result: Adjustment) -> bool:
+def _removed_many(result: Adjustment, share: float = MANY) -> bool:
     """Whether so many measurements were gross errors that those of points of two rays are not
     reliable."""
-    return len(result.removed) > MANY * len(result.network.observations)
+    return len(result.removed) > share * len(result.network.observations)
 
 
 def _is_better(clearer: Weighted, found: Weighted | None) -> bool:
     """Whether the result of points of three rays replaces that of all points."""
-    return found is None or _removed_many(found.adjustment) or SIMILAR * clearer.worst < found.worst
+    return found is None or _removed_many(found.adjustment) or clearer.worst < found.worst
 
 
 def _count_agreeing(network: Network, result: Adjustment) -> int:
@@ -145,19 +146,28 @@ def _count_agreeing(network: Network, result: Adjustment) -> int:
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
-    """As `_weight`, without tie points undetermined by the rays left after data snooping."""
-    tie = network.points.has_role("tie")
+    """As `_weight`, without tie points that gross errors, or the rays left after data snooping,
+    leave undetermined."""
     for _ in range(LOSSES):
         try:
-            return _weight(network, kinds, names, significance, tell)
+            found = _weight(network, kinds, names, significance, tell)
         except NotSolvedError as error:
-            lost = {name.rpartition(" ")[2] for name in error.undetermined}
-            kept = ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
+            kept = _are_determined(network, error.undetermined)
             if kept.all():
                 raise
-            network, kinds = _keep(network, kinds, kept)
-            tie = network.points.has_role("tie")
+        else:
+            kept = _are_determined(network, found.adjustment.undetermined)
+            if kept.all():
+                return found
+        network, kinds = _keep(network, kinds, kept)
     return _weight(network, kinds, names, significance, tell)
+
+
+def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:
+    """Which points are not tie points among the undetermined, by the names of their coordinates."""
+    lost = {name.rpartition(" ")[2] for name in undetermined}
+    tie = network.points.has_role("tie")
+    return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
 
 
 def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " rays"]]:

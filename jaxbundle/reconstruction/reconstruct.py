@@ -24,6 +24,7 @@ from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
+from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
@@ -61,10 +62,6 @@ REPEATS = 0.3
 MISFIT = 4.0
 """Factor of σ above which a result is called doubtful; right results of rendered sets have up to
 2."""
-FOLDED = 1 / 3
-"""Minimum share of measurements that agree with a result: 0.41 of a building with identical windows
-agree with the right one, 0.15 of a long facade with a wrong one (`building` and `chain` of the
-benchmarks)."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -158,6 +155,7 @@ class _Making:
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
+        self.tried: set[tuple[int, int]] = set()
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -184,6 +182,7 @@ class _Making:
         matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
                         self.tell)  # fmt: skip
         self.store.drop_unused()
+        self.tried = {m.images for m in matches}
         matches, marked = without_marks(matches, features, [p.size for p in self.photographs])
         if marked:
             self.notes.append(
@@ -314,9 +313,11 @@ class _Making:
         self._begin("start values")
         oriented, weighted, note = self._adjust_first(network, measured)
         self._begin("")
-        _refuse_folded(weighted, measured, self.names)
+        refuse_folded(weighted, measured, self.names)
+        doubts = refuse_superimposed(weighted.adjustment, self.tried, self.names)
         self.notes += [note] if note else []
         self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
+        self.notes += [f"{name}: {said}" for said in doubts]
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
@@ -396,22 +397,6 @@ def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
     return [f"{name}: measurements fit {worst:.1f} times worse than their σ from matching: the "
             "object repeats itself or moves, or the camera model does not fit the lens; compare "
             "the result with the object"]  # fmt: skip
-
-
-def _refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[str]) -> None:
-    """Refuse a result that disagrees with most measurements in its photographs."""
-    placed = set(weighted.adjustment.network.images.id)
-    rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
-    rays = np.bincount(measured.track[rows])
-    found = int(rays[rays > 1].sum())
-    agree = weighted.agreeing
-    if agree < FOLDED * found:
-        raise NotSolvedError(
-            f"not solved: of {found} measurements in {count(len(placed), 'photograph')} {agree} "
-            "agree with one object: it repeats itself, and parts of it would be superimposed; "
-            "take photographs with shorter bases, or leave out those that show "
-            "repeated parts alone", names,
-        )  # fmt: skip
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

@@ -64,6 +64,27 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
             call()
 
 
+@pytest.mark.parametrize("how", ["raises", "ends without a minimum"])
+def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, how):
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    targets = grid_of_targets(4, 4, 0.5)
+    network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
+    lost = network.points.id[5]
+    names = (f"X, Y, Z of point {lost}",)
+
+    def weight(given, *_):
+        undetermined = names if lost in given.points.id else ()
+        if undetermined and how == "raises":
+            raise NotSolvedError("not solved", undetermined)
+        result = SimpleNamespace(converged=not undetermined, undetermined=undetermined)
+        return adjusting.Weighted(result, {}, len(given.points))
+
+    monkeypatch.setattr(adjusting, "_weight", weight)
+    kinds = np.zeros(len(network.observations), int)
+    found = adjusting._without_lost(network, kinds, {0: "all"}, 0.001, print)
+    assert found.adjustment.converged and found.agreeing == len(network.points) - 1
+
+
 def photographs_of_columns(share):
     """Six photographs of a grid, most points in two of them; of these, a share is measured at
     the neighbouring column in the second one."""

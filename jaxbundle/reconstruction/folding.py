@@ -1,0 +1,131 @@
+"""Results in which different parts of an object that repeats itself are superimposed.
+
+1. Most measurements agree with a right result.
+2. Two photographs from nearly one direction share most points in the field of both. Superimposed
+   parts share at most those that repeat themselves (Zach, Irschara and Bischof 2008, What can
+   missing correspondences tell us about 3D structure and motion?).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.columns import count
+from jaxbundle.orientation import many
+from jaxbundle.reconstruction.adjusting import Weighted
+from jaxbundle.tiepoints.refinement import Measurements
+from jaxbundle.tiepoints.search import ideal_features, present_size
+
+AGREEING = 1 / 3
+"""Minimum share of measurements that agree with a result: about 0.7 of a building with identical
+windows agree with the right one."""
+ONE_DIRECTION, ONE_SCALE = np.radians(15.0), 1.5
+"""Maximum angle between the rays to a point, and ratio of their lengths, with which it is expected
+in both photographs."""
+FEWEST = 50
+"""Minimum expected points of a pair."""
+SHARED = 0.1
+"""Share of the expected points below which a pair is contradictory; in right results of rendered
+facades it is at least 0.19."""
+PAIRS, OF_ALL = 3, 0.25
+"""Contradictory pairs, and their share of all, above which a result is refused: 15 of 21 in a
+facade that is folded (`chain` of the benchmarks)."""
+MOST_NAMED = 5
+
+
+def refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[str]) -> None:
+    """Refuse a result that disagrees with most measurements in its photographs."""
+    placed = set(weighted.adjustment.network.images.id)
+    rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
+    rays = np.bincount(measured.track[rows])
+    found = int(rays[rays > 1].sum())
+    if weighted.agreeing < AGREEING * found:
+        raise _folded(
+            f"of {found} measurements in {count(len(placed), 'photograph')} {weighted.agreeing} "
+            "agree with one object", names,
+        )  # fmt: skip
+
+
+def refuse_superimposed(
+    result: Adjustment, tried: set[tuple[int, int]], names: Sequence[str]
+) -> list[str]:
+    """Pairs of photographs that contradict a result, as notes.
+
+    **Arguments:** `tried`: matched pairs, by the positions of their photographs in `names`.
+
+    **Raises:** `NotSolvedError` if there are many of them.
+    """
+    expected, shared = count_shared_points(result)
+    row = {name: k for k, name in enumerate(names)}
+    place = [row[id] for id in result.network.images.id]
+    compared, bad = 0, []
+    for i, j in np.argwhere(np.triu(expected, 1) >= FEWEST).tolist():
+        if (min(place[i], place[j]), max(place[i], place[j])) in tried:
+            compared += 1
+            if shared[i, j] < SHARED * expected[i, j]:
+                bad.append((i, j))
+    bad.sort(key=lambda pair: -expected[pair])
+    said = [f"{shared[i, j]} of {expected[i, j]} points expected in both {names[place[i]]} and "
+            f"{names[place[j]]} were found" for i, j in bad]  # fmt: skip
+    if len(bad) >= max(PAIRS, OF_ALL * compared):
+        raise _folded(f"{said[0]}, and too few in {len(bad)} of {compared} such pairs", names)
+    return [f"{one}: parts of the object may be superimposed" for one in said[:MOST_NAMED]]
+
+
+def count_shared_points(
+    result: Adjustment,
+) -> tuple[Int[np.ndarray, "images images"], Int[np.ndarray, "images images"]]:
+    """For every two photographs the points of each that should also be in the other one, and
+    those of them that are."""
+    network, values = result.network, result.image_values
+    X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
+    X = np.asarray(result.point_values)
+    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    n = len(X0)
+    seen = np.zeros((n, len(X)), bool)
+    seen[result.problem.image[used], result.problem.point[used]] = True
+    fields = [_field(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
+              for c in network.cameras]  # fmt: skip
+    expected, shared = np.zeros((2, n, n), int)
+    for i in range(n):
+        points = np.flatnonzero(seen[i] & np.isfinite(X).all(1))
+        to_i = X[points] - X0[i]
+        far = np.linalg.norm(to_i, axis=1)
+        near = np.linalg.norm(X0 - X0[i], axis=1) < far.max(initial=0.0)
+        for j in np.flatnonzero(near & (np.arange(n) != i)):
+            d = X[points] - X0[j]
+            length = np.linalg.norm(d, axis=1)
+            cosine = (d * to_i).sum(1) / (length * far)
+            one = (cosine > np.cos(ONE_DIRECTION)) & (length < ONE_SCALE * far)
+            one &= (far < ONE_SCALE * length) & _is_in_field(
+                d @ M[j].T, fields[network.images.camera[j]]
+            )
+            expected[i, j] = one.sum()
+            shared[i, j] = seen[j, points[one]].sum()
+    return expected + expected.T, shared + shared.T
+
+
+def _field(camera) -> Float[np.ndarray, "2 2"]:
+    """Limits of x and y, c = 1, of the middle of each side."""
+    columns, rows = present_size(camera)
+    u, v = (columns - 1) / 2, (rows - 1) / 2
+    ideal = ideal_features(camera, np.array([[0, v], [2 * u, v], [u, 0], [u, 2 * v]]))
+    return np.stack([ideal.min(0), ideal.max(0)])
+
+
+def _is_in_field(d: Float[np.ndarray, "n 3"], field) -> Bool[np.ndarray, " n"]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = -d[:, :2] / d[:, 2:]
+        return (d[:, 2] < 0) & ((xy > field[0]) & (xy < field[1])).all(1)
+
+
+def _folded(what: str, names: Sequence[str]) -> NotSolvedError:
+    return NotSolvedError(
+        f"not solved: {what}: the object repeats itself, and parts of it would be superimposed; "
+        "take photographs with shorter bases, or leave out those that show repeated parts alone",
+        list(names),
+    )

@@ -1,0 +1,76 @@
+"""Photographs that should show common points and do not."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from jaxbundle import Camera, adjust, grid_of_targets, simulate
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.planning.stations import stations_looking_at
+from jaxbundle.reconstruction.folding import count_shared_points, refuse_superimposed
+
+EACH = 3
+"""Photographs of each half."""
+ALL = set(combinations(range(2 * EACH), 2))
+
+
+def adjusted(common):
+    """Photographs from nearly one direction; the first three measure one half of the points, the
+    others the other half, and all of them the share `common`."""
+    rng = np.random.default_rng(1)
+    camera = Camera("cam", "brown", {"c": 24.0}, image_size=(3600, 2400), pixel_size=(0.01, 0.01))
+    targets = grid_of_targets(16, 12, 0.3, relief=0.4)
+    X0 = np.c_[0.5 * np.arange(2 * EACH), rng.normal(size=(2 * EACH)), np.full(2 * EACH, 10.0)]
+    at = np.c_[X0[:, :1], np.zeros((2 * EACH, 2))] / 2
+    network = simulate(stations_looking_at(X0, at), targets, camera, noise=0.001, seed=3)
+    rays = network.observations
+    half = rng.integers(0, 2, len(targets))
+    both = rng.random(len(targets)) < common
+    kept = both[rays.point] | (half[rays.point] == rays.image // EACH)
+    return adjust(network.replace(observations=rays.take(kept)))
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return adjusted(1.0)
+
+
+@pytest.fixture(scope="module")
+def folded():
+    return adjusted(0.03)
+
+
+def test_photographs_from_one_direction_share_the_points_in_their_fields(whole):
+    expected, shared = count_shared_points(whole)
+    assert (expected == shared).all() and not expected.diagonal().any()
+    # each counts the points of the other, and their fields contain all of them
+    assert expected[0, 1] == 2 * len(whole.network.points)
+    assert refuse_superimposed(whole, ALL, whole.network.images.id) == []
+
+
+def test_superimposed_parts_are_refused(folded):
+    names = list(folded.network.images.id)
+    with pytest.raises(NotSolvedError, match="too few in 9 of 15 such pairs"):
+        refuse_superimposed(folded, ALL, names)
+
+
+def test_a_few_pairs_are_told_and_those_that_were_not_matched_are_no_evidence(folded):
+    names = list(folded.network.images.id)
+    within = {(i, j) for i, j in ALL if i // EACH == j // EACH}
+    assert refuse_superimposed(folded, within, names) == []
+    (said,) = refuse_superimposed(folded, within | {(0, 5)}, names)
+    assert f"expected in both {names[0]} and {names[5]}" in said
+
+
+def test_photographs_from_other_directions_and_distances_are_not_compared(whole):
+    angle = np.radians(40.0)
+    X0 = np.array(whole.network.images.position)
+    X0[0] = [10 * np.sin(angle), 0, 10 * np.cos(angle)]
+    X0[1] = [0, 0, 25.0]
+    camera = whole.network.cameras[0]
+    X = np.asarray(whole.network.points.position)
+    stations = stations_looking_at(X0, np.zeros((len(X0), 3)))
+    network = simulate(stations, X, camera, noise=0.001, seed=4)
+    expected, _ = count_shared_points(adjust(network))
+    assert not expected[:2].any() and (expected[2:, 2:] > 0).sum() == 12
