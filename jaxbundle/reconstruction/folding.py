@@ -73,7 +73,8 @@ def refuse_superimposed(
             f"{names[place[j]]} were found" for i, j in bad]  # fmt: skip
     if len(bad) >= max(PAIRS, OF_ALL * compared):
         raise _folded(f"{said[0]}, and too few in {len(bad)} of {compared} such pairs", names)
-    return [f"{one}: parts of the object may be superimposed" for one in said[:MOST_NAMED]]
+    return [f"{one}: something hides them, or parts of the object are superimposed"
+            for one in said[:MOST_NAMED]]  # fmt: skip
 
 
 def count_shared_points(
