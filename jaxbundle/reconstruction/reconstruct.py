@@ -47,6 +47,7 @@ from jaxbundle.tiepoints.search import (
     prepare,
     start_cameras,
     verify,
+    with_lens,
     without_contradicted,
 )
 from jaxbundle.tiepoints.still import without_marks
@@ -62,6 +63,9 @@ REPEATS = 0.3
 MISFIT = 4.0
 """Factor of σ above which a result is called doubtful; right results of rendered sets have up to
 2."""
+WRONG, POORLY = 1.05, 0.01
+"""Change of a principal distance by adjustment above which pairs are verified again, and its
+maximum relative σ: with a wrong one, right pairs contradict each other, and wrong ones may not."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -156,6 +160,7 @@ class _Making:
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.tried: set[tuple[int, int]] = set()
+        self.repeated = False
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -166,10 +171,17 @@ class _Making:
             for first in prepared[:1]:
                 first.result()
             self._calibrate(features, matches)
+            before = dict(self.left_out), list(self.notes)
             pairs = self._verify(features, matches)
             for one in prepared:
                 one.result()
         parts = self._parts(features, matches, pairs)
+        better, said = _better_cameras(self.cameras, parts)
+        if said:
+            self.cameras, self.repeated = better, True
+            self.left_out, self.notes = before[0], before[1] + said
+            pairs = self._verify(features, matches)
+            parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         files = {p.name: p.path for p in self.photographs}
@@ -313,13 +325,20 @@ class _Making:
         self._begin("start values")
         oriented, weighted, note = self._adjust_first(network, measured)
         self._begin("")
-        refuse_folded(weighted, measured, self.names)
-        doubts = refuse_superimposed(weighted.adjustment, self.tried, self.names)
+        doubts = self._refuse_folded(weighted, network, measured)
         self.notes += [note] if note else []
         self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
         self.notes += [f"{name}: {said}" for said in doubts]
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
+
+    def _refuse_folded(self, weighted: Weighted, network: Network, measured) -> list[str]:
+        """Notes on contradictions; none if the camera was wrong, and all will be done again."""
+        result = weighted.adjustment
+        if not self.repeated and any(_change(c, result) > WRONG for c in result.network.cameras):
+            return []
+        refuse_folded(weighted, measured, self.names)
+        return refuse_superimposed(result, network, self.tried, self.names)
 
     def _adjust_first(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
@@ -354,6 +373,37 @@ class _Making:
         kinds, named = _kinds(placed, measured, self.names)
         significance = self.settings.significance
         return adjust_weighted(placed, kinds, named, significance, self._begin), note
+
+
+def _better_cameras(cameras: Cameras, parts: Sequence[Part]) -> tuple[Cameras, list[str]]:
+    """The cameras with the adjusted values of wrong lenses, and what was wrong."""
+    better, said = cameras, []
+    if cameras.given:
+        return better, said
+    for part in reversed(parts):  # the largest decides
+        result = part.adjustment
+        for k, lens in enumerate(better.lens):
+            given = better.cameras[k]
+            if given.id not in result.cameras or _change(given, result) <= WRONG:
+                continue
+            found = dataclasses.replace(given, parameters=result.camera_parameters(given.id))
+            own = [c for c, other in enumerate(better.lens) if other == lens]
+            corrected = tuple(with_lens(better.cameras, own, found))
+            better = dataclasses.replace(better, cameras=corrected)
+            f, before = found.parameters["fx"], given.parameters["fx"]
+            said.append(f"camera {given.id}: principal distance {f:.0f} px instead of "
+                        f"{before:.0f} px: pairs verified again")  # fmt: skip
+    return better, said
+
+
+def _change(camera: Camera, result: Adjustment) -> float:
+    """Ratio of the principal distance of a camera before and after its adjustment, at least 1; 1 if
+    it is poorly determined."""
+    found = _principal_distances(result)[camera.id]
+    if not found["sigma"] or found["sigma"] > POORLY * found["value"]:
+        return 1.0
+    ratio = found["value"] / camera.parameters["fx"]
+    return max(ratio, 1 / ratio)
 
 
 def _principal_distances(result: Adjustment) -> dict[str, dict]:

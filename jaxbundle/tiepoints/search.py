@@ -134,14 +134,14 @@ def start_cameras(
         if start.pairs:
             clear = sorted(found, key=lambda m: -len(m.rows))[:COMPARED_PAIRS]
             explained = lambda camera, clear=clear, own=own: _count_explained(
-                _with_lens(cameras, own, camera), of, features, clear
+                with_lens(cameras, own, camera), of, features, clear
             )
             now, every = explained(start.camera), sum(len(m.rows) for m in clear)
             least = (MORE_THAN_TOLD if told else REQUIRED_RATIO) * now
             if now < SUFFICIENT_SHARE * every and least < every:
                 start = _choose_principal_distance(start, begin, xy, explained, least)
         p = start.camera.parameters
-        better = _with_lens(better, own, start.camera)
+        better = with_lens(better, own, start.camera)
         if start.pairs:
             notes.append(f"camera {name}: start values from {count(start.pairs, 'pair')}: principal"
                          f" distance {p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
@@ -163,8 +163,8 @@ def _centre(cameras, of, features, matches):
     return [tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T)) for m in matches]
 
 
-def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
-    """The cameras; those in `own` with the principal distance and K1 of `camera`."""
+def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> list[Camera]:
+    """The cameras; those at positions `own` with the principal distance and K1 of `camera`."""
     same = {name: camera.parameters[name] for name in OF_THE_LENS if name in camera.parameters}
     with_it = lambda c: dataclasses.replace(c, parameters={**c.parameters, **same})
     return [with_it(c) if k in own else c for k, c in enumerate(cameras)]

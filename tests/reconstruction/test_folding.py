@@ -42,24 +42,24 @@ def folded():
 
 
 def test_photographs_from_one_direction_share_the_points_in_their_fields(whole):
-    expected, shared = count_shared_points(whole)
+    expected, shared = count_shared_points(whole, whole.network)
     assert (expected == shared).all() and not expected.diagonal().any()
     # each counts the points of the other, and their fields contain all of them
     assert expected[0, 1] == 2 * len(whole.network.points)
-    assert refuse_superimposed(whole, ALL, whole.network.images.id) == []
+    assert refuse_superimposed(whole, whole.network, ALL, whole.network.images.id) == []
 
 
 def test_superimposed_parts_are_refused(folded):
     names = list(folded.network.images.id)
     with pytest.raises(NotSolvedError, match="too few in 9 of 15 such pairs"):
-        refuse_superimposed(folded, ALL, names)
+        refuse_superimposed(folded, folded.network, ALL, names)
 
 
 def test_a_few_pairs_are_told_and_those_that_were_not_matched_are_no_evidence(folded):
     names = list(folded.network.images.id)
     within = {(i, j) for i, j in ALL if i // EACH == j // EACH}
-    assert refuse_superimposed(folded, within, names) == []
-    (said,) = refuse_superimposed(folded, within | {(0, 5)}, names)
+    assert refuse_superimposed(folded, folded.network, within, names) == []
+    (said,) = refuse_superimposed(folded, folded.network, within | {(0, 5)}, names)
     assert f"expected in both {names[0]} and {names[5]}" in said
 
 
@@ -72,5 +72,5 @@ def test_photographs_from_other_directions_and_distances_are_not_compared(whole)
     X = np.asarray(whole.network.points.position)
     stations = stations_looking_at(X0, np.zeros((len(X0), 3)))
     network = simulate(stations, X, camera, noise=0.001, seed=4)
-    expected, _ = count_shared_points(adjust(network))
+    expected, _ = count_shared_points(adjust(network), network)
     assert not expected[:2].any() and (expected[2:, 2:] > 0).sum() == 12
