@@ -116,6 +116,24 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
 
 
+def test_pairs_are_verified_again_if_the_principal_distance_was_wrong(made, monkeypatch):
+    _, _, _, store = made
+
+    def start_too_long(cameras, *_):
+        longer = {name: 1.4 * F for name in ("fx", "fy")}
+        return [dataclasses.replace(c, parameters={**c.parameters, **longer}) for c in cameras], []
+
+    monkeypatch.setattr("jaxbundle.reconstruction.reconstruct.start_cameras", start_too_long)
+    found = reconstruct([store.parent], settings=SETTINGS, store=store)
+    assert any(f"{F:.0f} px instead of {1.4 * F:.0f} px" in note for note in found.notes)
+    assert len(found.parts[0].adjustment.network.images) == 6
+    (camera,) = found.parts[0].adjustment.cameras.values()
+    c = camera["parameters"]["fx"]
+    assert abs(c["value"] - F) < 3 * c["sigma"] < 1.0
+    # and not also what contradicted with the wrong one
+    assert sum("contradict" in note for note in found.notes) <= 1
+
+
 def test_the_principal_point_of_few_photographs_is_estimated(tmp_path):
     """Held at the centre of the photographs it would bias the principal distance by many σ."""
     write_photographs(tmp_path, "a", 3, 2)
