@@ -36,9 +36,9 @@ MANY = 0.25
 """Share of gross errors above which points of two rays are not used: most of their gross errors
 cannot be detected."""
 SOME, MISFIT = 0.05, 2.0
-"""Share of gross errors, and factor of σ of the others, above which both together make a result as
-doubtful: undetected ones may distort it."""
-AGREEING = 0.001
+"""Share of gross errors, and factor of σ of the others, that together make a result doubtful:
+undetected ones may distort it."""
+AGREEING_RAY = 0.001
 """Maximum misclosure of an agreeing ray, relative to the image extent."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined by data snooping."""
@@ -101,7 +101,7 @@ def adjust_weighted(
             return found or clearer
         if clearer.adjustment.converged and _is_better(clearer, found if solved else None):
             return dataclasses.replace(
-                clearer, agreeing=_count_agreeing(network, clearer.adjustment),
+                clearer, agreeing=_count_agreeing(network, clearer),
                 unused=len(network.points) - len(clear.points),
             )  # fmt: skip
     assert found is not None, "an attempt ends with a result or an error"
@@ -116,14 +116,14 @@ def adjust_weighted(
 
 
 def _is_doubtful(found: Weighted) -> bool:
+    """Whether undetected gross errors, most of them in points of two rays, may distort a result."""
     return _removed_many(found.adjustment) or (
         _removed_many(found.adjustment, SOME) and found.worst > MISFIT
     )
 
 
 def _removed_many(result: Adjustment, share: float = MANY) -> bool:
-    """Whether so many measurements were gross errors that those of points of two rays are not
-    reliable."""
+    """Whether more than a share of the measurements were gross errors."""
     return len(result.removed) > share * len(result.network.observations)
 
 
@@ -132,8 +132,9 @@ def _is_better(clearer: Weighted, found: Weighted | None) -> bool:
     return found is None or _removed_many(found.adjustment) or clearer.worst < found.worst
 
 
-def _count_agreeing(network: Network, result: Adjustment) -> int:
+def _count_agreeing(network: Network, clearer: Weighted) -> int:
     """The number of measurements of all points that agree with the result of some of them."""
+    result = clearer.adjustment
     cameras = tuple(
         dataclasses.replace(c, parameters=result.camera_parameters(c.id)) for c in network.cameras
     )
@@ -142,7 +143,10 @@ def _count_agreeing(network: Network, result: Adjustment) -> int:
     images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
     points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
     placed = network.replace(cameras=cameras, images=images, points=points)
-    return len(find_start_values(placed, tolerance=AGREEING).network.observations)
+    try:
+        return len(find_start_values(placed, tolerance=AGREEING_RAY).network.observations)
+    except NotSolvedError:  # control does not agree so closely
+        return clearer.agreeing
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
@@ -164,7 +168,7 @@ def _without_lost(network: Network, kinds, names, significance, tell) -> Weighte
 
 
 def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:
-    """Which points are not tie points among the undetermined, by the names of their coordinates."""
+    """False for tie points named among the undetermined."""
     lost = {name.rpartition(" ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))

@@ -21,17 +21,15 @@ from jaxbundle.reconstruction.adjusting import Weighted
 from jaxbundle.tiepoints.refinement import Measurements
 from jaxbundle.tiepoints.search import ideal_features, present_size
 
-AGREEING = 1 / 3
-"""Minimum share of measurements that agree with a result: 0.78 of a building with identical
-windows agree with the right one."""
+AGREEING_SHARE = 1 / 3
+"""Minimum share of measurements that agree with a result."""
 ONE_DIRECTION, ONE_SCALE = np.radians(15.0), 1.5
 """Maximum angle between the rays to a point, and ratio of their lengths, with which it is expected
 in both photographs."""
 FEWEST = 50
 """Minimum expected points of a pair."""
 SHARED = 0.1
-"""Share of the expected points below which a pair is contradictory; in right results of rendered
-facades it is at least 0.19."""
+"""Share of the expected points below which a pair is contradictory."""
 PAIRS, OF_ALL = 3, 0.15
 """Contradictory pairs, and their share of all, above which a result is refused: 8 of 26 in a
 facade that is folded (`chain` of the benchmarks)."""
@@ -44,7 +42,7 @@ def refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[st
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
     found = int(rays[rays > 1].sum())
-    if weighted.agreeing < AGREEING * found:
+    if weighted.agreeing < AGREEING_SHARE * found:
         raise _folded(
             f"of {found} measurements in {count(len(placed), 'photograph')} {weighted.agreeing} "
             "agree with one object", names,
@@ -88,41 +86,48 @@ def count_shared_points(
     X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
     X = np.asarray(result.point_values)
     used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    known = np.all(np.isfinite(X), axis=1)
+    used &= known[result.problem.point]
     n = len(X0)
-    agree = np.zeros((n, len(X)), bool)
-    agree[result.problem.image[used], result.problem.point[used]] = True
-    seen = agree | _are_measured(network, measured)
+    agreeing = _points_of_images(n, result.problem.image[used], result.problem.point[used])
+    seen = _points_of_images(n, *_measured_rays(network, measured))
+    to_points = [X[points] - X0[i] for i, points in enumerate(agreeing)]
+    far = [np.linalg.norm(d, axis=1) for d in to_points]
+    reach = np.array([lengths.max(initial=0.0) for lengths in far])
     fields = [_field(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
               for c in network.cameras]  # fmt: skip
     expected, shared = np.zeros((2, n, n), int)
-    for i in range(n):
-        points = np.flatnonzero(agree[i] & np.isfinite(X).all(1))
-        to_i = X[points] - X0[i]
-        far = np.linalg.norm(to_i, axis=1)
-        near = np.linalg.norm(X0 - X0[i], axis=1) < far.max(initial=0.0)
-        for j in np.flatnonzero(near & (np.arange(n) != i)):
-            d = X[points] - X0[j]
+    for j in range(n):
+        there = np.zeros(len(X), bool)
+        there[agreeing[j]] = there[seen[j]] = True
+        near = np.linalg.norm(X0 - X0[j], axis=1) < reach
+        for i in np.flatnonzero(near & (np.arange(n) != j)):
+            d = X[agreeing[i]] - X0[j]
             length = np.linalg.norm(d, axis=1)
-            cosine = (d * to_i).sum(1) / (length * far)
-            one = (cosine > np.cos(ONE_DIRECTION)) & (length < ONE_SCALE * far)
-            one &= (far < ONE_SCALE * length) & _is_in_field(
+            cosine = (d * to_points[i]).sum(1) / (length * far[i])
+            one = (cosine > np.cos(ONE_DIRECTION)) & (length < ONE_SCALE * far[i])
+            one &= (far[i] < ONE_SCALE * length) & _is_in_field(
                 d @ M[j].T, fields[network.images.camera[j]]
             )
-            expected[i, j] = one.sum()
-            shared[i, j] = seen[j, points[one]].sum()
+            expected[i, j], shared[i, j] = one.sum(), there[agreeing[i][one]].sum()
     return expected + expected.T, shared + shared.T
 
 
-def _are_measured(network: Network, measured: Network) -> Bool[np.ndarray, "images points"]:
-    """Which points of a network are measured in which of its images, in another one."""
+def _points_of_images(number: int, image, point) -> list[Int[np.ndarray, " points"]]:
+    """The points of every image."""
+    order = np.argsort(image, kind="stable")
+    return np.split(point[order], np.searchsorted(image[order], np.arange(1, number)))
+
+
+def _measured_rays(network: Network, measured: Network):
+    """Image and point, in the network, of the measurements that belong to both."""
     image = {id: k for k, id in enumerate(network.images.id)}
     point = {id: k for k, id in enumerate(network.points.id)}
     images = np.array([image.get(id, -1) for id in measured.images.id])
     points = np.array([point.get(id, -1) for id in measured.points.id])
     i, p = images[measured.observations.image], points[measured.observations.point]
-    found = np.zeros((len(image), len(point)), bool)
-    found[i[(i >= 0) & (p >= 0)], p[(i >= 0) & (p >= 0)]] = True
-    return found
+    both = (i >= 0) & (p >= 0)
+    return i[both], p[both]
 
 
 def _field(camera) -> Float[np.ndarray, "2 2"]:

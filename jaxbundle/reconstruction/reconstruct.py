@@ -60,9 +60,9 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
-MISFIT = 4.0
-"""Factor of σ above which a result is called doubtful; right results of rendered sets have up to
-2."""
+LARGEST_MISFIT = 4.0
+"""Factor of σ above which a result is called doubtful; right results of rendered facades have up to
+2.5."""
 WRONG, POORLY = 1.05, 0.01
 """Change of a principal distance by adjustment above which pairs are verified again, and its
 maximum relative σ: with a wrong one, right pairs contradict each other, and wrong ones may not."""
@@ -160,7 +160,7 @@ class _Making:
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.tried: set[tuple[int, int]] = set()
-        self.repeated = False
+        self.preliminary = self.repeated = False
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -176,10 +176,10 @@ class _Making:
             for one in prepared:
                 one.result()
         parts = self._parts(features, matches, pairs)
-        better, said = _better_cameras(self.cameras, parts)
-        if said:
-            self.cameras, self.repeated = better, True
-            self.left_out, self.notes = before[0], before[1] + said
+        if self.preliminary:
+            self.cameras, corrected = _better_cameras(self.cameras, parts)
+            self.left_out, self.notes = before[0], before[1] + corrected
+            self.repeated = True
             pairs = self._verify(features, matches)
             parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
@@ -333,9 +333,10 @@ class _Making:
         return part, dict(oriented.images)
 
     def _refuse_folded(self, weighted: Weighted, network: Network, measured) -> list[str]:
-        """Notes on contradictions; none if the camera was wrong, and all will be done again."""
+        """Notes on contradictions; none if the camera was wrong: then all is done again."""
         result = weighted.adjustment
-        if not self.repeated and any(_change(c, result) > WRONG for c in result.network.cameras):
+        if not self.repeated and any(_is_wrong(c, result) for c in self.cameras.cameras):
+            self.preliminary = True
             return []
         refuse_folded(weighted, measured, self.names)
         return refuse_superimposed(result, network, self.tried, self.names)
@@ -376,34 +377,32 @@ class _Making:
 
 
 def _better_cameras(cameras: Cameras, parts: Sequence[Part]) -> tuple[Cameras, list[str]]:
-    """The cameras with the adjusted values of wrong lenses, and what was wrong."""
-    better, said = cameras, []
-    if cameras.given:
-        return better, said
-    for part in reversed(parts):  # the largest decides
-        result = part.adjustment
-        for k, lens in enumerate(better.lens):
-            given = better.cameras[k]
-            if given.id not in result.cameras or _change(given, result) <= WRONG:
-                continue
-            found = dataclasses.replace(given, parameters=result.camera_parameters(given.id))
-            own = [c for c, other in enumerate(better.lens) if other == lens]
-            corrected = tuple(with_lens(better.cameras, own, found))
-            better = dataclasses.replace(better, cameras=corrected)
-            f, before = found.parameters["fx"], given.parameters["fx"]
-            said.append(f"camera {given.id}: principal distance {f:.0f} px instead of "
-                        f"{before:.0f} px: pairs verified again")  # fmt: skip
-    return better, said
+    """The cameras, wrong lenses with the values adjusted in their largest part; and what was
+    wrong."""
+    better, said, known = list(cameras.cameras), [], set()
+    for result in (part.adjustment for part in parts):
+        shown = [k for k, c in enumerate(cameras.cameras)
+                 if c.id in result.cameras and cameras.lens[k] not in known]  # fmt: skip
+        for k in shown:
+            given, lens = better[k], cameras.lens[k]
+            if _is_wrong(given, result):
+                found = dataclasses.replace(given, parameters=result.camera_parameters(given.id))
+                own = [c for c, other in enumerate(cameras.lens) if other == lens]
+                better = with_lens(better, own, found)
+                f, before = found.parameters["fx"], given.parameters["fx"]
+                said.append(f"camera {given.id}: principal distance {f:.0f} px instead of "
+                            f"{before:.0f} px: pairs verified again")  # fmt: skip
+        known |= {cameras.lens[k] for k in shown}
+    return dataclasses.replace(cameras, cameras=tuple(better)), said
 
 
-def _change(camera: Camera, result: Adjustment) -> float:
-    """Ratio of the principal distance of a camera before and after its adjustment, at least 1; 1 if
-    it is poorly determined."""
-    found = _principal_distances(result)[camera.id]
-    if not found["sigma"] or found["sigma"] > POORLY * found["value"]:
-        return 1.0
+def _is_wrong(camera: Camera, result: Adjustment) -> bool:
+    """Whether an adjustment determined another principal distance."""
+    found = _principal_distances(result).get(camera.id)
+    if found is None or not found["sigma"] or found["sigma"] > POORLY * found["value"]:
+        return False
     ratio = found["value"] / camera.parameters["fx"]
-    return max(ratio, 1 / ratio)
+    return max(ratio, 1 / ratio) > WRONG
 
 
 def _principal_distances(result: Adjustment) -> dict[str, dict]:
@@ -441,12 +440,11 @@ def _name_unused(name: str, weighted: Weighted) -> list[str]:
 
 def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
     """A note on measurements that contradict each other by far more than their σ."""
-    worst = max(weighted.factors.values(), default=1.0)
-    if worst < MISFIT:
+    if weighted.worst < LARGEST_MISFIT:
         return []
-    return [f"{name}: measurements fit {worst:.1f} times worse than their σ from matching: the "
-            "object repeats itself or moves, or the camera model does not fit the lens; compare "
-            "the result with the object"]  # fmt: skip
+    return [f"{name}: measurements fit {weighted.worst:.1f} times worse than their σ from "
+            "matching: the object repeats itself or moves, or the camera model does not fit the "
+            "lens; compare the result with the object"]  # fmt: skip
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
