@@ -64,8 +64,8 @@ LARGEST_MISFIT = 4.0
 """Factor of σ above which a result is called doubtful; right results of rendered facades have up to
 2.5."""
 WRONG, POORLY = 1.05, 0.01
-"""Change of a principal distance by adjustment above which pairs are verified again, and its
-maximum relative σ: with a wrong one, right pairs contradict each other, and wrong ones may not."""
+"""Change of a principal distance by adjustment above which pairs of a refused result are verified
+again, and its maximum relative σ: with a wrong one, right pairs may contradict each other."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -333,13 +333,17 @@ class _Making:
         return part, dict(oriented.images)
 
     def _refuse_folded(self, weighted: Weighted, network: Network, measured) -> list[str]:
-        """Notes on contradictions; none if the camera was wrong: then all is done again."""
+        """Notes on contradictions. A result refused with a wrong camera is kept for its camera, and
+        all is done again."""
         result = weighted.adjustment
-        if not self.repeated and any(_is_wrong(c, result) for c in self.cameras.cameras):
+        try:
+            refuse_folded(weighted, measured, self.names)
+            return refuse_superimposed(result, network, self.tried, self.names)
+        except NotSolvedError:
+            if self.repeated or not any(_is_wrong(c, result) for c in self.cameras.cameras):
+                raise
             self.preliminary = True
             return []
-        refuse_folded(weighted, measured, self.names)
-        return refuse_superimposed(result, network, self.tried, self.names)
 
     def _adjust_first(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on

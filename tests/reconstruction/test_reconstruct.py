@@ -12,7 +12,7 @@ from rendered_photographs import CAMERA, SIZE, F, corner, write_photographs
 
 import jaxbundle
 from jaxbundle import Camera
-from jaxbundle.errors import InputError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.orientation.alignment import similarity
@@ -118,20 +118,31 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
 
 
-def test_pairs_are_verified_again_if_the_principal_distance_was_wrong(made, monkeypatch):
+def test_a_refused_result_with_a_wrong_principal_distance_is_repeated(made, monkeypatch):
     _, _, _, store = made
+    calls = []
+
+    def refuse_the_first(*_):
+        calls.append(1)
+        if len(calls) == 1:
+            raise NotSolvedError("not solved: superimposed")
+        return []
 
     def start_too_long(cameras, *_):
         longer = {name: 1.4 * F for name in ("fx", "fy")}
         return [dataclasses.replace(c, parameters={**c.parameters, **longer}) for c in cameras], []
 
     monkeypatch.setattr("jaxbundle.reconstruction.reconstruct.start_cameras", start_too_long)
+    monkeypatch.setattr(
+        "jaxbundle.reconstruction.reconstruct.refuse_superimposed", refuse_the_first
+    )
     found = reconstruct([store.parent], settings=SETTINGS, store=store)
     assert any(f"{F:.0f} px instead of {1.4 * F:.0f} px" in note for note in found.notes)
     assert len(found.parts[0].adjustment.network.images) == 6
     (camera,) = found.parts[0].adjustment.cameras.values()
     c = camera["parameters"]["fx"]
     assert abs(c["value"] - F) < 3 * c["sigma"] < 1.0
+    assert len(calls) == 2
     # and not also what contradicted with the wrong one
     assert sum("contradict" in note for note in found.notes) <= 1
 
