@@ -33,6 +33,8 @@ STRIP = 1 << 17
 """Pixels that are rendered together."""
 RAYS = 1 << 16
 """Batch size of rays: one program for all sizes of photographs."""
+NO_RAY = np.array([0.0, 0.0, 1.0])
+"""Direction in place of a missing ray; what it meets is discarded."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Sensor:
     """The sensor: g = offset + 255·gain·texture + noise, 0 to 255.
 
     `noise`: σ in grey values, drawn by `seed`; `fine`: samples per pixel side; `background`: grey
-    value without a surface.
+    value of pixels without a surface, or without a ray (beyond the circle of a fisheye).
     """
 
     gain: float = 1.0
@@ -186,7 +188,9 @@ def _render_strip(scene, o, d, sensor):
     along = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
     moved = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
     o, d = o[:-1, :-1], d[:-1, :-1]
-    t, surface = first_hits(scene, o, d)
+    ray = np.isfinite(d + along[0] + along[1]).all(-1)
+    t, surface = first_hits(scene, o, np.where(ray[..., None], d, NO_RAY))
+    t, surface = np.where(ray, t, np.inf), np.where(ray, surface, -1)
     point = o + np.where(np.isfinite(t), t, np.nan)[..., None] * d
     grey = np.full(t.shape, float(sensor.background), np.float32)
     for k, (shape, texture) in enumerate(zip(scene.shapes, scene.textures)):

@@ -1,6 +1,8 @@
 """Rendered photographs agree with the truth: every pixel's point, nothing through a hill, and the
 position of the texture to far below a pixel."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -120,6 +122,23 @@ def test_texture_repeats_where_it_is_to_and_is_blank_where_it_is_to():
     assert np.corrcoef(TEXTURE(s, t, width), TEXTURE(s + 512 * 0.03, t, width))[0, 1] < 0.6
     blank = Texture(0.03, side=64, blank=lambda s, t: s > 0)(s, t, width)
     assert (blank[s > 0] == 0.5).all() and blank[s < 0].std() > 0.1
+
+
+def test_pixels_that_no_ray_reaches_have_the_background():
+    """With K1 < 0 the image of all rays ends at the largest r(1 + K1·r²), r² = −1/(3·K1)."""
+    k1 = -0.9
+    barrel = dataclasses.replace(CAMERA, parameters=CAMERA.parameters | {"k1": k1})
+    ground = Rectangle((-90, -90, 0), (180, 0, 0), (0, 180, 0))
+    photo = render(
+        Scene((ground,), (TEXTURE,)), barrel, [0, 0, 10.0], DOWN, Sensor(background=7)
+    )
+    v, u = np.indices(photo.surface.shape)
+    radius = np.hypot(u - 79.5, v - 59.5)
+    end = F * 2 / 3 / np.sqrt(-3 * k1)
+    assert (photo.surface[radius < end - 1.5] == 0).all()
+    outside = radius > end
+    assert (photo.surface[outside] == -1).all() and (photo.grey[outside] == 7).all()
+    assert np.isnan(photo.point[outside]).all()
 
 
 def test_a_camera_without_a_size_is_refused():
