@@ -71,6 +71,14 @@ class Model:
         """An image, or several, with their poses."""
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
+    def without(self, images: Bool[np.ndarray, " images"]) -> "Model":
+        """A copy without these images, and with only the held points."""
+        X = np.where(self.held[:, None], self.X, np.nan)
+        return dataclasses.replace(
+            self, X0=self.X0.copy(), M=self.M.copy(), placed=self.placed & ~images, X=X,
+            known=self.known & self.held,
+        )  # fmt: skip
+
     def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
         """The same model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))

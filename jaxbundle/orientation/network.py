@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
@@ -38,6 +38,7 @@ from jaxbundle.orientation.growth import (
     are_controlled,
     finish,
     grow,
+    intersect,
     misclosures,
     place_far_points,
 )
@@ -59,6 +60,9 @@ LEAST_CONTROL = 3
 """Minimum remaining control points for the datum."""
 SUFFICIENT_SHARE = 0.8
 """A model that uses at least this fraction of the image points is accepted without alternatives."""
+DOUBTFUL = 0.5
+"""Share of agreeing rays, relative to the median of the images, below which one is resected
+again."""
 WIDE_ANGLE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
@@ -195,14 +199,47 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
             model = _with_control(network, moved)
             grow(seen, model, improve=improve)
     finish(seen, model)
+    model = _place_doubtful_again(network, seen, model, improve)
     place_far_points(seen, model)
     return (model, frame) if fixed else to_scale(network, model)
+
+
+def _place_doubtful_again(network: Network, seen: Sights, model: Model, improve) -> Model:
+    """The model, or a better one in which images with few agreeing rays are resected again, from
+    the points of the others. An image that repeated parts of an object place wrongly was resected
+    from few points, and hides it by leaving the others unknown."""
+    agreeing, share = _count_agreeing(seen, model)
+    placed = model.placed
+    doubtful = placed & ~_have_poses(network) & (share < DOUBTFUL * np.median(share[placed]))
+    if not doubtful.any() or (placed & ~doubtful).sum() < 2:
+        return model
+    other = model.without(doubtful)
+    intersect(seen, other, FOR_OTHERS)
+    grow(seen, other, improve=improve)
+    finish(seen, other)
+    return other if _count_agreeing(seen, other)[0] > agreeing else model
+
+
+def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
+    """The number of agreeing rays; and their share of those of every placed image that belong to
+    points with two rays."""
+    placed = model.placed[seen.image]
+    rays = placed & (_rays_of(seen, model) > 1)[seen.point]
+    agree = rays & (misclosures(seen, model) < seen.tolerance[seen.image])
+    number, good = (np.bincount(seen.image, r, seen.images) for r in (rays, agree))
+    return int(agree.sum()), good / np.maximum(number, 1)
+
+
+def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
+    """Images with all six start values."""
+    images = network.images
+    return np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
 
 
 def _given_model(network: Network, seen: Sights) -> Model:
     """Images with all six start values, points with all three coordinates known."""
     model, images = Model.empty(seen), network.images
-    there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+    there = _have_poses(network)
     if there.any():
         model.place(there, images.position[there], many.matrices(images.angles[there]))
     return _with_control(network, model)

@@ -368,3 +368,24 @@ def test_a_principal_distance_far_from_the_truth():
     values = [entry["value"] for entry in found.cameras["wide"]["parameters"].values()]
     np.testing.assert_allclose(values, camera[0], rtol=1e-6, atol=1e-12)
     assert (found.vtpv, found.redundancy) == pytest.approx(counts, rel=1e-9)
+
+
+def test_an_image_first_placed_by_repeated_parts_is_placed_again():
+    """Of the points of the first pair, image '1' shows others that look alike: as from where '2'
+    is. Most of its points, known only later, do not agree with that."""
+    network = close_up(jaxbundle.cloud_of_targets(400, (4.0, 3.0, 1.5), seed=3))
+    rays, part = network.observations, np.repeat(["pair", "late", "link"], [300, 70, 30])
+    there, group = rays.image, part[rays.point]
+    wrong = (group == "pair") & (there == 0) & (rays.point < 35)
+    seen = wrong | ((group == "pair") & np.isin(there, [4, 5]))
+    seen |= (group == "late") & ((there == 0) | (there > 5))
+    seen |= (group == "link") & (there > 3)
+    xy = rays.xy.copy()
+    neighbour = {p: xy[k] for k, p in enumerate(rays.point) if there[k] == 1}
+    xy[wrong] = [neighbour[p] for p in rays.point[wrong]]
+    found = orient(bare(network.replace(observations=dataclasses.replace(rays, xy=xy).take(seen))))
+    images = found.network.images
+    assert len(images) == 7 and images.id[0] == "1"
+    true = network.images.position[[network.images.id.index(id) for id in images.id]]
+    ratio = lambda X: np.linalg.norm(X[0] - X[1:], axis=1) / np.linalg.norm(X[1] - X[2])
+    np.testing.assert_allclose(ratio(images.position), ratio(true), rtol=0.1)
