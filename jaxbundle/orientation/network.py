@@ -233,7 +233,7 @@ def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, 
 def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
     """Images with all six start values."""
     images = network.images
-    return np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+    return np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
 
 
 def _given_model(network: Network, seen: Sights) -> Model:

@@ -1,6 +1,6 @@
 """`reconstruct`: photographs in, adjusted networks out.
 
-    photographs ─features─▶ matches ─principal distance by pairs─▶ verified pairs ─▶ parts
+    photographs ─features─▶ matches ─principal distance by loops─▶ verified pairs ─▶ parts
     part ─tracks─▶ measured by least squares matching ─start values─▶ adjusted, weighted, snooped
 """
 
@@ -38,6 +38,7 @@ from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
 from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
+from jaxbundle.tiepoints.calibration import start_cameras
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
@@ -45,9 +46,7 @@ from jaxbundle.tiepoints.search import (
     detect,
     match,
     prepare,
-    start_cameras,
     verify,
-    with_lens,
     without_contradicted,
 )
 from jaxbundle.tiepoints.still import without_marks
@@ -63,9 +62,6 @@ REPEATS = 0.3
 LARGEST_MISFIT = 4.0
 """Factor of σ above which a result is called doubtful; right results of rendered facades have up to
 2.5."""
-WRONG, POORLY = 1.05, 0.01
-"""Change of a principal distance by adjustment above which pairs of a refused result are verified
-again, and its maximum relative σ: with a wrong one, right pairs may contradict each other."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -160,7 +156,6 @@ class _Making:
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.tried: set[tuple[int, int]] = set()
-        self.preliminary = self.repeated = False
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -171,17 +166,10 @@ class _Making:
             for first in prepared[:1]:
                 first.result()
             self._calibrate(features, matches)
-            before = dict(self.left_out), list(self.notes)
             pairs = self._verify(features, matches)
             for one in prepared:
                 one.result()
         parts = self._parts(features, matches, pairs)
-        if self.preliminary:
-            self.cameras, corrected = _better_cameras(self.cameras, parts)
-            self.left_out, self.notes = before[0], before[1] + corrected
-            self.repeated = True
-            pairs = self._verify(features, matches)
-            parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         files = {p.name: p.path for p in self.photographs}
@@ -323,35 +311,24 @@ class _Making:
         )  # fmt: skip
         network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
-        oriented, weighted, note = self._adjust_first(network, measured)
+        named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
+        oriented, weighted, note = self._adjust_first(network, measured, named)
         self._begin("")
-        doubts = self._refuse_folded(weighted, network, measured)
+        refuse_folded(weighted, measured, self.names)
+        doubts = refuse_superimposed(weighted.adjustment, network, self.tried, self.names)
         self.notes += [note] if note else []
         self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
         self.notes += [f"{name}: {said}" for said in doubts]
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
 
-    def _refuse_folded(self, weighted: Weighted, network: Network, measured) -> list[str]:
-        """Notes on contradictions. A result refused with a wrong camera is kept for its camera, and
-        all is done again."""
-        result = weighted.adjustment
-        try:
-            refuse_folded(weighted, measured, self.names)
-            return refuse_superimposed(result, network, self.tried, self.names)
-        except NotSolvedError:
-            if self.repeated or not any(_is_wrong(c, result) for c in self.cameras.cameras):
-                raise
-            self.preliminary = True
-            return []
-
-    def _adjust_first(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
+    def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
         guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
                    if not known]  # fmt: skip
         failed: NotSolvedError | None = None
-        for oriented in start_values(network, guessed):
+        for oriented in start_values(network, guessed, pairs):
             try:
                 weighted, note = self._adjust(oriented, measured)
             except NotSolvedError as error:
@@ -361,7 +338,7 @@ class _Making:
             if not is_plausible(result):
                 failed = failed or _not_solved(result)
                 continue
-            again = start_again(network, oriented, result)
+            again = start_again(network, oriented, result, pairs)
             if again is not None:
                 try:
                     better, other_note = self._adjust(again, measured)
@@ -378,35 +355,6 @@ class _Making:
         kinds, named = _kinds(placed, measured, self.names)
         significance = self.settings.significance
         return adjust_weighted(placed, kinds, named, significance, self._begin), note
-
-
-def _better_cameras(cameras: Cameras, parts: Sequence[Part]) -> tuple[Cameras, list[str]]:
-    """The cameras, wrong lenses with the values adjusted in their largest part; and what was
-    wrong."""
-    better, said, known = list(cameras.cameras), [], set()
-    for result in (part.adjustment for part in parts):
-        shown = [k for k, c in enumerate(cameras.cameras)
-                 if c.id in result.cameras and cameras.lens[k] not in known]  # fmt: skip
-        for k in shown:
-            given, lens = better[k], cameras.lens[k]
-            if _is_wrong(given, result):
-                found = dataclasses.replace(given, parameters=result.camera_parameters(given.id))
-                own = [c for c, other in enumerate(cameras.lens) if other == lens]
-                better = with_lens(better, own, found)
-                f, before = found.parameters["fx"], given.parameters["fx"]
-                said.append(f"camera {given.id}: principal distance {f:.0f} px instead of "
-                            f"{before:.0f} px: pairs verified again")  # fmt: skip
-        known |= {cameras.lens[k] for k in shown}
-    return dataclasses.replace(cameras, cameras=tuple(better)), said
-
-
-def _is_wrong(camera: Camera, result: Adjustment) -> bool:
-    """Whether an adjustment determined another principal distance."""
-    found = _principal_distances(result).get(camera.id)
-    if found is None or not found["sigma"] or found["sigma"] > POORLY * found["value"]:
-        return False
-    ratio = found["value"] / camera.parameters["fx"]
-    return max(ratio, 1 / ratio) > WRONG
 
 
 def _principal_distances(result: Adjustment) -> dict[str, dict]:

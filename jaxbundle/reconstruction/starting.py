@@ -20,12 +20,16 @@ from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.sights import TOLERANCE
-from jaxbundle.tiepoints.search import APART, OTHERS, present_size
+from jaxbundle.reconstruction.misplaced import NamedPairs, find_misplaced
+from jaxbundle.tiepoints.search import present_size
 
 START_TOLERANCE = 0.01
 """Tolerance of start values by cameras from consistent pairs, relative to the image extent."""
 SHORTEST, LONGEST = 0.35, 12.0
 """Limits of an adjusted principal distance, relative to the longer side."""
+OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
+"""Other principal distances to try, relative to the longer side, unless they differ by less
+than this factor."""
 FEWEST_RAYS = 12
 """Minimum image points of a photograph; of fewer most may be gross errors."""
 LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
@@ -33,17 +37,20 @@ LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
 maximum number of such start values that are adjusted."""
 
 
-def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]:
+def start_values(
+    network: Network, guessed: Sequence[str], pairs: NamedPairs
+) -> Iterator[Oriented]:
     """The network with start values, by one method after another.
 
-    **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files.
+    **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files; `pairs`:
+    verified ones.
 
     **Raises:** `NotSolvedError` if there are none.
     """
     found, failed = [], None
     for tolerance in (START_TOLERANCE, TOLERANCE):
         try:
-            found.append(_orient(network, tolerance))
+            found.append(_orient(network, tolerance, pairs))
         except NotSolvedError as error:
             failed = error
         else:
@@ -53,7 +60,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
     others = []
     for changed in _with_other_distances(network, guessed):
         try:
-            others.append(_orient(changed, START_TOLERANCE))
+            others.append(_orient(changed, START_TOLERANCE, pairs))
         except NotSolvedError:
             continue
     enough = [one for one in others
@@ -63,10 +70,13 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
         raise failed
 
 
-def _orient(network: Network, tolerance: float) -> Oriented:
-    """Start values, without photographs weakly connected to the others."""
+def _orient(network: Network, tolerance: float, pairs: NamedPairs) -> Oriented:
+    """Start values, without photographs that contradict their pairs, or are weakly connected to the
+    others."""
     found = orient(network, tolerance=tolerance)
-    network, images = found.network, dict(found.images)
+    network, misplaced = found.network, find_misplaced(found.network, pairs)
+    images = {**found.images, **misplaced}
+    network = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
         tied = (rays > 1)[network.observations.point]
@@ -77,9 +87,16 @@ def _orient(network: Network, tolerance: float) -> Oriented:
         for k in np.flatnonzero(few):
             why = f"only {int(number[k])} of its points agree with the others"
             images[network.images.id[k]] = why
-        network = keep_images(network, ~few)
-        rays = np.bincount(network.observations.point, minlength=len(network.points))
-        network = keep_points(network, (rays > 1) | ~network.points.has_role("tie"))
+        network = _without(network, few)
+
+
+def _without(network: Network, images) -> Network:
+    """The network without images, and without the tie points that lose all but one ray."""
+    if not images.any():
+        return network
+    network = keep_images(network, ~images)
+    rays = np.bincount(network.observations.point, minlength=len(network.points))
+    return keep_points(network, (rays > 1) | ~network.points.has_role("tie"))
 
 
 def _with_other_distances(network: Network, guessed: Sequence[str]) -> Iterator[Network]:
@@ -109,7 +126,9 @@ def is_plausible(result: Adjustment) -> bool:
     )
 
 
-def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Oriented | None:
+def start_again(
+    network: Network, oriented: Oriented, result: Adjustment, pairs: NamedPairs
+) -> Oriented | None:
     """Start values with the adjusted cameras, if these orient more photographs."""
     if not oriented.images:
         return None
@@ -119,7 +138,7 @@ def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Ori
     }
     cameras = tuple(better.get(c.id, c) for c in network.cameras)
     try:
-        found = _orient(network.replace(cameras=cameras), START_TOLERANCE)
+        found = _orient(network.replace(cameras=cameras), START_TOLERANCE, pairs)
     except NotSolvedError:
         return None
     return found if len(found.images) < len(oriented.images) else None

@@ -26,7 +26,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.tiepoints.verification import Pair
+from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
 TURN, GAP = np.radians(5.0), 0.15
 """Maximum rotation remaining around a loop, and gap of the bases relative to the longest."""
@@ -130,7 +130,7 @@ class _Loops:
     def _closes(self, i, j, k):
         ij, jk, ik = (self.pairs[of] for of in ((i, j), (j, k), (i, k)))
         turn = jk.M @ ij.M @ ik.M.T
-        if np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) > TURN:
+        if rotation_angle(turn) > TURN:
             return False
         # ln β of jk and ik, β of ij is 1
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)

@@ -240,6 +240,27 @@ def _improve(poses, of, xy1, xy2, tolerance, limit):
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
 
 
+def turn_pairs(
+    pairs: Sequence[Pair],
+    ideal: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
+) -> Float[np.ndarray, "pairs 3 3"]:
+    """M of pairs, refined with their matches at these coordinates, c = 1."""
+    rows = [many.spread(len(pair), SLOTS) for pair in pairs]
+    weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
+    xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
+    weights *= np.isfinite(xy1 + xy2).all(-1)
+    xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
+    start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
+    return many.run_in_lanes(_refine, LANES, *start, xy1, xy2, weights)[0]
+
+
+def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """The angle of rotations, radians."""
+    across = M - np.swapaxes(M, -1, -2)
+    sine = np.sqrt((across**2).sum((-2, -1)) / 8)
+    return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
+
+
 def _fill(a):
     return np.resize(a, (SLOTS, *a.shape[1:]))
 

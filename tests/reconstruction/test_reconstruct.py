@@ -1,7 +1,6 @@
 """Rendered photographs of a scene and some that do not belong to it, reconstructed."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,14 +10,13 @@ from PIL import Image
 from rendered_photographs import CAMERA, SIZE, F, corner, write_photographs
 
 import jaxbundle
-from jaxbundle import Camera
-from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.parts import group_connected
-from jaxbundle.reconstruction.photographs import Cameras, assign_cameras, find_photographs
-from jaxbundle.reconstruction.reconstruct import _better_cameras, reconstruct
+from jaxbundle.reconstruction.photographs import assign_cameras, find_photographs
+from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.tiepoints.features import Detection
 from jaxbundle.tiepoints.verification import Pair
@@ -116,57 +114,6 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert {"features", "matching", "verification", "start values"} <= set(stages)
     assert all(done == total for stage, (done, total) in stages.items() if "data" not in stage)
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
-
-
-def test_a_refused_result_with_a_wrong_principal_distance_is_repeated(made, monkeypatch):
-    _, _, _, store = made
-    calls = []
-
-    def refuse_the_first(*_):
-        calls.append(1)
-        if len(calls) == 1:
-            raise NotSolvedError("not solved: superimposed")
-        return []
-
-    def start_too_long(cameras, *_):
-        longer = {name: 1.4 * F for name in ("fx", "fy")}
-        return [dataclasses.replace(c, parameters={**c.parameters, **longer}) for c in cameras], []
-
-    monkeypatch.setattr("jaxbundle.reconstruction.reconstruct.start_cameras", start_too_long)
-    monkeypatch.setattr(
-        "jaxbundle.reconstruction.reconstruct.refuse_superimposed", refuse_the_first
-    )
-    found = reconstruct([store.parent], settings=SETTINGS, store=store)
-    assert any(f"{F:.0f} px instead of {1.4 * F:.0f} px" in note for note in found.notes)
-    assert len(found.parts[0].adjustment.network.images) == 6
-    (camera,) = found.parts[0].adjustment.cameras.values()
-    c = camera["parameters"]["fx"]
-    assert abs(c["value"] - F) < 3 * c["sigma"] < 1.0
-    assert len(calls) == 2
-    # and not also what contradicted with the wrong one
-    assert sum("contradict" in note for note in found.notes) <= 1
-
-
-def test_the_largest_part_decides_on_a_wrong_camera():
-    def part(**found):
-        return SimpleNamespace(adjustment=SimpleNamespace(
-            cameras={id: {"parameters": {"fx": {"value": f, "sigma": sigma}}}
-                     for id, (f, sigma) in found.items()},
-            camera_parameters=lambda id: dict.fromkeys(("fx", "fy"), found[id][0]) | {"k1": 0.1},
-        ))  # fmt: skip
-
-    one, two, other = (Camera(id, "opencv", {"fx": 1000.0, "fy": 1000.0}) for id in "abc")
-    cameras = Cameras((one, two, other), (0, 1, 2), (False,) * 3, False, (), (0, 0, 1))
-    of = lambda *parts: _better_cameras(cameras, parts)
-    values = lambda better: [c.parameters["fx"] for c in better.cameras]
-    # a and b share a lens
-    better, said = of(part(a=(800.0, 1.0), b=(800.0, 1.0)), part(b=(1300.0, 1.0), c=(900.0, 1.0)))
-    assert values(better) == [800.0, 800.0, 900.0] and better.cameras[1].parameters["k1"] == 0.1
-    assert [line[:8] for line in said] == ["camera a", "camera c"]
-    # right, poorly determined, held
-    better, said = of(part(a=(1010.0, 1.0), c=(500.0, 20.0)), part(a=(700.0, 1.0)))
-    assert values(better) == [1000.0] * 3 and not said
-    assert values(of(part(a=(500.0, None)))[0]) == [1000.0] * 3
 
 
 def test_the_principal_point_of_few_photographs_is_estimated(tmp_path):

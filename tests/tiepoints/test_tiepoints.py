@@ -1,12 +1,15 @@
 """Matches of known geometry: principal distance, verification, tracks, what is kept."""
 
 import dataclasses
+from itertools import combinations
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
+from jaxbundle.tiepoints.calibration import start_cameras
+from jaxbundle.tiepoints.closing import find_loops
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.interior import estimate_interior
 from jaxbundle.tiepoints.loops import split_contradicted
@@ -15,7 +18,7 @@ from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
-from jaxbundle.tiepoints.verification import Pair, verify_pairs
+from jaxbundle.tiepoints.verification import Pair, rotation_angle, verify_pairs
 
 SIZE, F, K1 = (1200, 900), 1000.0, -0.1
 
@@ -66,6 +69,42 @@ def test_principal_distance_and_distortion_from_pairs(cloud):
     assert found.camera.parameters["fx"] == pytest.approx(F, rel=0.02)
     assert found.camera.parameters["k1"] == pytest.approx(K1, abs=0.03)
     assert found.misclosure < 0.5
+
+
+def test_rotations_close_with_the_right_principal_distance_and_distortion():
+    """A flat object, EXIF 20 % wrong, a fifth of the matches and one pair wrong: the coplanarity
+    condition alone leaves the principal distance undecided."""
+    rng = np.random.default_rng(8)
+    X = rng.uniform(-2.2, 2.2, (160, 3)) * [1, 1, 0.02]
+    views = list(stations(6, rng))
+    features = [features_at(pixels(seen(X, *view), rng)) for view in views]
+    matches = []
+    for i, j in combinations(range(6), 2):
+        rows = np.tile(np.arange(len(X))[:, None], 2)
+        wrong = rng.random(len(X)) < (0.2 if (i, j) != (1, 4) else 1.0)
+        rows[wrong, 1] = rng.permutation(rows[wrong, 1])
+        matches.append(Matches((i, j), rows, np.full(len(X), 0.5), np.ones(len(X), bool)))
+    told = {"fx": 1.2 * F, "fy": 1.2 * F, "cx": 599.5, "cy": 449.5, "k1": 0.0}
+    camera = jaxbundle.Camera("c", "opencv", told, image_size=SIZE)
+    (found,), notes = start_cameras([camera], [0] * 6, [0], [True], features, matches)
+    assert found.parameters["fx"] == found.parameters["fy"] == pytest.approx(F, rel=0.02)
+    assert found.parameters["k1"] == pytest.approx(K1, abs=0.03)
+    assert any(f"distance {found.parameters['fx']:.0f} px" in note for note in notes)
+    # with a single pair no rotation closes
+    few, _ = start_cameras([camera], [0] * 6, [0], [True], features, matches[:1])
+    assert np.isfinite(few[0].parameters["fx"])
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, 3.0, np.pi])
+def test_the_angle_of_a_rotation(angle):
+    M = Rotation.from_rotvec(angle * np.array([2, -1, 2]) / 3).as_matrix()
+    assert rotation_angle(M) == pytest.approx(angle, abs=1e-12)
+
+
+def test_loops_are_three_photographs_with_three_pairs():
+    pairs = [(0, 1), (0, 2), (1, 2), (2, 3), (1, 3), (3, 4)]
+    loops = [[pairs[k] for k in loop] for loop in find_loops(pairs)]
+    assert loops == [[(0, 1), (1, 2), (0, 2)], [(1, 2), (2, 3), (1, 3)]]
 
 
 def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
