@@ -7,6 +7,8 @@
 | `statue` | half around a statue on a square: paving, a building with mirroring windows, trees |
 | `building` | along a front of columns, windows and ornaments that are alike, a hedge before it |
 | `room` | a room with bare walls, pictures, identical books; some turned at one place |
+| `courtyard` | all around inside a courtyard, opposite wings with identical windows and roofs |
+| `drone` | from above, in strips with alternating headings; houses, trees, cars |
 
 Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
 edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places
@@ -27,13 +29,15 @@ from photograph_sets import Shot, arc, camera, write
 import jaxbundle
 from jaxbundle.orientation import many
 from jaxbundle.planning.render import Rendered, Scene, Sensor, camera_rays
-from jaxbundle.planning.shapes import Rectangle
+from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.planning.texture import Texture
 
 WRONG = 1.05
 """Principal distance in EXIF, relative to the true one."""
 QUALITY = 85
+EVERY = 3.0
+"""Distance of windows in a wing of the courtyard, and of its floors."""
 CLOUDS = Texture(0.008, seed=77, mean=0.8, contrast=0.05)
 
 
@@ -90,6 +94,24 @@ class Leaves(Rectangle):
         hit = np.isfinite(t)
         s, u = self.coordinates(o[hit] + t[hit][:, None] * d[hit])
         t[hit] = np.where(self.pattern(s, u, np.full(len(s), 0.01)) > 0.5, t[hit], np.inf)
+        return t
+
+
+@dataclasses.dataclass(frozen=True)
+class Panes(Rectangle):
+    """A rectangle in every field of `EVERY` × `EVERY` of a wall: the `limits` of both
+    coordinates."""
+
+    limits: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 1.0)
+
+    def distances(self, o, d):
+        """Lengths of rays to one of them."""
+        t = super().distances(o, d)
+        hit = np.isfinite(t)
+        s, u = (a % EVERY for a in self.coordinates(o[hit] + t[hit][:, None] * d[hit]))
+        left, right, low, high = self.limits
+        inside = (s > left) & (s < right) & (u > low) & (u < high)
+        t[hit] = np.where(inside, t[hit], np.inf)
         return t
 
 
@@ -311,8 +333,83 @@ def room(width: int) -> list[Shot]:
     return _shots("r", stages, X0, at, width, focal, 0.03 * rng.normal(size=n), exif=False)
 
 
+def _wing(stage: Stage, corner, along, columns, rows, seed) -> None:
+    """A wing of plaster of its own, with windows, sills and a roof that all wings have."""
+    corner, along = np.array([*corner, 0.0]), np.array([*along, 0.0])
+    inward, long, high = np.cross([0, 0, 1.0], along), EVERY * columns, EVERY * rows + 1
+    at = lambda z, out: tuple(corner + out * inward + [0, 0, z])
+    across, up = tuple(long * along), (0, 0, EVERY * rows)
+    stage.add(Rectangle(at(0, 0), across, (0, 0, high)), seed, contrast=0.06, mean=0.6, side=2048)
+    stage.add(Panes(at(0, 0.02), across, up, (0.84, 2.14, 0.8, 2.6)), 210, mirror=0.6,
+              contrast=0.1, mean=0.2, period=EVERY)  # fmt: skip
+    stage.add(Panes(at(0, 0.2), across, up, (0.69, 2.29, 0.6, 0.8)), 211, period=EVERY)
+    slope = tuple(-3.0 * inward + [0, 0, 2.5])
+    stage.add(Rectangle(at(high, 0.4), across, slope), 213, period=1.5, contrast=0.12, mean=0.35)
+
+
+def courtyard(width: int) -> list[Shot]:
+    rng = np.random.default_rng(35)
+    n, texel = 24, 0.5 * 14 / (0.9 * width)
+    a, b = 15.0, 12.0
+    stage = Stage(texel)
+    stage.add(Rectangle((-a, -b, 0), (2 * a, 0, 0), (0, 2 * b, 0)), 1, contrast=0.08, mean=0.4,
+              side=2048)  # fmt: skip
+    for k, (corner, along, columns) in enumerate((
+        ((-a, -b), (1, 0), 10), ((a, -b), (0, 1), 8), ((a, b), (-1, 0), 10), ((-a, b), (0, -1), 8),
+    )):  # fmt: skip
+        _wing(stage, corner, along, columns, 2, 200 + 20 * k)
+    stage.box((12.5, 9.5, 0), (2.5, 2.5, 11.0), 300, contrast=0.08, mean=0.55)
+    for k, (corner, size) in enumerate((
+        ((-14.8, 2, 0), (0.5, 2.2, 3.0)), ((3, 11.5, 0), (2.2, 0.5, 3.2)),
+        ((-6, -11.8, 0), (3, 0.6, 0.9)),
+    )):  # fmt: skip
+        stage.box(corner, size, 310 + 10 * k)
+    stage.box((10, -10.8, 0), (4.2, 1.8, 1.4), 340, mirror=0.3)
+    stage.tree(-12, 9.0, 1.5, 3.0, 350)
+    stage.tree(8, -9.5, 1.0, 2.5, 360)
+    turn = 2 * np.pi * np.arange(n) / n
+    X0 = np.c_[9 * np.cos(turn), 7 * np.sin(turn), 1.7 + 0.1 * rng.normal(size=n)]
+    X0 += 0.5 * rng.normal(size=(n, 3)) * [1, 1, 0]
+    ahead = turn + np.pi + 0.12 * rng.normal(size=n)
+    at = X0 + np.c_[10 * np.cos(ahead), 10 * np.sin(ahead), np.full(n, 1.3)]
+    stages = []
+    for k in range(n):
+        one = stage.with_others()
+        one.person(*rng.uniform([-6, -5], [6, 5]), 400 + 4 * k)
+        stages.append(one)
+    return _shots("y", stages, X0, at, width, 0.9, 0.03 * rng.normal(size=n))
+
+
+def drone(width: int) -> list[Shot]:
+    rng = np.random.default_rng(36)
+    high, focal, strips, each = 60.0, 0.75, 3, 5
+    n = strips * each
+    stage = Stage(0.5 * high / (focal * width))
+    ground = lambda X, Y: 1.5 * np.sin(X / 25) * np.cos(Y / 30) + 0.4 * np.sin(X / 6 + Y / 9)
+    stage.add(HeightField(ground, (-150, -130, 150, 130)), 1, side=2048, contrast=0.12, mean=0.4)
+    for k in range(14):
+        (x, y), (a, b) = rng.uniform([-50, -40], [50, 40]), rng.uniform(5, 12, 2)
+        stage.box((x, y, -1), (a, b, rng.uniform(4, 10)), 100 + 7 * k, contrast=0.1,
+                  mean=rng.uniform(0.3, 0.7))  # fmt: skip
+    for k in range(8):
+        (x, y), r = rng.uniform([-50, -40], [50, 40]), rng.uniform(1.5, 4)
+        stage.add(Ellipsoid((x, y, r), (r, r, 1.3 * r)), 500 + k, contrast=0.15, mean=0.3)
+    along, aside = 0.25 * high / focal, 0.35 * 0.75 * high / focal
+    X, Y = np.meshgrid(along * (np.arange(each) - 2), aside * (np.arange(strips) - 1))
+    X0 = np.c_[X.ravel(), Y.ravel(), np.full(n, high)] + rng.normal(size=(n, 3)) * [1, 1, 0.7]
+    at = (X0 + 0.03 * high * rng.normal(size=(n, 3))) * [1, 1, 0]
+    stages = []
+    for k in range(n):
+        one = stage.with_others()
+        for i in range(3):
+            one.box((*rng.uniform([-60, -50], [60, 50]), 0), (4.2, 1.8, 1.5), 900 + 10 * k + i)
+        stages.append(one)
+    roll = np.where(np.arange(n) // each % 2 == 1, np.pi, 0.0) + 0.03 * rng.normal(size=n)
+    return _shots("n", stages, X0, at, width, focal, roll)
+
+
 LIFELIKE: dict[str, Callable[[int], list[Shot]]] = {
-    f.__name__: f for f in (statue, building, room)
+    f.__name__: f for f in (statue, building, room, courtyard, drone)
 }
 
 

@@ -8,6 +8,7 @@
    unreached images are joined by relative orientation to an oriented image. Finally a similarity
    transforms the model to control points or given positions (`frames`); without these it keeps its
    own frame.
+4. Images with few agreeing rays are resected again from the points of the others.
 
 A plane has two relative orientations, and two images from one place have none: a pair
 from which little grows is replaced by the next.
@@ -38,7 +39,6 @@ from jaxbundle.orientation.growth import (
     are_controlled,
     finish,
     grow,
-    intersect,
     misclosures,
     place_far_points,
 )
@@ -208,23 +208,25 @@ def _place_doubtful_again(network: Network, seen: Sights, model: Model, improve)
     """The model, or a better one in which images with few agreeing rays are resected again, from
     the points of the others. An image that repeated parts of an object place wrongly was resected
     from few points, and hides it by leaving the others unknown."""
-    agreeing, share = _count_agreeing(seen, model)
     placed = model.placed
+    if placed.sum() < 3:
+        return model
+    agreeing, share = _count_agreeing(seen, model)
     doubtful = placed & ~_have_poses(network) & (share < DOUBTFUL * np.median(share[placed]))
     if not doubtful.any() or (placed & ~doubtful).sum() < 2:
         return model
     other = model.without(doubtful)
-    intersect(seen, other, FOR_OTHERS)
     grow(seen, other, improve=improve)
     finish(seen, other)
-    return other if _count_agreeing(seen, other)[0] > agreeing else model
+    lost = placed & ~other.placed & ~doubtful
+    return model if lost.any() or _count_agreeing(seen, other)[0] <= agreeing else other
 
 
 def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
     """The number of agreeing rays; and their share of those of every placed image that belong to
-    points with two rays."""
-    placed = model.placed[seen.image]
-    rays = placed & (_rays_of(seen, model) > 1)[seen.point]
+    known control or to points with two rays."""
+    checked = model.held | (_rays_of(seen, model) > 1)
+    rays = model.placed[seen.image] & checked[seen.point]
     agree = rays & (misclosures(seen, model) < seen.tolerance[seen.image])
     number, good = (np.bincount(seen.image, r, seen.images) for r in (rays, agree))
     return int(agree.sum()), good / np.maximum(number, 1)

@@ -4,6 +4,7 @@ Around a photograph that repeated parts of an object place wrongly, enough point
 epipolar lines. But its pairs were oriented, and closed in triplets, without this model.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -17,7 +18,7 @@ TURN, ASIDE = np.radians(10.0), np.radians(30.0)
 SURE_BASE = 0.03
 """Angle of intersection, radians, above which the direction of a base is known."""
 FEWEST = 3
-"""Minimum number of pairs of a photograph that can be contradicted by them."""
+"""Minimum number of pairs for a photograph to be judged by them."""
 
 NamedPairs = Mapping[tuple[str, str], Pair]
 """Pairs by the ids of their images."""
@@ -25,24 +26,27 @@ NamedPairs = Mapping[tuple[str, str], Pair]
 
 def find_misplaced(network: Network, pairs: NamedPairs) -> dict[str, str]:
     """Images that contradict more than half of their pairs, with the reason; the worst first,
-    whose pairs no longer count for the others."""
+    whose pairs no longer count for the others. None if these are most images: then it is not known
+    which of them are right."""
     contradicted = _compare(network, pairs)
     found: dict[str, str] = {}
-    while contradicted:
-        of = {id: [bad for pair, bad in contradicted.items() if id in pair]
-              for pair in contradicted for id in pair}  # fmt: skip
-        worst = max(of, key=lambda id: sum(of[id]) / len(of[id]))
-        number, bad = len(of[worst]), sum(of[worst])
-        if number < FEWEST or 2 * bad <= number:
-            break
-        found[worst] = f"its position contradicts {bad} of its {number} pairs"
-        contradicted = {pair: bad for pair, bad in contradicted.items() if worst not in pair}
-    return found
+    while True:
+        number = Counter(id for pair in contradicted for id in pair)
+        bad = Counter(id for pair, wrong in contradicted.items() if wrong for id in pair)
+        judged = [id for id in bad if number[id] >= FEWEST and 2 * bad[id] > number[id]]
+        if not judged:
+            return found if 2 * len(found) < len(network.images) else {}
+        worst = max(judged, key=lambda id: bad[id] / number[id])
+        found[worst] = (f"its position or attitude contradicts {bad[worst]} of its "
+                        f"{number[worst]} pairs")  # fmt: skip
+        contradicted = {pair: wrong for pair, wrong in contradicted.items() if worst not in pair}
 
 
 def _compare(network: Network, pairs: NamedPairs) -> dict[tuple[str, str], bool]:
     """Whether each pair contradicts the images."""
     row = {id: k for k, id in enumerate(network.images.id)}
+    if not row:
+        return {}
     X0, M = network.images.position, np.asarray(many.matrices(network.images.angles))
     found = {}
     for ids, pair in pairs.items():

@@ -5,7 +5,8 @@
 2. With other principal distances, unless the file gives one; those that explain the most matches
 come first.
 
-In both cases, left out photographs are tried again with the adjusted cameras.
+In both cases, left out photographs are tried again with the adjusted cameras. Photographs that
+contradict their pairs are left out, as long as the principal distance is that of the pairs.
 """
 
 import dataclasses
@@ -30,6 +31,8 @@ SHORTEST, LONGEST = 0.35, 12.0
 OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
 """Other principal distances to try, relative to the longer side, unless they differ by less
 than this factor."""
+NEAR = 1.05
+"""Ratio of principal distances below which verified pairs are still right."""
 FEWEST_RAYS = 12
 """Minimum image points of a photograph; of fewer most may be gross errors."""
 LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
@@ -60,7 +63,7 @@ def start_values(
     others = []
     for changed in _with_other_distances(network, guessed):
         try:
-            others.append(_orient(changed, START_TOLERANCE, pairs))
+            others.append(_orient(changed, START_TOLERANCE, {}))
         except NotSolvedError:
             continue
     enough = [one for one in others
@@ -74,9 +77,11 @@ def _orient(network: Network, tolerance: float, pairs: NamedPairs) -> Oriented:
     """Start values, without photographs that contradict their pairs, or are weakly connected to the
     others."""
     found = orient(network, tolerance=tolerance)
-    network, misplaced = found.network, find_misplaced(found.network, pairs)
-    images = {**found.images, **misplaced}
-    network = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
+    misplaced = find_misplaced(found.network, pairs)
+    if misplaced:
+        others = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
+        found = orient(others, tolerance=tolerance)
+    network, images = found.network, {**found.images, **misplaced}
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
         tied = (rays > 1)[network.observations.point]
@@ -138,10 +143,17 @@ def start_again(
     }
     cameras = tuple(better.get(c.id, c) for c in network.cameras)
     try:
-        found = _orient(network.replace(cameras=cameras), START_TOLERANCE, pairs)
+        near = all(_is_near(c, better.get(c.id, c)) for c in network.cameras)
+        found = _orient(network.replace(cameras=cameras), START_TOLERANCE, pairs if near else {})
     except NotSolvedError:
         return None
     return found if len(found.images) < len(oriented.images) else None
+
+
+def _is_near(camera: Camera, other: Camera) -> bool:
+    """Whether relative orientations with one camera also hold with the other."""
+    ratio = camera.parameters.get("fx", 1.0) / other.parameters.get("fx", 1.0)
+    return max(ratio, 1 / ratio) < NEAR
 
 
 def _parameters(result: Adjustment, camera: Camera) -> dict[str, float]:

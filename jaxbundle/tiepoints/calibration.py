@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera
 from jaxbundle.orientation import many
 from jaxbundle.tiepoints.closing import Interior, Oriented, close_rotations, find_loops
@@ -55,8 +54,8 @@ def start_cameras(
         if start.pairs:
             better = _close(better, own, of, features, _choose_loops(found))
             p = better[own[0]].parameters
-            notes.append(f"camera {name}: start values from {count(start.pairs, 'pair')}: principal"
-                         f" distance {p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
+            notes.append(f"camera {name}: start values from matches: principal distance "
+                         f"{p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
         elif not told:
             notes.append(f"camera {name}: the principal distance is a guess: no two of its "
                          "photographs agree on one")  # fmt: skip
@@ -141,14 +140,19 @@ def _choose_pairs(own):
 
 
 def _choose_loops(own: Sequence[Matches]) -> list[Matches]:
-    """The pairs of loops of three photographs, those whose weakest pair has the most matches."""
+    """The pairs of loops of three photographs, those whose weakest pair has the most matches, each
+    next to others."""
     number = {m.images: len(m.rows) for m in own if len(m.rows) >= LEAST}
     loops = find_loops(list(number))
-    weakest = np.array(list(number.values()))[loops].min(1)
-    chosen: dict[int, None] = {}
-    for loop in loops[np.argsort(-weakest, kind="stable")]:
-        if len(chosen) >= LOOP_PAIRS:
+    weakest = np.array(list(number.values()), int)[loops].min(1)
+    loops = loops[np.argsort(-weakest, kind="stable")]
+    pairs = np.array(list(number)).reshape(-1, 2)
+    new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
+    while new.any() and chosen.sum() < LOOP_PAIRS:
+        reached = np.any(np.isin(pairs, pairs[chosen]), axis=1) if chosen.any() else ~chosen
+        next_to = new & np.any(reached[loops], axis=1)
+        if not next_to.any():
             break
-        chosen |= dict.fromkeys(loop.tolist())
-    of_pair = {m.images: m for m in own}
-    return [of_pair[list(number)[k]] for k in sorted(chosen)]
+        first = np.argmax(next_to)
+        chosen[loops[first]], new[first] = True, False
+    return [m for m in own if m.images in set(map(tuple, pairs[chosen].tolist()))]

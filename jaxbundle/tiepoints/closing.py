@@ -6,14 +6,15 @@ photographs i, j, k
 
     M_jk·M_ij·M_ikᵀ = rotation by ω ≠ 0.
 
-Minimised over ln c and K1 is, with ω of all loops,
+The following sum, with ω of all loops, is minimised over ln c and K1,
 
     p·mean ln(1 + (ω/ω₀)²) + ((ln c − ln c₀)/σ_c)² + (K1/σ_K1)²,
 
-where p = pairs − photographs + 1 is the number of independent loops. Loops of wrong pairs do not
-close with any camera, and add a constant. Pairs are oriented robustly with a first camera, and then
-refined with the matches that agree. The sum has local minima: unless most loops close, other first
-principal distances are tried, and pairs are oriented again with the best result.
+where p = pairs − photographs + connected groups of them is the number of independent loops. Loops
+of wrong pairs do not close with any camera, and add a constant. Pairs are oriented robustly with a
+first camera, and then refined with the matches that agree. The sum has local minima: unless most
+loops close, other first principal distances are tried, and pairs are oriented again with the best
+result.
 
 Sweeney, Sattler, Höllerer, Turk and Pollefeys (2015), Optimizing the viewing graph for
 structure-from-motion, do this with fundamental matrices.
@@ -21,6 +22,7 @@ structure-from-motion, do this with fundamental matrices.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,14 +32,14 @@ from jaxbundle.tiepoints.verification import Pair, rotation_angle, turn_pairs
 ANGLE = np.radians(0.3)
 """ω₀, the error of ω of right pairs."""
 SIGMA_C, SIGMA_K1 = 0.25, 0.15
-"""σ of ln c, of the start value, and of K1."""
+"""σ of ln c about the start value, and of K1 about zero."""
 FIRST = (1.0, 1.25, 0.8)
 """First principal distances, relative to the start value."""
 STEP_C, STEP_K1 = 0.1, 0.04
 """First steps of the search, in ln c and K1."""
 LAST_STEP, EVALUATIONS = 0.01, 40
 CLEAR = 0.5
-"""Sum of an independent loop below which no other first principal distance is tried."""
+"""Sum per independent loop below which no other first principal distance is tried."""
 FEWEST = 3
 """Minimum number of independent loops."""
 
@@ -62,25 +64,34 @@ def close_rotations(orient: Callable[[Interior], Oriented], start: Interior) -> 
     for factor in FIRST:
         first = start + [np.log(factor), 0.0]
         one = _search(orient(first), first, start[0])
-        if one is None:
-            return start
-        found.append(one)
-        if one[1] < CLEAR:
-            return one[0]
-    best, _ = min(found, key=lambda one: one[1])
+        if one is not None:
+            if one.sum < CLEAR:
+                return one.interior
+            found.append(one)
+    if not found:
+        return start
+    most = max(one.loops for one in found)
+    best = min((one for one in found if 2 * one.loops > most), key=lambda one: one.sum).interior
     again = _search(orient(best), best, start[0])
-    return best if again is None else again[0]
+    return best if again is None else again.interior
 
 
-def _search(oriented: Oriented, first: Interior, middle: float) -> tuple[Interior, float] | None:
-    """The minimum next to a first interior orientation, and the sum of an independent loop; None
-    with too few loops."""
+class Minimum(NamedTuple):
+    """A minimum, the sum per independent loop, and their number."""
+
+    interior: Interior
+    sum: float
+    loops: int
+
+
+def _search(oriented: Oriented, first: Interior, middle: float) -> Minimum | None:
+    """The minimum next to a first interior orientation; None with too few loops."""
     from scipy.optimize import minimize
 
     pairs = oriented.pairs
     loops = find_loops([pair.images for pair in pairs])
-    independent = len(pairs) - len({k for pair in pairs for k in pair.images}) + 1
-    if not len(loops) or independent < FEWEST:
+    independent = count_independent([pairs[k].images for k in np.unique(loops)])
+    if independent < FEWEST:
         return None
 
     def total(x):
@@ -94,7 +105,21 @@ def _search(oriented: Oriented, first: Interior, middle: float) -> tuple[Interio
     found = minimize(total, first, method="Nelder-Mead", options={
         "initial_simplex": simplex, "xatol": LAST_STEP, "fatol": LAST_STEP, "maxfev": EVALUATIONS,
     })  # fmt: skip
-    return found.x, float(found.fun) / independent
+    return Minimum(found.x, float(found.fun) / independent, independent)
+
+
+def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
+    """The number of independent loops of pairs."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    photographs, ends = np.unique(np.reshape(pairs, (-1, 2)), return_inverse=True)
+    shape = (len(photographs), len(photographs))
+    if not len(pairs):
+        return 0
+    i, j = ends.reshape(-1, 2).T
+    groups, _ = connected_components(coo_array((np.ones(len(i)), (i, j)), shape), directed=False)
+    return len(pairs) - len(photographs) + groups
 
 
 def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:

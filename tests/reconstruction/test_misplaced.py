@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.network.sightings import keep_images
 from jaxbundle.orientation import many
 from jaxbundle.reconstruction.misplaced import find_misplaced
 from jaxbundle.tiepoints.verification import Pair
@@ -60,6 +61,23 @@ def test_single_wrong_pairs_contradict_no_photograph(network, pairs):
     assert find_misplaced(network, {**pairs, first: turned}) == {}
     few = dict(list(pairs.items())[:2])  # two pairs of one image
     assert find_misplaced(moved(network, 0, (9.0, 0, 0)), few) == {}
+
+
+def test_a_partner_with_one_pair_does_not_hide_the_misplaced_one(network, pairs):
+    elsewhere, id = moved(network, 3, (9.0, 0, 0)), network.images.id
+    first = (id[0], id[3])
+    fewer = {first: pairs[first]} | {p: one for p, one in pairs.items() if id[0] not in p}
+    assert list(find_misplaced(elsewhere, fewer)) == [id[3]]
+
+
+def test_if_most_contradict_their_pairs_none_is_chosen(network, pairs):
+    about = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
+    turned = {ids: dataclasses.replace(p, M=about @ p.M) for ids, p in pairs.items()}
+    assert find_misplaced(network, turned) == {}
+
+
+def test_no_images_contradict_nothing(network, pairs):
+    assert find_misplaced(keep_images(network, np.zeros(6, bool)), pairs) == {}
 
 
 def test_the_base_of_a_narrow_pair_or_of_a_rotation_says_nothing(network, pairs):

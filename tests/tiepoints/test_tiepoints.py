@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.tiepoints.calibration import start_cameras
-from jaxbundle.tiepoints.closing import find_loops
+from jaxbundle.tiepoints.closing import Minimum, close_rotations, count_independent, find_loops
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.interior import estimate_interior
 from jaxbundle.tiepoints.loops import split_contradicted
@@ -90,9 +90,29 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
     assert found.parameters["fx"] == found.parameters["fy"] == pytest.approx(F, rel=0.02)
     assert found.parameters["k1"] == pytest.approx(K1, abs=0.03)
     assert any(f"distance {found.parameters['fx']:.0f} px" in note for note in notes)
-    # with a single pair no rotation closes
-    few, _ = start_cameras([camera], [0] * 6, [0], [True], features, matches[:1])
-    assert np.isfinite(few[0].parameters["fx"])
+    # two pairs have no loop: what the coplanarity condition gives stays
+    two = matches[:2]
+    (few,), _ = start_cameras([camera], [0] * 6, [0], [True], features, two)
+    middle = np.array([599.5, 449.5])
+    xy = [tuple(features[k].xy[rows] - middle for k, rows in zip(m.images, m.rows.T)) for m in two]
+    begin = dataclasses.replace(camera, parameters=told | {"cx": 0.0, "cy": 0.0})
+    by_pairs = estimate_interior(begin, xy, known=True).camera.parameters
+    assert few.parameters["fx"] == pytest.approx(by_pairs["fx"], rel=1e-12)
+
+
+def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
+    """And one with few loops, which close by chance, is not taken for the best."""
+    start = np.array([7.0, -0.1])
+    answers = {0.8: None, 1.0: Minimum(start + 0.01, 2.0, 30), 1.25: Minimum(start + 0.3, 0.6, 4)}
+
+    def search(oriented, first, middle):
+        factor = min(answers, key=lambda f: abs(np.log(f) - first[0] + middle))
+        return answers[factor]
+
+    monkeypatch.setattr("jaxbundle.tiepoints.closing._search", search)
+    np.testing.assert_allclose(close_rotations(lambda x: None, start), start + 0.01)
+    answers.update(dict.fromkeys(answers))
+    np.testing.assert_array_equal(close_rotations(lambda x: None, start), start)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, 3.0, np.pi])
@@ -105,6 +125,9 @@ def test_loops_are_three_photographs_with_three_pairs():
     pairs = [(0, 1), (0, 2), (1, 2), (2, 3), (1, 3), (3, 4)]
     loops = [[pairs[k] for k in loop] for loop in find_loops(pairs)]
     assert loops == [[(0, 1), (1, 2), (0, 2)], [(1, 2), (2, 3), (1, 3)]]
+    assert count_independent(pairs) == 2
+    apart = pairs + [(i + 9, j + 9) for i, j in pairs]
+    assert count_independent(apart) == 4 and count_independent([]) == 0
 
 
 def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
