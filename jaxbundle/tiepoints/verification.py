@@ -234,7 +234,7 @@ def _improve(poses, of, xy1, xy2, tolerance, limit):
     if not keys:
         return {}
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
-    weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
+    weights = _used_slots(rows)
     start = [np.stack([poses[k][i] for k in keys]) for i in (0, 1)]
     M, b = many.run_in_lanes(_refine, LANES, *start, filled(xy1), filled(xy2), weights)
     return {k: (M[i], b[i]) for i, k in enumerate(keys) if np.isfinite(M[i]).all()}
@@ -246,7 +246,7 @@ def turn_pairs(
 ) -> Float[np.ndarray, "pairs 3 3"]:
     """M of pairs, refined with their matches at these coordinates, c = 1."""
     rows = [many.spread(len(pair), SLOTS) for pair in pairs]
-    weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
+    weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
@@ -259,6 +259,11 @@ def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
+
+
+def _used_slots(rows) -> Float[np.ndarray, "pairs slots"]:
+    """Weights of the matches of pairs: 1, and 0 in slots that they do not need."""
+    return np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
 
 
 def _fill(a):
@@ -282,7 +287,7 @@ def _kinds(found, xy1, xy2, tolerance):
     if not found:
         return []
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
-    weights = np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
+    weights = _used_slots(rows)
     M, b = (np.stack([f[i] for f in found]) for i in (1, 2))
     angle, turn, plane = many.run_in_lanes(
         _simpler, LANES, M, b, filled(xy1), filled(xy2), weights
