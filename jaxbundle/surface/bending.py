@@ -43,7 +43,17 @@ LARGEST_CORRECTION = 0.5
 """Maximum correction, pixels: larger ones mean that the polynomial does not fit the surface."""
 NEAR, SURE = 1.5, 0.7
 """Maximum shift of a node by least squares matching, pixels, and its minimum ρ."""
+CORRELATED, NODE_SIGMA = 0.3, 0.01
+"""σ of nodes without least squares matching, and σ added to all for the deviation of the surface from
+a polynomial, pixels."""
 NODES_AT_ONCE = 4096
+
+
+class Nodes(NamedTuple):
+    """A guide, and the σ of its good nodes, pixels."""
+
+    guide: Guide
+    sigma: Float[np.ndarray, "r c"]
 
 
 class Bend(NamedTuple):
@@ -54,30 +64,37 @@ class Bend(NamedTuple):
     known: Bool[np.ndarray, " n"]
 
 
-def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
+def bend_at(nodes: Nodes, uv: Float[np.ndarray, "n 2"]) -> Bend:
     """Derivatives of the widest fitting polynomial around the nearest node."""
-    wide, narrow = (_polynomials(guide, uv, reach) for reach in NODE_REACHES)
+    wide, narrow = (_polynomials(nodes, uv, reach) for reach in NODE_REACHES)
     derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
     return Bend(derivatives, wide.known | narrow.known)
 
 
-def _polynomials(guide, uv, reach):
+def _polynomials(nodes, uv, reach):
+    guide = nodes.guide
     columns, rows = guide.q.shape[::-1]
     place = (uv - guide.first) / guide.step
     j, i = (np.clip(np.rint(a).astype(int), 0, n - 1) for a, n in zip(place.T, (columns, rows)))
     k = np.arange(-reach, reach + 1)
     y, x = (a.ravel().astype(float) for a in np.meshgrid(k, k, indexing="ij"))
     A = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
-    fit = np.linalg.pinv(A)
-    padded = np.pad(guide.q, reach, mode="edge")
-    good = np.pad(guide.good, reach)
-    pick = lambda a: np.stack([a[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)], 1)
-    values, there = pick(padded), pick(good)
+    pick = lambda a: np.stack([
+        np.pad(a, reach, mode="edge")[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)
+    ], 1)
+    there = np.pad(guide.good, reach)
+    there = np.stack([there[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)], 1)
+    values = pick(guide.q)
     middle = values[:, len(x) // 2][:, None]
-    p = (values - middle) @ fit.T
-    misfit = np.sqrt(np.mean(((values - middle) - p @ A.T) ** 2, axis=1)) * guide.rate[i, j]
+    values = (values - middle) * guide.rate[i, j][:, None]
+    w = np.where(there, 1 / (pick(nodes.sigma) ** 2 + NODE_SIGMA**2), 0.0)
+    N = np.einsum("nk,ka,kb->nab", w, A, A) + 1e-6 * np.eye(6)
+    p = np.linalg.solve(N, np.einsum("nk,ka->na", w * values, A)[..., None])[..., 0]
+    residual = values - p @ A.T
+    misfit = np.sqrt(np.sum(w * residual**2, 1) / np.maximum(w.sum(1), 1e-12))
     level = guide.step / 4.0
     known = (there.sum(1) >= (1 - MOST_MISSING) * len(x)) & (misfit < MOST_MISFIT * level)
+    p = p / guide.rate[i, j][:, None]
     size = guide.step
     found = p[:, 1:] / np.array([size, size, size**2, size**2, size**2])
     # the slope at the point, not at the node
@@ -87,11 +104,13 @@ def _polynomials(guide, uv, reach):
     return Bend(np.where(known[:, None], found, 0.0), known)
 
 
-def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, half: int) -> Guide:
+def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, half: int) -> Nodes:
     """The guide with good nodes refined by least squares matching in the first of the other images
     that shows them: correlation is not accurate enough for the polynomials."""
     row, column = np.nonzero(guide.good)
     q, left = guide.q.copy(), np.ones(len(row), bool)
+    sigma = np.full(q.shape, CORRELATED)
+    rough = Nodes(guide, sigma)
     uv = np.rint(np.stack([column, row], 1) * guide.step + guide.first)
     for other in others:
         k = np.flatnonzero(left)
@@ -100,7 +119,7 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
         here, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
         # the node is between pixels if the guide ends above the finest level
         shift = uv[k] - (np.stack([column[k], row[k]], 1) * guide.step + guide.first)
-        slope = bend_at(guide, uv[k]).derivatives[:, :2]
+        slope = bend_at(rough, uv[k]).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
         shape = windows(base, other, base.points(uv[k], here), normal)
         ends = here[:, None] * np.array([1.0, 1.0]) + [0.0, 1e-3] / guide.rate[row[k], column[k]][
@@ -116,8 +135,10 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
         moved = k[good]
         step = change[good] / guide.rate[row[moved], column[moved]]
         q[row[moved], column[moved]] = (here - np.sum(slope * shift, 1))[good] + step
+        along = np.einsum("ni,nij,nj->n", rate[good], match.covariance[good], rate[good])
+        sigma[row[moved], column[moved]] = np.sqrt(along) / np.sum(rate[good]**2, 1)
         left[moved] = False
-    return dataclasses.replace(guide, q=q)
+    return Nodes(dataclasses.replace(guide, q=q), sigma)
 
 
 def second_differences(
@@ -169,11 +190,11 @@ def response(
 
 
 def correct_bending(
-    pair: tuple[OrientedImage, OrientedImage], guide: Guide, uv: Float[np.ndarray, "n 2"],
+    pair: tuple[OrientedImage, OrientedImage], nodes: Nodes, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, " n"], match, half: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """Matches, and their covariances, corrected for bending."""
-    bend = bend_at(guide, uv)
+    bend = bend_at(nodes, uv)
     base, other = pair
     second = second_differences(base, other, uv, q, bend)
     good = bend.known & np.isfinite(second).all((1, 2)) & np.isfinite(match.A).all((1, 2))

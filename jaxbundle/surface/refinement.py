@@ -107,7 +107,7 @@ def has_texture(
         a = grey[r[:, :, None], c[:, None]].astype(np.float32)
         gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
         square = (gx * gx + gy * gy) / 4
-        near, far = slice(0, half + 2), slice(half - 1, None)
+        near, far = slice(0, half), slice(half + 1, None)
         sides = square[:, near], square[:, far], square[:, :, near], square[:, :, far]
         least = np.min([side.mean((1, 2)) for side in sides], axis=0)
         with np.errstate(invalid="ignore"):
