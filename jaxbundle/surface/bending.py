@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.measure.least_squares_matching import MatchingStatus
-from jaxbundle.surface.guide import Guide
+from jaxbundle.surface.guide import SPACING, Guide
 from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage
@@ -30,7 +30,7 @@ NODE_REACHES = 4, 2
 nodes, which are those of the matches around it, to an eighth; the narrow one is for surfaces
 that the wide one does not fit."""
 MOST_MISSING = 0.16
-"""Minimum share of valid nodes."""
+"""Maximum share of nodes that were not found."""
 MOST_MISFIT = 0.12
 """Maximum RMS of the nodes relative to the polynomial, pixels of their level."""
 STEP = 4.0
@@ -44,8 +44,8 @@ LARGEST_CORRECTION = 0.5
 NEAR, SURE = 1.5, 0.7
 """Maximum shift of a node by least squares matching, pixels, and its minimum ρ."""
 CORRELATED, NODE_SIGMA = 0.3, 0.01
-"""σ of nodes without least squares matching, and σ added to all for the deviation of the surface from
-a polynomial, pixels."""
+"""σ of nodes without least squares matching; σ added to all nodes. Pixels."""
+TINY = 1e-6
 NODES_AT_ONCE = 4096
 
 
@@ -66,41 +66,40 @@ class Bend(NamedTuple):
 
 def bend_at(nodes: Nodes, uv: Float[np.ndarray, "n 2"]) -> Bend:
     """Derivatives of the widest fitting polynomial around the nearest node."""
-    wide, narrow = (_polynomials(nodes, uv, reach) for reach in NODE_REACHES)
-    derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
-    return Bend(derivatives, wide.known | narrow.known)
-
-
-def _polynomials(nodes, uv, reach):
     guide = nodes.guide
-    columns, rows = guide.q.shape[::-1]
     place = (uv - guide.first) / guide.step
-    j, i = (np.clip(np.rint(a).astype(int), 0, n - 1) for a, n in zip(place.T, (columns, rows)))
+    nearest = np.clip(np.rint(place[:, ::-1]).astype(int), 0, np.array(guide.q.shape) - 1)
+    # many points share a node
+    flat, own = np.unique(np.ravel_multi_index(tuple(nearest.T), guide.q.shape), return_inverse=True)
+    i, j = np.unravel_index(flat, guide.q.shape)
+    wide, narrow = (_polynomials(nodes, i, j, reach) for reach in NODE_REACHES)
+    derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)[own]
+    # the slopes at the point, not at the node
+    du, dv = (place - nearest[:, ::-1]).T * guide.step
+    derivatives[:, 0] += derivatives[:, 2] * du + derivatives[:, 3] * dv
+    derivatives[:, 1] += derivatives[:, 3] * du + derivatives[:, 4] * dv
+    return Bend(derivatives, (wide.known | narrow.known)[own])
+
+
+def _polynomials(nodes, i, j, reach) -> Bend:
+    """Derivatives at the nodes [i, j], of polynomials through `reach` nodes on each side."""
+    guide, size = nodes.guide, nodes.guide.step
     k = np.arange(-reach, reach + 1)
-    y, x = (a.ravel().astype(float) for a in np.meshgrid(k, k, indexing="ij"))
+    y, x = (a.ravel() for a in np.meshgrid(k, k, indexing="ij"))
     A = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
-    pick = lambda a: np.stack([
-        np.pad(a, reach, mode="edge")[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)
-    ], 1)
-    there = np.pad(guide.good, reach)
-    there = np.stack([there[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)], 1)
-    values = pick(guide.q)
-    middle = values[:, len(x) // 2][:, None]
-    values = (values - middle) * guide.rate[i, j][:, None]
-    w = np.where(there, 1 / (pick(nodes.sigma) ** 2 + NODE_SIGMA**2), 0.0)
-    N = np.einsum("nk,ka,kb->nab", w, A, A) + 1e-6 * np.eye(6)
-    p = np.linalg.solve(N, np.einsum("nk,ka->na", w * values, A)[..., None])[..., 0]
-    residual = values - p @ A.T
-    misfit = np.sqrt(np.sum(w * residual**2, 1) / np.maximum(w.sum(1), 1e-12))
-    level = guide.step / 4.0
-    known = (there.sum(1) >= (1 - MOST_MISSING) * len(x)) & (misfit < MOST_MISFIT * level)
-    p = p / guide.rate[i, j][:, None]
-    size = guide.step
-    found = p[:, 1:] / np.array([size, size, size**2, size**2, size**2])
-    # the slope at the point, not at the node
-    du, dv = ((place - np.stack([j, i], 1)) * size).T
-    found[:, 0] += found[:, 2] * du + found[:, 3] * dv
-    found[:, 1] += found[:, 3] * du + found[:, 4] * dv
+    row, column = i[:, None] + y + reach, j[:, None] + x + reach
+    around = lambda a, **how: np.pad(a, reach, **how)[row, column]
+    there = around(guide.good)
+    rate = guide.rate[i, j][:, None]
+    values = (around(guide.q, mode="edge") - guide.q[i, j][:, None]) * rate
+    weight = there / (around(nodes.sigma, mode="edge") ** 2 + NODE_SIGMA**2)
+    N = np.einsum("nk,ka,kb->nab", weight, A, A, optimize=True) + TINY * np.eye(A.shape[1])
+    p = np.linalg.solve(N, ((weight * values) @ A)[..., None])[..., 0]
+    square = np.sum(weight * (values - p @ A.T) ** 2, 1)
+    misfit = np.sqrt(square / np.maximum(weight.sum(1), TINY))
+    known = there.mean(1) >= 1 - MOST_MISSING
+    known &= misfit < MOST_MISFIT * size / SPACING
+    found = p[:, 1:] / rate / np.array([size, size, size**2, size**2, size**2])
     return Bend(np.where(known[:, None], found, 0.0), known)
 
 

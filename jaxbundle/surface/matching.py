@@ -6,9 +6,11 @@
 The residuals across the epipolar lines are errors of the same matching that gives the heights: the
 median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
 multiplied. It includes error sources unknown to the matching, such as small errors of orientation.
-Below 1 it means that the differences of the windows are finer than those that shift them; but
-errors along the epipolar lines may be larger, due to the shape of the surface, so that it
-is used only as far as the scatter of the surface agrees (`scatter.py`).
+Below 1 it means that the differences of the windows are finer than those that shift them. But the
+shape of the surface within the windows shifts all matches of a point along its line of sight, which
+no residual shows. The scatter of the points (`scatter.py`) does: what it has beyond their
+covariances is added, the same for all points in pixels. Without a grid of points the factor is at
+least 1 instead.
 """
 
 import dataclasses
@@ -27,7 +29,7 @@ from jaxbundle.surface.guide import Guide, search
 from jaxbundle.surface.intersection import Intersected, intersect
 from jaxbundle.surface.orientation import orientation_covariance
 from jaxbundle.surface.refinement import has_texture, refine
-from jaxbundle.surface.scatter import scatter_factor
+from jaxbundle.surface.scatter import missing_sigma
 from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
@@ -165,8 +167,9 @@ def _accept(table, X, uv, rhos, settings, lost) -> Matches:
     """Intersect; inconsistent rays are left out, inconsistent points are rejected."""
     found = table.intersect(X)
     factor = variance_factor(found.vtpv, found.redundancy)
-    if factor < 1:
-        factor = min(1.0, max(factor, _scatter(table.views[0], uv, found, settings)))
+    shape = _shape_variance(table, found, factor, settings) if factor < 1 else None
+    if shape is None:
+        factor, shape = max(factor, 1.0), np.zeros_like(found.covariance)
     bad = _misfits(found, factor)
     several = bad & (found.rays > max(settings.least_rays, 2))
     if several.any():
@@ -182,7 +185,7 @@ def _accept(table, X, uv, rhos, settings, lost) -> Matches:
         rho = np.nanmin(np.where(table.used[good][:, 1:], rhos[good], np.nan), axis=1) if (
             good.any()
         ) else np.zeros(0)
-    covariance = factor * found.covariance[good]
+    covariance = factor * found.covariance[good] + shape[good]
     covariance += orientation_covariance(table.views, found.X[good], table.used[good])
     return Matches(
         uv[good], found.X[good], covariance, found.rays[good],
@@ -202,22 +205,37 @@ def variance_factor(
     return float(np.median(vtpv[good] / stats.chi2.median(redundancy[good])))
 
 
-def _scatter(base, uv, found, settings) -> float:
-    """The variance factor of points on a grid by their scatter, 1 if they are not on a grid."""
+def _shape_variance(table, found, factor, settings) -> Float[np.ndarray, "n 3 3"] | None:
+    """The variance along the lines of sight that points on a grid have, by their scatter, beyond
+    the covariances of their matches; None if it is not known."""
     good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
     if good.sum() < BLOCK_SIDE**2:
-        return 1.0
-    X, C, place = found.X[good], found.covariance[good], uv[good].astype(int)
+        return None
+    base, *others = table.views
+    X, place = found.X[good], table.uv[good, 0].astype(int)
     step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
     column, row = ((place - place.min(0)) // step).T
-    q = base.parameter(X)
     d = line_of_sight(base.derivative(X))
-    scale = np.sqrt(np.einsum("ni,nij,nj->n", d, C, d))
-    rate = np.abs(base.parameter(X + scale[:, None] * d) - q)
-    values, sigma = np.full((2, row.max() + 1, column.max() + 1), np.nan)
-    values[row, column], sigma[row, column] = q, rate
+    along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
+    moved = [np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others]
+    pixel = 1 / np.max(np.where(table.used[good, 1:], np.stack(moved, 1), 0), 1)
+    q = base.parameter(X)
+    rate = np.abs(base.parameter(X + along[:, None] * d) - q) / along
+
+    def on_grid(values):
+        grid = np.full((row.max() + 1, column.max() + 1), np.nan)
+        grid[row, column] = values
+        return grid
+
     apart = -(-(2 * settings.fine + 1) // step)
-    return min(scatter_factor(values, sigma, apart, BLOCK_SIDE, SMOOTH), default=1.0)
+    missing = missing_sigma(
+        on_grid(q), on_grid(rate * along), on_grid(rate * pixel), apart, BLOCK_SIDE, SMOOTH
+    )
+    if missing is None:
+        return None
+    C = np.zeros_like(found.covariance)
+    C[good] = ((missing * pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
+    return C
 
 
 def _misfits(found: Intersected, factor: float) -> Bool[np.ndarray, " n"]:

@@ -90,7 +90,8 @@ def has_texture(
     sigma0: Float[np.ndarray, " n"], half: int,
 ) -> Bool[np.ndarray, " n"]:
     """Whether windows have texture on all sides of their points, by the squares of its gradients
-    relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof.
+    relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof. The row
+    and the column of a point belong to no side: the edge itself may be there.
 
     Smoothed noise of variance σ² has σ²/4πs², twice this is σ0²; central differences of it
     have σ²/2 on each axis.

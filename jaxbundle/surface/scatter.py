@@ -10,11 +10,14 @@ are pure noise if the surface is smooth. The variance factor is a quantile of th
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
+from scipy.optimize import brentq
 
 FEWEST_VALUES = 100
 """Minimum values for a factor."""
 MOST_VALUES = 4_000_000
 """Values of a larger grid are sampled, in strips."""
+MOST_MISSING = 1.0
+"""Maximum of what is missing in σ, in the given units."""
 WEIGHTS = 1.0, -3.0, 3.0, -1.0
 
 
@@ -46,6 +49,24 @@ def scatter_factor(
         if full:
             found.append(float(np.quantile(full, quantile)))
     return found
+
+
+def missing_sigma(
+    d: Float[np.ndarray, "rows columns"], sigma: Float[np.ndarray, "rows columns"],
+    unit: Float[np.ndarray, "rows columns"], step: int, side: int, quantile: float,
+) -> float | None:
+    """The s for which the variances σ² + (s·unit)² of values on a grid agree with their scatter; 0
+    if σ² alone is too large, None if no block has enough values."""
+
+    def excess(s):
+        factors = scatter_factor(d, np.hypot(sigma, s * unit), step, side, quantile)
+        return min(factors, default=np.nan) - 1
+
+    if np.isnan(excess(0.0)):
+        return None
+    if excess(0.0) <= 0:
+        return 0.0
+    return float(brentq(excess, 0.0, MOST_MISSING)) if excess(MOST_MISSING) < 0 else MOST_MISSING
 
 
 def _blocks(a, s, step, side):
