@@ -9,8 +9,8 @@ multiplied. It includes error sources unknown to the matching, such as small err
 Below 1 it means that the differences of the windows are finer than those that shift them. But the
 shape of the surface within the windows shifts all matches of a point along its line of sight, which
 no residual shows. The scatter of the points (`scatter.py`) does: what it has beyond their
-covariances is added, the same for all points in pixels. Without a grid of points the factor is at
-least 1 instead.
+covariances is added, the same for all points in pixels. Where it is not known, the factor is at
+least 1.
 """
 
 import dataclasses
@@ -233,6 +233,8 @@ def _shape_variance(table, found, factor, settings) -> Float[np.ndarray, "n 3 3"
     )
     if missing is None:
         return None
+    # what is more than the matches have without a factor is the surface itself
+    missing = min(missing, np.sqrt(1 / factor - 1) * np.median(along / pixel))
     C = np.zeros_like(found.covariance)
     C[good] = ((missing * pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
     return C
