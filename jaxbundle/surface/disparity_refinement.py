@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surface.row_windows import correct
-from jaxbundle.surface.scatter import robust_factor, scatter_factor
+from jaxbundle.surface.scatter import missing_sigma, robust_factor
 from jaxbundle.system.configuration import available_cores
 
 HALF, WIDE = 4, 7
@@ -128,10 +128,15 @@ def _with_windows(left, spline, start, half, wanted):
     with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(refine, corners))
     good = np.isfinite(d)
-    smooth = scatter_factor(np.where(wanted, d, np.nan), sigma, 2 * half + 1, BLOCK_SIDE, SMOOTHEST)
-    factor = max(robust_factor(across[good & wanted]), min(smooth, default=1.0))
+    factor = robust_factor(across[good & wanted])
+    noise = np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
+    d_wanted = np.where(wanted, d, np.nan)
+    missing = missing_sigma(d_wanted, noise, np.ones_like(noise), 2 * half + 1, BLOCK_SIDE, SMOOTHEST)
+    if missing is None:
+        factor, missing = max(factor, 1.0), 0.0
+        noise = np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
     edges = _at_edges(np.where(good, d, 0), good, half)
-    sigma = np.sqrt(factor * sigma**2 + LEAST_SIGMA**2 + edges)
+    sigma = np.sqrt(noise**2 + missing**2 + edges)
     stepped = edges >= STEP**2
     with np.errstate(invalid="ignore"):
         # beside a step the disparities of one side extend to the other

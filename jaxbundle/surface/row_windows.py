@@ -82,6 +82,9 @@ def _correct(left, right, half: int) -> Corrections:
     beyond = 1 + SIGNIFICANT * float(np.sqrt(2 / (number - 1)))
     own = _sum_windows(L * L, inner) / number - (_sum_windows(L, inner) / number) ** 2
     textured &= own > LEAST_CONTRAST**2 + beyond * variance / 2
+    textured &= _least_of_sides(L, half) > variance / 2 * (
+        1 + SIGNIFICANT * float(np.sqrt(2 / (half * (2 * half + 1) - 1)))
+    )
     return Corrections(
         delta, jnp.sqrt(variance * A / determinant),
         epsilon / jnp.sqrt(variance * D / determinant), LR / jnp.sqrt(LL * RR), contrast, textured,
@@ -99,6 +102,23 @@ def _sum_windows(a, half):
     for window in ((side, 1), (1, side)):
         a = lax.reduce_window(a, np.float32(0), lax.add, window, (1, 1), "valid")
     return a
+
+
+def _least_of_sides(a, half):
+    """The least variance of the four sides of each window, without its middle row and column."""
+    rows, columns = a.shape
+    padded = jnp.pad(a, half, mode="reflect")
+    least = jnp.asarray(np.inf, a.dtype)
+    for shape in ((half, 2 * half + 1), (2 * half + 1, half)):
+        number = half * (2 * half + 1)
+        total, square = (
+            lax.reduce_window(x, np.float32(0), lax.add, shape, (1, 1), "valid")
+            for x in (padded, padded * padded)
+        )
+        variance = square / number - (total / number) ** 2
+        far = [variance.shape[0] - rows, variance.shape[1] - columns]
+        least = jnp.minimum(least, jnp.minimum(variance[:rows, :columns], variance[far[0] :, far[1] :]))
+    return least
 
 
 def _gradient(a, axis):
