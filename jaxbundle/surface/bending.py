@@ -70,8 +70,9 @@ def bend_at(nodes: Nodes, uv: Float[np.ndarray, "n 2"]) -> Bend:
     place = (uv - guide.first) / guide.step
     nearest = np.clip(np.rint(place[:, ::-1]).astype(int), 0, np.array(guide.q.shape) - 1)
     # many points share a node
-    flat, own = np.unique(np.ravel_multi_index(tuple(nearest.T), guide.q.shape), return_inverse=True)
-    i, j = np.unravel_index(flat, guide.q.shape)
+    node = np.ravel_multi_index(tuple(nearest.T), guide.q.shape)
+    nodes_used, own = np.unique(node, return_inverse=True)
+    i, j = np.unravel_index(nodes_used, guide.q.shape)
     wide, narrow = (_polynomials(nodes, i, j, reach) for reach in NODE_REACHES)
     derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)[own]
     # the slopes at the point, not at the node

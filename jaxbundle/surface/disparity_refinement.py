@@ -3,9 +3,9 @@
 At each pixel a window follows the disparities found, R(x, y) = right(x − d(x, y), y), and a
 correction is solved for, with a shift ε across the rows (`row_windows`). Rows are aligned, so that
 ε should be 0: ε in units of its σ gives a variance factor (the median of ε²/σ² over that of χ²).
-Third differences of disparities farther apart than a window give another, which includes the effect
-of the window shape; the larger of both is taken. If noise dominates, the step is repeated with
-larger windows, as long as they contain one surface.
+What the scatter of disparities farther apart than a window has beyond that, due to the shape of the
+surface within the windows, is added, the same for all pixels. If noise dominates, the step is
+repeated with larger windows, as long as they contain one surface.
 """
 
 import dataclasses
@@ -42,9 +42,10 @@ LEAST_CORRELATION, SURE = 0.5, 0.9
 """Minimum ρ of a window; and of one beside a step in the surface."""
 LEAST_RATIO = 0.2
 """Minimum ratio of the contrasts of both windows."""
-LEAST_SIGMA, MOST_SIGMA = 0.008, 0.5
-"""σ of a disparity, pixels: added by interpolation and sampling, and the limit above which the
-texture does not determine it."""
+LEAST_SIGMA, MOST_SIGMA = 0.014, 0.5
+"""σ of a disparity, pixels: added by interpolation and sampling (errors that depend on the fraction
+of the disparity are alike over whole surfaces: no scatter shows them), and the limit above which
+the texture does not determine it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,15 +129,9 @@ def _with_windows(left, spline, start, half, wanted):
     with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(refine, corners))
     good = np.isfinite(d)
-    factor = robust_factor(across[good & wanted])
-    noise = np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
-    d_wanted = np.where(wanted, d, np.nan)
-    missing = missing_sigma(d_wanted, noise, np.ones_like(noise), 2 * half + 1, BLOCK_SIDE, SMOOTHEST)
-    if missing is None:
-        factor, missing = max(factor, 1.0), 0.0
-        noise = np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
+    factor, noise = _estimate_noise(np.where(wanted, d, np.nan), sigma, across, half)
     edges = _at_edges(np.where(good, d, 0), good, half)
-    sigma = np.sqrt(noise**2 + missing**2 + edges)
+    sigma = np.sqrt(noise**2 + edges)
     stepped = edges >= STEP**2
     with np.errstate(invalid="ignore"):
         # beside a step the disparities of one side extend to the other
@@ -144,6 +139,17 @@ def _with_windows(left, spline, start, half, wanted):
         good &= sigma < MOST_SIGMA
     keep = lambda a: np.where(good, a, np.nan)
     return Disparities(keep(d), keep(sigma), keep(rho), factor), stepped
+
+
+def _estimate_noise(d, sigma, across, half):
+    """The variance factor, and σ of the disparities d."""
+    factor = robust_factor(across[np.isfinite(d)])
+    noise = np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
+    shape = missing_sigma(d, noise, np.ones_like(noise), 2 * half + 1, BLOCK_SIDE, SMOOTHEST)
+    if shape is not None:
+        return factor, np.hypot(noise, shape)
+    factor = max(factor, 1.0)
+    return factor, np.hypot(np.sqrt(factor) * sigma, LEAST_SIGMA)
 
 
 def _reflect(index, n):

@@ -23,8 +23,9 @@ from jaxbundle.system.programs import compile_once
 MOST_RATIO = 5.0
 """Maximum ratio of the contrasts of two windows that may be alike."""
 INNER, SIGNIFICANT = 2, 3.0
-"""Margin of the window around its middle, which must have texture of its own: variance above that
-of noise by this many σ. Otherwise the window shows the surroundings of its pixel."""
+"""Margin of the window around its middle, which must have texture of its own, as must its sides:
+variance above that of noise by this many σ. Otherwise the window shows the surroundings of its
+pixel, such as the ground beside a roof without texture."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
 LEAST_DETERMINANT = 1e-9
@@ -77,14 +78,12 @@ def _correct(left, right, half: int) -> Corrections:
     rest = jnp.maximum(LL - delta * g[0] - epsilon * g[1] - contrast * g[2], 0)
     variance = rest / (n - 4)
     # half of the variance is the noise of the left image
+    noise = variance / 2
     inner = half // INNER
     number = (2 * inner + 1) ** 2
-    beyond = 1 + SIGNIFICANT * float(np.sqrt(2 / (number - 1)))
     own = _sum_windows(L * L, inner) / number - (_sum_windows(L, inner) / number) ** 2
-    textured &= own > LEAST_CONTRAST**2 + beyond * variance / 2
-    textured &= _least_of_sides(L, half) > variance / 2 * (
-        1 + SIGNIFICANT * float(np.sqrt(2 / (half * (2 * half + 1) - 1)))
-    )
+    textured &= own > LEAST_CONTRAST**2 + _beyond_noise(number) * noise
+    textured &= _least_of_sides(L, half) > _beyond_noise(half * (2 * half + 1)) * noise
     return Corrections(
         delta, jnp.sqrt(variance * A / determinant),
         epsilon / jnp.sqrt(variance * D / determinant), LR / jnp.sqrt(LL * RR), contrast, textured,
@@ -104,21 +103,25 @@ def _sum_windows(a, half):
     return a
 
 
+def _beyond_noise(number):
+    """Ratio of the variance of some grey values to that of noise, above which they have texture."""
+    return 1 + SIGNIFICANT * float(np.sqrt(2 / (number - 1)))
+
+
 def _least_of_sides(a, half):
-    """The least variance of the four sides of each window, without its middle row and column."""
+    """The smallest variance of the four sides of each window, without its middle row and column."""
     rows, columns = a.shape
-    padded = jnp.pad(a, half, mode="reflect")
-    least = jnp.asarray(np.inf, a.dtype)
-    for shape in ((half, 2 * half + 1), (2 * half + 1, half)):
-        number = half * (2 * half + 1)
-        total, square = (
-            lax.reduce_window(x, np.float32(0), lax.add, shape, (1, 1), "valid")
-            for x in (padded, padded * padded)
+    a = jnp.pad(a, half, mode="reflect")
+    found = []
+    for window in ((half, 2 * half + 1), (2 * half + 1, half)):
+        mean, square = (
+            lax.reduce_window(x, np.float32(0), lax.add, window, (1, 1), "valid")
+            / (half * (2 * half + 1))
+            for x in (a, a * a)
         )
-        variance = square / number - (total / number) ** 2
-        far = [variance.shape[0] - rows, variance.shape[1] - columns]
-        least = jnp.minimum(least, jnp.minimum(variance[:rows, :columns], variance[far[0] :, far[1] :]))
-    return least
+        variance = square - mean**2
+        found += [variance[:rows, :columns], variance[-rows:, -columns:]]
+    return jnp.min(jnp.stack(found), axis=0)
 
 
 def _gradient(a, axis):
