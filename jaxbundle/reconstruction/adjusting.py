@@ -41,7 +41,7 @@ undetected ones may distort it."""
 AGREEING_RAY = 0.001
 """Maximum misclosure of an agreeing ray, relative to the image extent."""
 LOSSES = 6
-"""Maximum rounds of excluding points left undetermined by data snooping."""
+"""Maximum rounds of excluding points left undetermined, in one adjustment."""
 MOST_ITERATIONS = 2000
 """Iterations of one adjustment. Two photographs, or many with the same viewing direction, determine
 an unknown camera only weakly, and the search then needs several hundred."""
@@ -81,7 +81,7 @@ def adjust_weighted(
     """
     found, failed = None, None
     try:
-        found = _without_lost(network, kinds, names, significance, tell)
+        found = _weight(network, kinds, names, significance, tell)
         if found.adjustment.converged and (len(network.images) < 3 or not _is_doubtful(found)):
             return found
     except NotSolvedError as error:
@@ -89,9 +89,10 @@ def adjust_weighted(
     solved = found is not None and found.adjustment.converged
     rays = network.observations
     number = np.bincount(rays.point, minlength=len(network.points))
-    clear, kinds = _keep(network, kinds, (number > 2) | ~network.points.has_role("tie"))
+    several = (number > 2) | ~network.points.has_role("tie")
+    clear, kinds = keep_points(network, several), kinds[several[rays.point]]
     try:
-        clearer = _without_lost(clear, kinds, names, significance, tell)
+        clearer = _weight(clear, kinds, names, significance, tell)
     except (InputError, NotSolvedError):
         # a photograph has hardly any of these points, or they do not determine it
         if failed is not None:
@@ -149,22 +150,25 @@ def _count_agreeing(network: Network, clearer: Weighted) -> int:
         return clearer.agreeing
 
 
-def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
-    """As `_weight`, without tie points that gross errors, or the rays left after data snooping,
-    leave undetermined."""
+def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network, np.ndarray]:
+    """The adjustment without tie points that are undetermined, or that gross errors or the rays
+    left after data snooping leave so; the network without them; its rows among those given."""
+    rows = np.arange(len(network.observations))
+    again = lambda: adjust(network, max_iterations=MOST_ITERATIONS, **options)
     for _ in range(LOSSES):
         try:
-            found = _weight(network, kinds, names, significance, tell)
+            result = again()
         except NotSolvedError as error:
             kept = _are_determined(network, error.undetermined)
             if kept.all():
                 raise
         else:
-            kept = _are_determined(network, found.adjustment.undetermined)
+            kept = _are_determined(network, result.undetermined)
             if kept.all():
-                return found
-        network, kinds = _keep(network, kinds, kept)
-    return _weight(network, kinds, names, significance, tell)
+                return result, network, rows
+        rows = rows[kept[network.observations.point]]
+        network = keep_points(network, kept)
+    return again(), network, rows
 
 
 def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:
@@ -174,16 +178,11 @@ def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
 
 
-def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " rays"]]:
-    """The network with only these points, and the kinds of its observations."""
-    return keep_points(network, points), kinds[points[network.observations.point]]
-
-
 def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
-    result = adjust(network, max_iterations=MOST_ITERATIONS)
-    total = np.ones(len(network.observations))
-    given, doubtful = network.observations.sigma, []
+    result, network, kept = _adjust_determined(network)
+    kinds, given = kinds[kept], network.observations.sigma
+    total, doubtful = np.ones(len(kept)), []
     if result.converged:
         (w, r), rows = _of_residuals(result), _rows(result, network)
         total[rows] = _factors(w, r, kinds[rows])
@@ -193,8 +192,10 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     for _ in range(ROUNDS):
         tell("data snooping")
         network = _with_sigma(network, given * total[:, None])
-        result = adjust(network, snooping="pope", significance=significance, doubtful=doubtful,
-                        max_iterations=MOST_ITERATIONS)  # fmt: skip
+        result, network, kept = _adjust_determined(
+            network, snooping="pope", significance=significance, doubtful=doubtful
+        )
+        kinds, given, total = kinds[kept], given[kept], total[kept]
         if not result.converged:
             break
         rows = _rows(result, network)

@@ -22,7 +22,7 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
     attempts = []
     unfinished = adjusting.Weighted(SimpleNamespace(converged=False), {}, 0)
 
-    def without_lost(given, *_):
+    def weight(given, *_):
         attempts.append(len(given.observations))
         if len(attempts) == 2:
             raise InputError("images, row 4: image '4': only 1 point can be used")
@@ -30,7 +30,7 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
             raise NotSolvedError("not solved: the first reason")
         return unfinished
 
-    monkeypatch.setattr(adjusting, "_without_lost", without_lost)
+    monkeypatch.setattr(adjusting, "_weight", weight)
     kinds = np.zeros(len(network.observations), int)
     call = lambda: adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
     if first == "fails":
@@ -53,7 +53,7 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
     )
     results = [result(True), result(confirmed)]
     attempts = iter(results)
-    monkeypatch.setattr(adjusting, "_without_lost", lambda *_: next(attempts))
+    monkeypatch.setattr(adjusting, "_weight", lambda *_: next(attempts))
     monkeypatch.setattr(adjusting, "_count_agreeing", lambda *_: 64)
     kinds = np.zeros(len(network.observations), int)
     call = lambda: adjusting.adjust_weighted(network, kinds, {0: "all"}, 0.001, print)
@@ -72,17 +72,18 @@ def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, h
     lost = network.points.id[5]
     names = (f"X, Y, Z of point {lost}",)
 
-    def weight(given, *_):
+    def adjust(given, **_):
         undetermined = names if lost in given.points.id else ()
         if undetermined and how == "raises":
             raise NotSolvedError("not solved", undetermined)
-        result = SimpleNamespace(converged=not undetermined, undetermined=undetermined)
-        return adjusting.Weighted(result, {}, len(given.points))
+        return SimpleNamespace(converged=not undetermined, undetermined=undetermined)
 
-    monkeypatch.setattr(adjusting, "_weight", weight)
-    kinds = np.zeros(len(network.observations), int)
-    found = adjusting._without_lost(network, kinds, {0: "all"}, 0.001, print)
-    assert found.adjustment.converged and found.agreeing == len(network.points) - 1
+    monkeypatch.setattr(adjusting, "adjust", adjust)
+    result, kept, rows = adjusting._adjust_determined(network)
+    assert result.converged and len(kept.points) == len(network.points) - 1
+    left = np.array(network.points.id)[network.observations.point[rows]]
+    assert list(left) == list(np.array(kept.points.id)[kept.observations.point])
+    assert lost not in left and len(rows) == len(network.observations) - 4
 
 
 def photographs_of_columns(share):
