@@ -247,8 +247,9 @@ def adjust(
         ))  # fmt: skip
         found = Solution(problem, minima[-1].values)
         if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
-            names = ", ".join(undetermined(problem, minima[-1].values)[:8])
-            raise NotSolvedError(f"not solved after a change of weights: {names}")
+            names = undetermined(problem, minima[-1].values)
+            what = ", ".join(names[:8])
+            raise NotSolvedError(f"not solved after a change of weights: {what}", names)
         return found
 
     found, removed, suspects, factors = again(problem, problem.data.start), [], [], {}

@@ -75,6 +75,32 @@ def test_blunders_of_a_trilateration_are_removed(trilateration):
     assert {s.row for s in robust.suspects} == {7, 40}
 
 
+def test_a_row_that_loses_its_only_view_is_excluded():
+    """Of three views of a point, the wrong one is the only one with its height."""
+    random = np.random.default_rng(3)
+    points = places(random)
+    number, lost = len(points), 4
+    plan, side = np.eye(3)[[0, 1]], np.eye(3)[[0, 2]]
+    view = ls.Kind("view", lambda p, s, d: d["M"] @ p + d["t"] * s - d["y"], of=("point", "shift"))
+    point = np.concatenate([np.repeat(np.arange(number), 3), np.delete(np.arange(number), lost)])
+    last = np.arange(len(point)) >= 3 * number
+    M = np.where(((np.arange(len(point)) % 3 == 2) | last)[:, None, None], side, plan)
+    t = last[:, None] * np.array([0.0, 1.0])
+    y = np.einsum("nij,nj->ni", M, points[point]) + 0.7 * t
+    y += SIGMA * random.normal(size=y.shape)
+    y[3 * lost + 2, 0] += 1.0
+    result = ls.adjust(
+        [ls.Table("point", np.zeros((number, 3))), ls.Table("shift", np.zeros(1))],
+        [view((point, np.zeros(len(point), int)), {"M": M, "t": t, "y": y}, sigma=SIGMA)],
+        eliminate="point", snooping="pope",
+    )  # fmt: skip
+    assert result.converged and [r.row for r in result.removed] == [3 * lost + 2]
+    others = np.delete(np.arange(number), lost)
+    assert np.abs(result["point"].value - points)[others].max() < 5 * SIGMA
+    assert result["shift"].value == pytest.approx(0.7, abs=4 * SIGMA / 3)
+    assert result.counts.redundancy == 2 * (len(point) - 3) - 3 * (number - 1) - 1
+
+
 def test_sigma_of_components(trilateration):
     _, start, rows, measured = trilateration
     result = ls.adjust(

@@ -1,6 +1,7 @@
 """Names of unknowns for reports, and the names of undetermined ones."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +75,16 @@ def undetermined(
     share, names = (null**2).sum(1), kept_unknowns(problem)
     order = np.argsort(-share, kind="stable")
     return [str(name_of(problem, *names[i])) for i in order if share[i] > SMALLEST_PART] + rows
+
+
+def eliminated_rows(problem: Problem, names: Sequence[str]) -> list[int]:
+    """The rows of the eliminated table to which unknowns of these names belong."""
+    if problem.plan.eliminated is None or not names:
+        return []
+    table = problem.table(problem.plan.eliminated)
+    row_of = {f"{table.title} {table.label(row)}": row for row in range(table.rows)}
+    owners = {str(name).partition(" of ")[2] for name in names}
+    return [row_of[owner] for owner in owners if owner in row_of]
 
 
 def scaled_system(problem: Problem, values: Values):

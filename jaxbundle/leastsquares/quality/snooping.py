@@ -7,7 +7,8 @@ One blunder affects the residuals of its neighbours. So only observations that c
 other are removed together (`separation.py`): of every eliminated row only the worst, of a kept row
 only those that stay significant whatever the influence of the worse ones, and only those at least
 half as bad as the worst of all. Observations without an eliminated row, or with residuals tested
-individually, are removed alone. An eliminated row left with too few residuals is excluded too.
+individually, are removed alone. An eliminated row left with too few residuals is excluded too, as
+is one that the others leave undetermined: the point of two rays that are nearly parallel.
 
 If observations of a row are inseparable, as the two of a two-ray point, nothing decides which is
 wrong: when no others are left, all of them are removed and listed as one ("either of").
@@ -25,10 +26,12 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import number, one_of
 from jaxbundle.choices import TESTS
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.equations.separation import choose_together, find_alternatives
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
+from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
 
 REMOVED_TOGETHER = 0.5
@@ -109,9 +112,9 @@ def snoop(
     """
     check_test(test, significance)
     whole, removed, returned = found.problem, [*doubtful], set()
-    touched = _Touched(whole)
+    touched, lost = _Touched(whole), []
     if removed:
-        found = adjust_from(without(whole, removed), found.values)
+        found = _solve(whole, removed, lost, found.values, adjust_from)
     while found.problem.counts.redundancy >= 2:
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
@@ -130,10 +133,26 @@ def snoop(
                 break
             returned |= passing
             removed = kept
-        found = readjust(without(whole, removed), found.values, adjust_from)
+        again = lambda problem, values: readjust(problem, values, adjust_from)
+        found = _solve(whole, removed, lost, found.values, again)
     if doubtful:
         removed = list(_test(whole, found, removed))
-    return adjust_from(found.problem, found.values) if removed else found, removed
+    if removed:
+        found = _solve(whole, removed, lost, found.values, adjust_from)
+    return found, removed
+
+
+def _solve(whole: Problem, removed, lost: list[int], values, adjust_from: Adjust) -> Solution:
+    """The solution without removed observations; eliminated rows that the others leave undetermined
+    are appended to `lost` and excluded."""
+    while True:
+        try:
+            return adjust_from(without(whole, removed, lost), values)
+        except NotSolvedError as error:
+            more = set(eliminated_rows(whole, error.undetermined)) - {*lost}
+            if not more:
+                raise
+            lost += sorted(more)
 
 
 class _Touched:
@@ -294,9 +313,9 @@ def _finite(tests) -> Float[np.ndarray, "..."]:
     return np.where(np.isfinite(tests), tests, 0.0)
 
 
-def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
-    """The problem with the weights of removed observations set to zero; eliminated rows left with
-    too few residuals are excluded."""
+def without(problem: Problem, removed: Sequence[Removed], lost: Sequence[int] = ()) -> Problem:
+    """The problem with the weights of removed observations set to zero; `lost` eliminated rows, and
+    those left with too few residuals, are excluded."""
     weight = [np.array(w) for w in problem.data.weight]
     for r in removed:
         weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0
@@ -308,7 +327,7 @@ def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
             rows = (np.asarray(problem.weights(o, weight[o])) > 0).sum(1)
             np.add.at(left, own[own >= 0], rows[own >= 0])
         changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
-        lone = [row for row in sorted(changed) if left[row] < width]
+        lone = sorted({*lost} | {row for row in changed if left[row] < width})
         for o, own in touched.own.items():
             weight[o][np.isin(own, lone)] = 0.0
     data = dataclasses.replace(problem.data, weight=tuple(weight))
