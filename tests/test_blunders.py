@@ -195,6 +195,8 @@ def test_either_of_two_rays(network):
     assert all(f"point {point} in image {image}" in removed.name for image in images)
     assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
     assert "either of" in text(found) and "does not show which" in text(found)
+    assert f"do not determine them: {point}." in text(found)
+    assert np.isnan([found.points[name][62] for name in ("X", "sX")]).all()
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 

@@ -90,6 +90,17 @@ class Problem:
         lengths = self.layout.lengths
         return np.zeros(len(self.network.points), bool) if lengths is None else lengths > 0
 
+    @property
+    def excluded(self) -> Bool[np.ndarray, " points"]:
+        """Which tie points data snooping left with too few rays, or with rays that do not determine
+        them."""
+        rays = np.bincount(
+            self.point[(np.asarray(self.data.image_weight) > 0).any(1)],
+            minlength=len(self.network.points),
+        )
+        held = ~self.system.table("point").free.any(1)
+        return self.network.points.has_role("tie") & held & (rays == 0)
+
     def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
         """The parameters free in any camera of the model, and which of them are free in this
         camera."""

@@ -87,6 +87,7 @@ def minimise_with_infinity(
         if there.any():
             outward = _are_pulled_outward(problem, start)
             there &= np.where(held, outward | (released >= MOST_RELEASES), outward)
+            there &= ~problem.excluded
         released += held & ~there
         changed = (there != held).any()
         if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
@@ -157,12 +158,13 @@ def at_infinity(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]
 
 def _held(problem: Problem) -> Bool[np.ndarray, " points"]:
     """Which points at any distance are held at infinity."""
-    return problem.at_any_distance & (problem.system.table("point").free[:, 2] == 0)
+    held = problem.system.table("point").free[:, 2] == 0
+    return problem.at_any_distance & ~problem.excluded & held
 
 
 def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
     """These points held at infinity, the others not."""
-    start, far = problem.data.start, problem.at_any_distance
+    start, far = problem.data.start, problem.at_any_distance & ~problem.excluded
     point = np.where(held[:, None], np.asarray(values.point), np.asarray(start.point))
     problem = problem.with_data(
         dataclasses.replace(problem.data, start=dataclasses.replace(start, point=point))

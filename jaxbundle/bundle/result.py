@@ -12,7 +12,7 @@ from os import PathLike
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle import plotting, report
 from jaxbundle.adjustment.problem import Problem
@@ -319,20 +319,24 @@ class Adjustment:
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:
-        """X, Y, Z in the object unit; NaN at infinity."""
-        return self._unless_at_infinity(np.asarray(self.values.point) + self.problem.origin)
+        """X, Y, Z in the object unit; NaN at infinity, and if excluded by data snooping."""
+        return self._where_known(np.asarray(self.values.point) + self.problem.origin)
 
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
-        """Marginal covariance of every point; zero where it is fixed, NaN at infinity."""
-        return self._unless_at_infinity(self.sigma0**2 * self.cofactors.point_cofactors)
+        """Marginal covariance of every point; zero where it is fixed, NaN without coordinates."""
+        return self._where_known(self.sigma0**2 * self.cofactors.point_cofactors)
 
-    def _unless_at_infinity(self, of_points):
-        lengths = self.problem.layout.lengths
-        if lengths is None:
-            return of_points
-        there = is_at_infinity(np.asarray(self.values.point), lengths)
-        return np.where(there.reshape(-1, *(1,) * (of_points.ndim - 1)), np.nan, of_points)
+    def _where_known(self, of_points):
+        lengths, unknown = self.problem.layout.lengths, self.problem.excluded
+        if lengths is not None:
+            unknown = unknown | is_at_infinity(np.asarray(self.values.point), lengths)
+        return np.where(unknown.reshape(-1, *(1,) * (of_points.ndim - 1)), np.nan, of_points)
+
+    @functools.cached_property
+    def located(self) -> Bool[np.ndarray, " points"]:
+        """Which points are neither at any distance nor excluded by data snooping."""
+        return ~(self.problem.at_any_distance | self.problem.excluded)
 
     @functools.cached_property
     def far_points(self) -> FarPoints | None:

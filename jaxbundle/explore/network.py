@@ -141,7 +141,7 @@ class NetworkView:
         """M that keeps the image of the centre of the station's points, by the smallest
         rotation."""
         problem = self.problem
-        seen = problem.point[(problem.image == row) & ~problem.at_any_distance[problem.point]]
+        seen = problem.point[(problem.image == row) & self.adjustment.located[problem.point]]
         given = self.adjustment.image_values[row]
         M = np.asarray(matrix_from_quaternion(self.adjustment.values.rotation[row]))
         if not len(seen):
@@ -215,7 +215,7 @@ class NetworkView:
         from jaxbundle.plotting.views import camera_pyramids, pyramid_size
 
         centres = self.adjustment.image_values[:, :3]
-        near = self.adjustment.point_values[~self.problem.at_any_distance]
+        near = self.adjustment.point_values[self.adjustment.located]
         _, size = extent(np.concatenate([near, centres]))
         pyramids = camera_pyramids(self.adjustment, pyramid_size(centres, size))
         M = np.asarray(jax.vmap(matrix_from_quaternion)(self.adjustment.values.rotation))
@@ -251,7 +251,7 @@ class NetworkView:
 
     def _compare(self, moves: list[Moved], before: Precision, after: Precision) -> str:
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
-        near = ~self.problem.at_any_distance & (before.points > 0).any(1)
+        near = self.adjustment.located & (before.points > 0).any(1)
         root = lambda s: np.sqrt(np.mean(s[near] ** 2, 0))
         rows = [
             (f"σ{axis} of the points, RMS [{unit}]", a, b)

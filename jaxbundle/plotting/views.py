@@ -190,7 +190,7 @@ def _neighbour(places, most: int = 400) -> float:
 def _points(adjustment):
     """Ids, roles and coordinates, including check points; without points at any distance."""
     table = adjustment.points
-    there = ~adjustment.problem.at_any_distance
+    there = adjustment.located
     id, role, xyz = table["id"][there], table["role"][there], adjustment.point_values[there]
     checks = adjustment.check_points
     if checks is not None:
@@ -209,7 +209,7 @@ def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
     """Closed polygons [points, corners, 2] of the ellipses of X and Y of the estimated points."""
     covariance = adjustment.point_covariance[:, :2, :2]
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    there = ~adjustment.problem.at_any_distance & np.isfinite(covariance).all((1, 2))
+    there = adjustment.located & np.isfinite(covariance).all((1, 2))
     there &= (np.trace(covariance, axis1=1, axis2=2) > 0)
     square, direction = np.linalg.eigh(covariance[there])
     t = np.linspace(0, 2 * np.pi, corners)
@@ -222,7 +222,7 @@ def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
     """The number of points with an error ellipse of X and Y, and the exaggeration for
     a network of this size, so that they are visible and comparable."""
     covariance = adjustment.point_covariance[:, :2, :2]
-    there = ~adjustment.problem.at_any_distance
+    there = adjustment.located
     large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[there]
     large = large[np.isfinite(large) & (large > 0)]
     if not len(large):

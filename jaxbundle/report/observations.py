@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, tau_quantile
-from jaxbundle.network.columns import count
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.report.head import span
 from jaxbundle.report.layout import (
     bar,
@@ -188,7 +188,13 @@ def removals(adjustment) -> list[str]:
         if any(item.others for item in adjustment.removed):
             lines += paragraph(
                 "Either of: one of these rays is wrong, but the point does not show which, "
-                "and none of them is used; a tie point left with fewer than two rays is not used."
+                "and none of them is used."
+            )
+        excluded = np.flatnonzero(adjustment.problem.excluded)
+        if len(excluded):
+            points = list_some((adjustment.network.points.id[p] for p in excluded), 20, clean)
+            lines += paragraph(
+                f"Without coordinates, since the remaining rays do not determine them: {points}."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)

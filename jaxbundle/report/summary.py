@@ -96,7 +96,7 @@ def _points(adjustment) -> str:
     parts = []
     for axis in "XYZ":
         sigma = adjustment.points[f"s{axis}"]
-        sigma = sigma[np.isfinite(sigma) & (sigma > 0) & ~adjustment.problem.at_any_distance]
+        sigma = sigma[np.isfinite(sigma) & (sigma > 0) & adjustment.located]
         if len(sigma):
             rms, most = np.sqrt((sigma**2).mean()), sigma.max()
             parts.append(f"σ{axis} {significant(rms)} (max {significant(most)})")

@@ -181,7 +181,7 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
     free = adjustment.problem.system.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
-    free &= ~adjustment.problem.at_any_distance[:, None]
+    free &= adjustment.located[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
     columns = [sigma[free[:, i], i] for i in range(3)]

@@ -46,9 +46,9 @@ class FarPoints:
 def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
     """The points at any distance of a solution; None if there are none."""
     problem = inspection.problem
-    if not problem.at_any_distance.any():
+    rows = np.flatnonzero(problem.at_any_distance & ~problem.excluded)
+    if not len(rows):
         return None
-    rows = np.flatnonzero(problem.at_any_distance)
     X, s = np.asarray(inspection.adjusted.point)[rows], present(problem.layout.lengths)[rows]
     across, along = shares(X, s)
     Q = sigma0**2 * np.asarray(inspection.solution.cofactor("point"))[rows]

@@ -266,6 +266,26 @@ def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
     )
 
 
+def test_a_point_of_the_horizon_without_good_rays_is_excluded(horizon):
+    """Two rays that contradict each other across their base: neither is used, nor their point."""
+    network, _, result = horizon
+    rays, spoilt = network.observations, NEAR + 1
+    pair = np.flatnonzero(rays.point == spoilt)[[0, 3]]
+    xy = rays.xy.copy()
+    xy[pair[0], 1] += 0.03
+    kept = (rays.point != spoilt) | np.isin(np.arange(len(rays)), pair)
+    rays = dataclasses.replace(rays, xy=xy).take(kept)
+    found = jaxbundle.adjust(network.replace(observations=rays), snooping="pope")
+    (removed,) = found.removed
+    assert removed.name.startswith("either of ") and len(removed.rows) == 2
+    excluded = network.points.id[spoilt]
+    assert found.converged and {*result.far_points.id} - {*found.far_points.id} == {excluded}
+    assert np.isnan(found.point_values[spoilt]).all()
+    np.testing.assert_allclose(
+        found.camera_parameters("cam")["c"], result.camera_parameters("cam")["c"], atol=3e-3
+    )
+
+
 def test_start_values_of_a_horizon_are_found(horizon):
     """From image coordinates and one distance alone; most of the rays do not intersect."""
     network, _, result = horizon

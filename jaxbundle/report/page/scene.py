@@ -21,7 +21,7 @@ def describe_network(adjustment) -> dict:
     stations are too wide to be drawn with it, and the pyramid of every image (projection centre and
     four corners, relative to the centre)."""
     centres = adjustment.image_values[:, :3]
-    near = adjustment.point_values[~adjustment.problem.at_any_distance]
+    near = adjustment.point_values[adjustment.located]
     centre, size = extent(np.concatenate([near, centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
     number, factor = ellipse_factor(adjustment, size)

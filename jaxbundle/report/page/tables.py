@@ -82,7 +82,7 @@ def points(adjustment) -> Columns:
         | {
             "rays": Column(found["rays"], "rays"),
             "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
-            "near": Column((~adjustment.problem.at_any_distance).astype(int)),
+            "near": Column(adjustment.located.astype(int)),
         }
         | _covariance(adjustment.point_covariance)
     )
