@@ -1,6 +1,7 @@
 """Blunders in a network: data snooping by removal and return, robust estimation by weights."""
 
 import dataclasses
+import json
 import re
 
 import equinox as eqx
@@ -10,18 +11,20 @@ import pytest
 from scipy import integrate
 
 import jaxbundle
-from jaxbundle import Camera, InputError
+from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.bundle import far_points
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.minimum import minimise
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.choices import ESTIMATORS
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.io.results.result_json import result_dict
+from jaxbundle.io import adjusted_network
+from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.leastsquares.quality.snooping import Removed, _passing, _Touched, _worst, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.network import Distances
 from jaxbundle.report import text
 from jaxbundle.statistics.inspection import Inspection
 
@@ -196,8 +199,39 @@ def test_either_of_two_rays(network):
     assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
     assert "either of" in text(found) and "does not show which" in text(found)
     assert f"do not determine them: {point}." in text(found)
-    assert np.isnan([found.points[name][62] for name in ("X", "sX")]).all()
+    assert np.isnan([found.points[name][62] for name in ("X", "sX", "rms")]).all()
+    written = json.loads("".join(result_text(found)))["points"][point]
+    assert written["X"] == {"value": None, "sigma": None}
+    assert point not in adjusted_network(found).points.id
+    with pytest.raises((InputError, KeyError), match="excluded by data snooping"):
+        found.covariance(("point", point, "Z"))
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
+
+
+@pytest.mark.parametrize("role", ["control", "tie"])
+def test_points_without_good_rays_and_other_observations(network, role):
+    """A height alone does not locate a point without rays; a distance to it keeps it."""
+    rays, points = network.observations, network.points
+    pair = np.flatnonzero(rays.point == 62)[[0, 3]]
+    xy = rays.xy.copy()
+    xy[pair[0], 1] += 30 * SIGMA
+    kept = (rays.point != 62) | np.isin(np.arange(len(rays)), pair)
+    spoilt = network.replace(observations=dataclasses.replace(rays, xy=xy).take(kept))
+    if role == "control":
+        sigma, roles = points.sigma.copy(), list(points.role)
+        sigma[[0, 4, 20]], sigma[62] = 0.01, [np.inf, np.inf, 0.01]
+        for k in (0, 4, 20, 62):
+            roles[k] = "control"
+        spoilt = spoilt.replace(points=dataclasses.replace(points, sigma=sigma, role=tuple(roles)))
+        found = adjust(spoilt, snooping="pope")
+        assert found.converged and np.isnan(found.point_values[62]).all()
+    else:
+        X = points.position
+        ends = np.array([[62, 0]])
+        length = np.linalg.norm(X[62] - X[0], keepdims=True)
+        spoilt = spoilt.replace(distances=Distances(ends, length, np.array([0.01])))
+        with pytest.raises(NotSolvedError, match="no longer determined"):
+            adjust(spoilt, snooping="pope")
 
 
 def test_rays_that_cannot_mask_each_other_go_together(network):

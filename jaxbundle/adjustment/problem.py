@@ -92,14 +92,14 @@ class Problem:
 
     @property
     def excluded(self) -> Bool[np.ndarray, " points"]:
-        """Which tie points data snooping left with too few rays, or with rays that do not determine
+        """Which points data snooping left with too few rays, or with rays that do not determine
         them."""
         rays = np.bincount(
             self.point[(np.asarray(self.data.image_weight) > 0).any(1)],
             minlength=len(self.network.points),
         )
         held = ~self.system.table("point").free.any(1)
-        return self.network.points.has_role("tie") & held & (rays == 0)
+        return ~self.network.points.has_role("fixed") & held & (rays == 0)
 
     def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
         """The parameters free in any camera of the model, and which of them are free in this

@@ -46,7 +46,7 @@ def find_unknowns(problem: Problem, names: Sequence[tuple[str, str, str]]) -> li
 def value_of(problem: Problem, name: Name, values: Values):
     """The unknown with this name; exterior orientation as X0, Y0, Z0, ω, φ, κ (radians).
 
-    **Raises:** `KeyError` for an unknown name."""
+    **Raises:** `KeyError` for an unknown name, or an excluded point."""
     network = problem.network
     if name.kind == "camera":
         c = place_of(name.id, [camera.id for camera in network.cameras], "camera")
@@ -59,6 +59,8 @@ def value_of(problem: Problem, name: Name, values: Values):
         return pose[place_of(name.parameter, EXTERIOR, "image parameter")]
     if name.kind == "point":
         p = place_of(name.id, network.points.id, "point")
+        if problem.excluded[p]:
+            raise KeyError(f"point {name.id} was excluded by data snooping: it has no coordinates")
         return values.point[p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
     raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
 

@@ -12,7 +12,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
-from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.quality.names import undetermined, undetermined_rows
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import list_some
@@ -59,6 +59,9 @@ def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
     system = problem.system
     if system.plan.reduction == "dense" and system.reduced_size <= EIGENVECTORS:
         return undetermined(system, problem.layout.tables(_last(problem, minimum)))
+    rows = undetermined_rows(system, problem.layout.tables(_last(problem, minimum)))
+    if rows:
+        return rows
     singular = bool(converged(int(minimum.termination))) or int(minimum.termination) == SINGULAR
     return list(weakness_without_solution(problem, minimum).unknowns) if singular else []
 

@@ -124,7 +124,7 @@ def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
     number = np.bincount(of_ray, used.sum(1), minlength=n)
     return {
         "rays": np.bincount(of_ray, used.any(1), minlength=n).astype(int),
-        "rms": np.sqrt(squares / np.maximum(number, 1)),
+        "rms": np.sqrt(np.where(number > 0, squares, np.nan) / np.maximum(number, 1)),
     }
 
 

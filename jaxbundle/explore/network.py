@@ -229,7 +229,8 @@ class NetworkView:
         """Messages about image points of moved stations outside the image or behind the camera."""
         problem, lines = self.problem, []
         for moved in moves:
-            rays = np.flatnonzero(problem.image == moved.row)
+            used = (np.asarray(problem.data.image_weight) > 0).any(1)
+            rays = np.flatnonzero(used & (problem.image == moved.row))
             camera = problem.network.cameras[problem.network.images.camera[moved.row]]
             model = get_model(camera.model)
             low, high, known = image_frame(self.adjustment, camera.id)

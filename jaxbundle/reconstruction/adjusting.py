@@ -151,8 +151,8 @@ def _count_agreeing(network: Network, clearer: Weighted) -> int:
 
 
 def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network, np.ndarray]:
-    """The adjustment without tie points that are undetermined, or that gross errors or the rays
-    left after data snooping leave so; the network without them; its rows among those given."""
+    """The adjustment without undetermined tie points; the network without them; its rows among
+    those given."""
     rows = np.arange(len(network.observations))
     again = lambda: adjust(network, max_iterations=MOST_ITERATIONS, **options)
     for _ in range(LOSSES):
@@ -173,7 +173,7 @@ def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network
 
 def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
-    lost = {name.rpartition(" ")[2] for name in undetermined}
+    lost = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
 
@@ -207,7 +207,8 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
         doubtful = _name(result, ~used.any(1))
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
-    return Weighted(result, kept, len(result.network.observations) - len(result.removed))
+    used = np.asarray(result.problem.data.image_weight) > 0
+    return Weighted(result, kept, int(used.any(1).sum()))
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:

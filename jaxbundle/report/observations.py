@@ -194,7 +194,8 @@ def removals(adjustment) -> list[str]:
         if len(excluded):
             points = list_some((adjustment.network.points.id[p] for p in excluded), 20, clean)
             lines += paragraph(
-                f"Without coordinates, since the remaining rays do not determine them: {points}."
+                "Points without coordinates, since their remaining rays do not determine them: "
+                f"{points}."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)

@@ -218,7 +218,7 @@ def _rays(rays) -> list[str]:
     groups = [(int(n), int(n)) for n in seen]
     if len(groups) > 12:
         edges = np.unique(np.round(np.geomspace(max(seen[0], 1), seen[-1] + 1, 11)).astype(int))
-        groups = [(int(a), int(b) - 1) for a, b in zip(edges, edges[1:])]
+        groups = [(0, 0), *((int(a), int(b) - 1) for a, b in zip(edges, edges[1:]))]
     counted = [int(((rays >= a) & (rays <= b)).sum()) for a, b in groups]
     rows = [
         (str(a) if a == b else f"{a}–{b}", str(n), bar(n, max(counted)))

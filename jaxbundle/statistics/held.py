@@ -111,7 +111,9 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     """Table, row, column and name of every held quantity of this name."""
     text, estimated = ":".join((kind, id, parameter)), []
     tables = _tables_of(problem, kind)
-    ids = [table.label(row) for table in tables for row in range(table.rows)]
+    points = np.flatnonzero(~problem.excluded).tolist()
+    rows_of = lambda table: points if table.name == "point" else range(table.rows)
+    ids = [table.label(row) for table in tables for row in rows_of(table)]
     if id != WILDCARD and id not in ids:
         raise InputError(
             f"{text}: there is no {kind} {id!r}{did_you_mean(id, ids, listing=len(ids) <= 20)}"
@@ -120,7 +122,7 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     for table in tables:
         names = _names(problem, table)
         known += [name for name in names if name not in known]
-        for row in range(table.rows):
+        for row in rows_of(table):
             if id not in (WILDCARD, table.label(row)):
                 continue
             for column, of in enumerate(names):

@@ -110,7 +110,7 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
     row, column = np.nonzero(guide.good)
     q, left = guide.q.copy(), np.ones(len(row), bool)
     sigma = np.full(q.shape, CORRELATED)
-    rough = Nodes(guide, sigma)
+    rough = Nodes(guide, sigma.copy())
     uv = np.rint(np.stack([column, row], 1) * guide.step + guide.first)
     for other in others:
         k = np.flatnonzero(left)

@@ -50,7 +50,8 @@ the texture does not determine it."""
 
 @dataclasses.dataclass(frozen=True)
 class Disparities:
-    """Disparity, its σ (times the root of `factor`), ρ of the window; NaN: none."""
+    """Disparity, its σ, ρ of the window; NaN: none. `factor`: of the variances of matching, which
+    σ contains."""
 
     disparity: Float[np.ndarray, "rows columns"]
     sigma: Float[np.ndarray, "rows columns"]

@@ -16,8 +16,8 @@ FEWEST_VALUES = 100
 """Minimum values for a factor."""
 MOST_VALUES = 4_000_000
 """Values of a larger grid are sampled, in strips."""
-MOST_MISSING = 1.0
-"""Maximum of what is missing in σ, in the given units."""
+LARGEST_ADDED = 1.0
+"""Largest s added to σ, in the given units."""
 WEIGHTS = 1.0, -3.0, 3.0, -1.0
 
 
@@ -56,22 +56,25 @@ def missing_sigma(
     unit: Float[np.ndarray, "rows columns"], step: int, side: int, quantile: float,
 ) -> float | None:
     """The s for which the variances σ² + (s·unit)² of values on a grid agree with their scatter; 0
-    if σ² alone is too large, None if no block has enough values."""
+    if σ² alone is enough, None if no block has enough values."""
 
     def excess(s):
         factors = scatter_factor(d, np.hypot(sigma, s * unit), step, side, quantile)
         return min(factors, default=np.nan) - 1
 
-    if np.isnan(excess(0.0)):
+    without = excess(0.0)
+    if np.isnan(without):
         return None
-    if excess(0.0) <= 0:
+    if without <= 0:
         return 0.0
-    return float(brentq(excess, 0.0, MOST_MISSING)) if excess(MOST_MISSING) < 0 else MOST_MISSING
+    if excess(LARGEST_ADDED) >= 0:
+        return LARGEST_ADDED
+    return float(brentq(excess, 0.0, LARGEST_ADDED))
 
 
 def _blocks(a, s, step, side):
-    """Third differences over their σ along some rows, in blocks of `side` columns of which a third
-    or more is known."""
+    """Third differences over their σ along some rows, in blocks of `side` columns with enough known
+    values."""
     n = a.shape[1] - 3 * step
     parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(WEIGHTS)]
     difference = sum(w * a[:, part] for w, part in parts)
@@ -79,4 +82,4 @@ def _blocks(a, s, step, side):
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = difference / np.sqrt(square)
     blocks = (ratio[:, first : first + side] for first in range(0, n, side))
-    return [b for b in blocks if np.isfinite(b).sum() > side**2 / 3]
+    return [b for b in blocks if np.isfinite(b).sum() > max(FEWEST_VALUES, side**2 / 3)]

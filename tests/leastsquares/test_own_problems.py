@@ -9,6 +9,7 @@ import pytest
 from jaxbundle import NotSolvedError
 from jaxbundle import leastsquares as ls
 from jaxbundle.geometry import quaternion_from_rotation_vector
+from jaxbundle.leastsquares.quality.names import undetermined_rows
 
 SIGMA = 0.002
 RANGE = ls.Kind("distance", lambda a, b, d: jnp.linalg.norm(a - b) - d, of=("point", "point"))
@@ -89,11 +90,19 @@ def test_a_row_that_loses_its_only_view_is_excluded():
     y = np.einsum("nij,nj->ni", M, points[point]) + 0.7 * t
     y += SIGMA * random.normal(size=y.shape)
     y[3 * lost + 2, 0] += 1.0
-    result = ls.adjust(
-        [ls.Table("point", np.zeros((number, 3))), ls.Table("shift", np.zeros(1))],
-        [view((point, np.zeros(len(point), int)), {"M": M, "t": t, "y": y}, sigma=SIGMA)],
-        eliminate="point", snooping="pope",
-    )  # fmt: skip
+
+    def adjusted(rows, **options):
+        return ls.adjust(
+            [ls.Table("point", np.zeros((number, 3))), ls.Table("shift", np.zeros(1))],
+            [view((point[rows], np.zeros(rows.sum(), int)),
+                  {"M": M[rows], "t": t[rows], "y": y[rows]}, sigma=SIGMA)],
+            eliminate="point", **options,
+        )  # fmt: skip
+
+    unseen = adjusted(np.arange(len(point)) != 3 * lost + 2)
+    named = undetermined_rows(unseen.problem, unseen.minimum.values)
+    assert named == ["1, 2, 3 of point 5"] and named == [*unseen.undetermined]
+    result = adjusted(np.ones(len(point), bool), snooping="pope")
     assert result.converged and [r.row for r in result.removed] == [3 * lost + 2]
     others = np.delete(np.arange(number), lost)
     assert np.abs(result["point"].value - points)[others].max() < 5 * SIGMA

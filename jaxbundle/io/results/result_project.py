@@ -18,7 +18,7 @@ def adjusted_network(adjustment) -> Network:
     twice. Only priors required by a camera model, such as a grid of splines, stay: without them it
     has no solution. So the datum is inner; a second adjustment changes nothing. σ of image
     coordinates are the given ones, even if variance components were estimated. Check points are
-    left out, and so are points at infinity, which have no coordinates.
+    left out, and so are points without coordinates: at infinity, or excluded by data snooping.
     """
     problem = adjustment.problem
     network = problem.network

@@ -64,7 +64,7 @@ def undetermined(
     """The unknowns that the observations do not determine, most affected first. `threshold`: of the
     scaled eigenvalues; a larger one also finds unknowns that are hardly separated."""
     S, V, G = scaled_system(problem, values)
-    rows = [] if V is None else _undetermined_rows(problem, V)
+    rows = [] if V is None else _name_singular(problem, V)
     if not np.isfinite(S).all():
         return rows
     if G.shape[1]:  # The datum is fixed separately.
@@ -77,12 +77,28 @@ def undetermined(
     return [str(name_of(problem, *names[i])) for i in order if share[i] > SMALLEST_PART] + rows
 
 
+def undetermined_rows(problem: Problem, values: Values) -> list[str]:
+    """The unknowns of eliminated rows that are undetermined even if all other unknowns are
+    given."""
+    if problem.plan.eliminated is None:
+        return []
+    values, data = pad_values(problem, values), pad_data(problem, problem.data)
+    V = _eliminated_blocks(problem.declared, problem.plan, values, data)
+    return _name_singular(problem, np.asarray(V))
+
+
+@compile_once
+def _eliminated_blocks(declared: Declared, plan: Plan, values: Values, data: Data):
+    *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    return blocks.eliminated
+
+
 def eliminated_rows(problem: Problem, names: Sequence[str]) -> list[int]:
-    """The rows of the eliminated table to which unknowns of these names belong."""
+    """The eliminated rows to which unknowns of these names belong."""
     if problem.plan.eliminated is None or not names:
         return []
-    table = problem.table(problem.plan.eliminated)
-    row_of = {f"{table.title} {table.label(row)}": row for row in range(table.rows)}
+    table, rows = problem.table(problem.plan.eliminated), np.flatnonzero(~problem.kept_rows)
+    row_of = {f"{table.title} {table.label(row)}": row for row in rows.tolist()}
     owners = {str(name).partition(" of ")[2] for name in names}
     return [row_of[owner] for owner in owners if owner in row_of]
 
@@ -110,8 +126,8 @@ def _scale(declared: Declared, plan: Plan, values: Values, data: Data, moves):
     return S.matrix(plan, plan.kept), blocks.eliminated, G
 
 
-def _undetermined_rows(problem: Problem, V) -> list[str]:
-    """Eliminated rows that are undetermined even if all other unknowns are given."""
+def _name_singular(problem: Problem, V) -> list[str]:
+    """The unknowns of eliminated rows with a singular block V."""
     e = present(problem.plan.eliminated)
     group, table = problem.plan.groups[e], problem.table(e)
     finite = np.isfinite(V).all((1, 2))

@@ -8,7 +8,7 @@ other are removed together (`separation.py`): of every eliminated row only the w
 only those that stay significant whatever the influence of the worse ones, and only those at least
 half as bad as the worst of all. Observations without an eliminated row, or with residuals tested
 individually, are removed alone. An eliminated row left with too few residuals is excluded too, as
-is one that the others leave undetermined: the point of two rays that are nearly parallel.
+is one that its remaining observations do not determine, such as a point with two parallel rays.
 
 If observations of a row are inseparable, as the two of a two-ray point, nothing decides which is
 wrong: when no others are left, all of them are removed and listed as one ("either of").
@@ -112,9 +112,9 @@ def snoop(
     """
     check_test(test, significance)
     whole, removed, returned = found.problem, [*doubtful], set()
-    touched, lost = _Touched(whole), []
+    touched, excluded = _Touched(whole), set()
     if removed:
-        found = _solve(whole, removed, lost, found.values, adjust_from)
+        found = _solve(whole, removed, excluded, found.values, adjust_from)
     while found.problem.counts.redundancy >= 2:
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
@@ -134,25 +134,25 @@ def snoop(
             returned |= passing
             removed = kept
         again = lambda problem, values: readjust(problem, values, adjust_from)
-        found = _solve(whole, removed, lost, found.values, again)
+        found = _solve(whole, removed, excluded, found.values, again)
     if doubtful:
         removed = list(_test(whole, found, removed))
     if removed:
-        found = _solve(whole, removed, lost, found.values, adjust_from)
+        found = _solve(whole, removed, excluded, found.values, adjust_from)
     return found, removed
 
 
-def _solve(whole: Problem, removed, lost: list[int], values, adjust_from: Adjust) -> Solution:
-    """The solution without removed observations; eliminated rows that the others leave undetermined
-    are appended to `lost` and excluded."""
+def _solve(whole: Problem, removed, excluded: set[int], values, adjust_from: Adjust) -> Solution:
+    """The solution without removed observations and `excluded` eliminated rows, to which those are
+    added that the remaining observations do not determine."""
     while True:
         try:
-            return adjust_from(without(whole, removed, lost), values)
+            return adjust_from(without(whole, removed, excluded), values)
         except NotSolvedError as error:
-            more = set(eliminated_rows(whole, error.undetermined)) - {*lost}
+            more = {*eliminated_rows(whole, error.undetermined)} - excluded
             if not more:
                 raise
-            lost += sorted(more)
+            excluded |= more
 
 
 class _Touched:
@@ -313,21 +313,21 @@ def _finite(tests) -> Float[np.ndarray, "..."]:
     return np.where(np.isfinite(tests), tests, 0.0)
 
 
-def without(problem: Problem, removed: Sequence[Removed], lost: Sequence[int] = ()) -> Problem:
-    """The problem with the weights of removed observations set to zero; `lost` eliminated rows, and
-    those left with too few residuals, are excluded."""
+def without(problem: Problem, removed: Sequence[Removed], excluded: Iterable[int] = ()) -> Problem:
+    """The problem with the weights of removed observations set to zero, without `excluded`
+    eliminated rows and those left with too few residuals."""
     weight = [np.array(w) for w in problem.data.weight]
     for r in removed:
         weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0
     e, lone = problem.plan.eliminated, []
-    if e is not None and removed:
+    if e is not None and (removed or excluded):
         touched, width = _Touched(problem), problem.table(e).space.width
         left = np.zeros(problem.table(e).rows)
         for o, own in touched.own.items():
             rows = (np.asarray(problem.weights(o, weight[o])) > 0).sum(1)
             np.add.at(left, own[own >= 0], rows[own >= 0])
         changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
-        lone = sorted({*lost} | {row for row in changed if left[row] < width})
+        lone = sorted({*excluded} | {row for row in changed if left[row] < width})
         for o, own in touched.own.items():
             weight[o][np.isin(own, lone)] = 0.0
     data = dataclasses.replace(problem.data, weight=tuple(weight))
