@@ -198,12 +198,12 @@ def test_either_of_two_rays(network):
     assert all(f"point {point} in image {image}" in removed.name for image in images)
     assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
     assert "either of" in text(found) and "does not show which" in text(found)
-    assert f"do not determine them: {point}." in text(found)
+    assert f"do not determine them: {point}." in " ".join(text(found).split())
     assert np.isnan([found.points[name][62] for name in ("X", "sX", "rms")]).all()
     written = json.loads("".join(result_text(found)))["points"][point]
     assert written["X"] == {"value": None, "sigma": None}
     assert point not in adjusted_network(found).points.id
-    with pytest.raises((InputError, KeyError), match="excluded by data snooping"):
+    with pytest.raises(InputError, match="excluded by data snooping"):
         found.covariance(("point", point, "Z"))
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 

@@ -43,10 +43,18 @@ def find_unknowns(problem: Problem, names: Sequence[tuple[str, str, str]]) -> li
     return wanted
 
 
+def require_located(problem: Problem, name: Name) -> None:
+    """Refuse an unknown of a point that data snooping excluded.
+
+    **Raises:** `InputError`."""
+    if name.kind == "point" and problem.excluded[problem.network.points.id.index(name.id)]:
+        raise InputError(f"point {name.id} was excluded by data snooping: it has no coordinates")
+
+
 def value_of(problem: Problem, name: Name, values: Values):
     """The unknown with this name; exterior orientation as X0, Y0, Z0, ω, φ, κ (radians).
 
-    **Raises:** `KeyError` for an unknown name, or an excluded point."""
+    **Raises:** `KeyError` for an unknown name."""
     network = problem.network
     if name.kind == "camera":
         c = place_of(name.id, [camera.id for camera in network.cameras], "camera")
@@ -59,8 +67,6 @@ def value_of(problem: Problem, name: Name, values: Values):
         return pose[place_of(name.parameter, EXTERIOR, "image parameter")]
     if name.kind == "point":
         p = place_of(name.id, network.points.id, "point")
-        if problem.excluded[p]:
-            raise KeyError(f"point {name.id} was excluded by data snooping: it has no coordinates")
         return values.point[p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
     raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
 

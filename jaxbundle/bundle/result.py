@@ -20,6 +20,7 @@ from jaxbundle.adjustment.unknowns import (
     angles_near,
     find_unknowns,
     place_of,
+    require_located,
     value_of,
 )
 from jaxbundle.arguments import at_least_zero
@@ -381,9 +382,11 @@ class Adjustment:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
         `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
 
-        **Raises:** `InputError` without names, or for a name that does not have three parts;
-        `KeyError` for an unknown name."""
+        **Raises:** `InputError` without names, for a name that does not have three parts, or for a
+        point excluded by data snooping; `KeyError` for an unknown name."""
         wanted = find_unknowns(self.problem, names)
+        for name in wanted:
+            require_located(self.problem, name)
 
         def pick(values: Values):
             return jnp.stack([value_of(self.problem, name, values) for name in wanted])

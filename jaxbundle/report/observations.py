@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, tau_quantile
-from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.columns import count
 from jaxbundle.report.head import span
 from jaxbundle.report.layout import (
     bar,
@@ -189,13 +189,6 @@ def removals(adjustment) -> list[str]:
             lines += paragraph(
                 "Either of: one of these rays is wrong, but the point does not show which, "
                 "and none of them is used."
-            )
-        excluded = np.flatnonzero(adjustment.problem.excluded)
-        if len(excluded):
-            points = list_some((adjustment.network.points.id[p] for p in excluded), 20, clean)
-            lines += paragraph(
-                "Points without coordinates, since their remaining rays do not determine them: "
-                f"{points}."
             )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxbundle.cameras import CameraModel, get_model
-from jaxbundle.network.columns import count
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import (
@@ -173,6 +173,13 @@ def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[st
     lines = heading("Points: precision")
     lines += _precision(adjustment, accuracy_unit)
     lines += _rays(adjustment.points["rays"])
+    excluded = np.flatnonzero(adjustment.problem.excluded)
+    if len(excluded):
+        names = list_some((adjustment.network.points.id[p] for p in excluded), 20, clean)
+        lines += ["", *paragraph(
+            f"Without coordinates, because the rays left by data snooping do not determine them: "
+            f"{names}."
+        )]  # fmt: skip
     return [*lines, *_list_of_points(adjustment, most)]
 
 

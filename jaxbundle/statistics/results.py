@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.unknowns import angles_near, value_of
+from jaxbundle.adjustment.unknowns import angles_near, require_located, value_of
 from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -101,6 +101,7 @@ def _part(inspection: Inspection, one):
         value_of(problem, name, inspection.adjusted)
     except KeyError as error:
         raise InputError(f"of: {error.args[0]}") from None
+    require_located(problem, name)
     function = lambda values: jnp.atleast_1d(value_of(problem, name, values))
     sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
     angle = name.kind == "image" and name.parameter in EXTERIOR[3:]
