@@ -243,7 +243,7 @@ class _Making:
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
-        least = min(SMALLEST_PART, len(self.photographs))
+        least = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
         waiting = group_connected(len(self.photographs), pairs)
         parts: list[Part] = []
         failed: list[str] = []
@@ -296,7 +296,8 @@ class _Making:
         if failed:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
-        return f"not solved: no photographs overlap: {said}"
+        some = "no three photographs overlap one another" if pairs else "no photographs overlap"
+        return f"not solved: {some}: {said}"
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
