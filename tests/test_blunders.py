@@ -205,6 +205,8 @@ def test_either_of_two_rays(network):
     assert point not in adjusted_network(found).points.id
     with pytest.raises(InputError, match="excluded by data snooping"):
         found.covariance(("point", point, "Z"))
+    with pytest.raises(InputError, match="excluded by data snooping"):
+        jaxbundle.sensitivity(found, {("point", point, "Z"): 0.1})
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 

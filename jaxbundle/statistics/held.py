@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.unknowns import require_located
 from jaxbundle.arguments import number, positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
@@ -19,6 +20,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.response import Change
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
 from jaxbundle.network.columns import did_you_mean, list_some
@@ -110,6 +112,8 @@ def split_name(name: Any) -> tuple[str, str, str]:
 def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     """Table, row, column and name of every held quantity of this name."""
     text, estimated = ":".join((kind, id, parameter)), []
+    if kind == "point" and id in problem.network.points.id:
+        require_located(problem, Name(kind, id, parameter))
     tables = _tables_of(problem, kind)
     points = np.flatnonzero(~problem.excluded).tolist()
     rows_of = lambda table: points if table.name == "point" else range(table.rows)
