@@ -80,6 +80,8 @@ def _survey(declared, plan, data, real, moves) -> Survey:
                   for t, J in zip(part.touches, touches)]  # fmt: skip
         if E is not None:
             blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
+        if not blocks:  # Held tables only: it determines nothing.
+            continue
         total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
         product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
         # Non-finite values at the start are ignored here; the solver will report them.

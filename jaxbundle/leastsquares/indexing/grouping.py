@@ -4,7 +4,7 @@ See `plan.py` for the terms."""
 
 import dataclasses
 from collections.abc import Hashable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -41,6 +41,13 @@ class Share:
     observations: int
     source: Int[np.ndarray, " share"]
     slot: int | None
+
+
+class TouchedGroup(NamedTuple):
+    """A kept group with the slots (slot, first column) that touch the same row of it."""
+
+    group: str
+    slots: list[tuple[int, int]]
 
 
 class Grouping:
@@ -152,28 +159,35 @@ class Grouping:
             index = None if rows is None else as_index(rows, ("group", name), ("table", table))
             members.append(Member(table, start, given.space.width, index))
         free = np.concatenate(free, 1)
+        # A slot of the eliminated table touches its kept rows, or a held one, which is not there.
+        partial = any(rows is not None for *_, rows in self.members[name])
         may_be_held = name == self.eliminate and len(free) < MASKED
+        may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held
         all_free = self.choose("all free", name, found=all_free)
         return Group(tuple(members), as_column(free, ("group", name)), all_free)
 
-    def touched_groups(self, share: Share, of):
-        """The kept groups that a share touches, in order, with their slots and first columns; a
-        second row of a group is a touch of its own."""
-        found = []
-        for s, name in enumerate(of):
+    def touched_groups(self, number: int, share: Share) -> list[TouchedGroup]:
+        """The kept groups touched by share `number`, in order.
+
+        Slots of one group are one touch if they have the same row in every observation of the
+        share. This is decided for each share: tables that always meet where rows are eliminated
+        may cross elsewhere, as the velocity of one image and the pose of the next."""
+        given, found = self.observations[share.observations], []
+        for s, name in enumerate(given.kind.of):
             if s == share.slot or name not in self.group_of:
                 continue
-            group, start, _ = self.group_of[name]
-            entry = next(
-                (f for f in found if f[0] == group and all(of[q] != name for q, _ in f[1])), None
-            )
-            if entry is None:
-                found.append((group, [(s, start)]))
+            group, start, place = self.group_of[name]
+            row = place[given.rows[s][share.source]]
+            same = (t for t, at in found if t.group == group and np.array_equal(at, row))
+            tables = lambda t: [given.kind.of[q] for q, _ in t.slots]
+            host = next((t for t in same if name not in tables(t)), None)
+            if host is None:
+                found.append((TouchedGroup(group, [(s, start)]), row))
             else:
-                entry[1].append((s, start))
-        found.sort(key=lambda f: self.kept.index(f[0]))
-        return [(group, tuple(slots)) for group, slots in found]
+                host.slots.append((s, start))
+        found = sorted((t for t, _ in found), key=lambda t: self.kept.index(t.group))
+        return self.choose("touches", number, found=found)
 
     def rows(self, group: str) -> int:
         table, _, rows = self.members[group][0]

@@ -101,12 +101,13 @@ class _Planner:
         given = self.by.observations[share.observations]
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
-        slots = self.by.touched_groups(share, of)
+        slots = self.by.touched_groups(k, share)
         major = np.zeros(len(share.source), np.int64)
         for _, touched in slots:
             slot = touched[0][0]
             row = self.by.group_of[of[slot]][2][rows[slot]]
-            major = np.unique(major * (row.max(initial=0) + 1) + row, return_inverse=True)[1]
+            # Rows from −1 on: none.
+            major = np.unique(major * (row.max(initial=0) + 2) + row + 1, return_inverse=True)[1]
         minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
         along = ("part", k)
         length = self.choose("length", along, found=chunk_length(major))
@@ -128,7 +129,7 @@ class _Planner:
             stop = max(start + self.by.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
             index = as_index(row, along, ("group", group))
-            touches.append(Touch(group, touched, start, stop, index, None))
+            touches.append(Touch(group, tuple(touched), start, stop, index, None))
         source = np.where(used, share.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
         place[share.source[order][used]] = np.flatnonzero(used)
@@ -214,13 +215,15 @@ class _Planner:
                 a, b = touches[j], touches[i]  # the later group first
                 row, column = a.row.rows, b.row.rows
                 same = turned = None
+                none = (row < 0) | (column < 0)
                 if a.group == b.group:
-                    equal, less = row == column, row < column
+                    equal, less = (row == column) & ~none, row < column
                     row, column = np.maximum(row, column), np.minimum(row, column)
                     meets = self.choose("same", k, j, i, found=bool(equal.any()))
                     same = as_column(equal.astype(float), p.along) if meets else None
                     turned = as_column(less.astype(float), p.along)
-                    row = np.where(equal, -1, row)
+                    none |= equal
+                row = np.where(none, -1, row)
                 direct.setdefault((a.group, b.group), []).append((k, len(couples), row, column))
                 couples.append(Couple(j, i, None, turned, same))
         p.part = dataclasses.replace(p.part, couples=tuple(couples))
@@ -231,9 +234,10 @@ class _Planner:
             empty = np.zeros(0, np.int64)
             return empty, empty, empty, empty, None
         i, j = pairs_between(later.eliminated, earlier.eliminated)
+        there = (later.row[i] >= 0) & (earlier.row[j] >= 0)
         if within:  # below the diagonal; an incidence paired with itself is summed by chunks
-            low = later.row[i] > earlier.row[j]
-            i, j = i[low], j[low]
+            there &= later.row[i] > earlier.row[j]
+        i, j = i[there], j[there]
         return later.live[i], earlier.live[j], later.row[i], earlier.row[j], (
             (later.along, later.length), (earlier.along, earlier.length),
         )  # fmt: skip
