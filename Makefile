@@ -18,7 +18,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all bench docs install install-docs clean \
+.PHONY: demo test test-all random-problems bench docs install install-docs clean \
   $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
@@ -40,6 +40,10 @@ test test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
+
+# 500 random problems by the engine and by dense algebra; 40 of them are in `make test`.
+random-problems: install
+	cd tests/leastsquares && ../../$(BIN)/python test_random_problems.py 500
 
 # Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
 # Python (make test-newest PYTHON=python3.13), each in an environment of its own.

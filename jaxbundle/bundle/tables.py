@@ -16,6 +16,7 @@ from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
 from jaxbundle.statistics.further import estimates
+from jaxbundle.statistics.inspection import OfNetwork
 
 
 def cameras(adjustment) -> dict[str, dict]:
@@ -133,10 +134,10 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the given order."""
     found = adjustment.reliability
-    parts = observations(adjustment.problem, found.residual, found.redundancy, found.w)
+    parts = observations(adjustment.problem, *found)
     return concatenate([
-        residual_rows(adjustment, kind, image, point, axes, v, weight, r, w)
-        for kind, image, point, axes, weight, v, r, w in parts
+        residual_rows(adjustment, kind, image, point, axes, weight, OfNetwork(*tested))
+        for kind, image, point, axes, weight, *tested in parts
     ])  # fmt: skip
 
 
@@ -207,10 +208,12 @@ def checks(adjustment) -> dict[str, np.ndarray]:
     return table | {"rays": found.rays}
 
 
-def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
+def residual_rows(adjustment, kind, image, point, axes, weight, tested):
     """The rows of one kind of observation [observations × axes] as columns, without weightless
-    rows."""
-    v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
+    rows. `weight`: 1/σ; `tested`: its columns of `Reliability`, by name."""
+    v, gain, r, w, hat = (np.asarray(getattr(tested, name)) for name in OfNetwork._fields)
+    weight = np.asarray(weight)
+    free = np.clip(1 - hat, 0, 1)
     unit = np.ones(weight.shape[1])
     if kind in OF_ANGLES or (kind == "prior" and axes == EXTERIOR):
         unit[-3:] = adjustment.angle_scale
@@ -227,8 +230,8 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
         "r": r.ravel(),
         "w": w.ravel(),
         "tau": adjustment.pope(w).ravel(),
-        "mdb": minimal_detectable(sigma, r).ravel(),
-        "external": external_reliability(r).ravel(),
+        "mdb": minimal_detectable(sigma / np.where(used, gain, 1.0), free).ravel(),
+        "external": external_reliability(free).ravel(),
     }
     if adjustment.weights is not None:
         factor = adjustment.weights if kind == "image" else np.ones(len(image))

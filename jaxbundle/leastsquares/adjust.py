@@ -143,9 +143,9 @@ class Result:
         return self.residuals(kind)["r"]
 
     def residuals(self, kind: str) -> dict[str, Float[np.ndarray, "n *r"]]:
-        """For the observations of a kind, in the given order: v (computed − observed, in the unit
-        of the kind; with a covariance L⁻¹·v), sigma (a priori), r, w (Baarda), tau (Pope), mdb,
-        external."""
+        """For the observations of a kind, in the given order: v (computed − observed) and sigma (a
+        priori) in the unit of the kind, r, w (Baarda), tau (Pope), mdb, external; v is NaN, sigma
+        infinite for residuals without weight."""
         names = [given.kind.name for given in self.problem.observations]
         if kind not in names:
             raise KeyError(f"there is no kind {kind!r}; known: {', '.join(dict.fromkeys(names))}")
@@ -155,15 +155,15 @@ class Result:
         return {c: x[:, 0] if one else x for c, x in columns.items()}
 
     def _residuals(self, o: int):
-        found, weight = self.solution.reliability, self.problem.data.weight[o]
-        weight = np.asarray(weight)
-        used = weight > 0 if weight.ndim == 2 else np.ones(weight.shape[:2], bool)
-        sigma = np.where(used, 1 / np.where(used, weight, 1.0) if weight.ndim == 2 else 1.0, np.inf)
-        r, w = found.redundancy[o], found.w[o]
+        found, weight = self.solution.reliability, self.problem.weights(o)
+        used = weight > 0
+        sigma = np.where(used, 1 / np.where(used, weight, 1.0), np.inf)
+        w, gain = found.w[o], np.where(used, found.gain[o], 1.0)
+        free = np.where(used, np.clip(1 - found.hat[o], 0, 1), 0.0)
         return {
-            "v": found.residual[o] * np.where(used, sigma, np.nan), "sigma": sigma, "r": r, "w": w,
-            "tau": w / (self.sigma0 or np.nan), "mdb": minimal_detectable(sigma, r),
-            "external": external_reliability(r),
+            "v": found.residual[o] * np.where(used, sigma, np.nan), "sigma": sigma,
+            "r": found.redundancy[o], "w": w, "tau": w / (self.sigma0 or np.nan),
+            "mdb": minimal_detectable(sigma / gain, free), "external": external_reliability(free),
         }  # fmt: skip
 
     @functools.cached_property

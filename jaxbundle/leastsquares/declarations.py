@@ -19,6 +19,7 @@ from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
+from jaxbundle.leastsquares.weights import whitening
 
 OF_THE_VALUES: Any = None
 """Placeholder: the space is derived from the values of the table."""
@@ -291,7 +292,6 @@ def _whitening(name: str, covariance, number: int, residuals: int):
     if not (np.abs(covariance - covariance.mT) <= 1e-9 * size).all():
         raise InputError(f"{name}: a covariance is not symmetric or not finite")
     try:
-        lower = np.linalg.cholesky(covariance)
+        return whitening(covariance)
     except np.linalg.LinAlgError:
         raise InputError(f"{name}: a covariance is not positive definite") from None
-    return np.linalg.inv(lower)

@@ -1,6 +1,7 @@
 """A problem prepared for the solver: plan, numbers, and counts of rows and unknowns."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal
@@ -25,13 +26,13 @@ from jaxbundle.leastsquares.indexing.rows import (
     Data,
     Declared,
     Values,
-    diagonal_of,
     evaluate,
     scalars,
 )
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
+from jaxbundle.leastsquares.weights import diagonal, inverse_sigma, used
 from jaxbundle.system.memory import return_freed_memory
 
 LARGE_PROBLEM = 200_000
@@ -59,10 +60,9 @@ class Problem:
         """The table of this name."""
         return next(t for t in self.tables if t.name == name)
 
-    def weights(self, o: int, weight=None) -> Float[np.ndarray, "n r"]:
-        """1/σ of the residuals of a set of observations, 0 without weight; for those with a
-        covariance the diagonal of L⁻¹."""
-        return np.asarray(diagonal_of(self.data.weight[o] if weight is None else weight))
+    def weights(self, o: int) -> Float[np.ndarray, "n r"]:
+        """1/σ of the residuals of a set of observations, 0 without weight."""
+        return inverse_sigma(np.asarray(self.data.weight[o]))
 
     @property
     def reduced_size(self) -> int:
@@ -234,7 +234,7 @@ def with_data(problem: Problem, data: Data) -> Problem:
 def count(tables, data: Data) -> Counts:
     """Rows with weight, and free unknowns."""
     return Counts(
-        sum(int((np.asarray(diagonal_of(w)) > 0).sum()) for w in data.weight),
+        sum(int(used(np.asarray(w)).sum()) for w in data.weight),
         sum(int((t.free > 0).sum()) for t in tables),
     )
 
@@ -267,8 +267,8 @@ def check_numbers(tables, observations, weights) -> None:
                 raise InputError(f"{table.title} {row}: a start value is not a finite number")
     for given, weight in zip(observations, weights):
         for rows in jax.tree.leaves(given.measured):
-            bad = ~np.isfinite(rows).reshape(given.number, -1)
-            counts = diagonal_of(weight) > 0
+            bad = ~np.isfinite(rows).reshape(given.number, math.prod(np.shape(rows)[1:]))
+            counts = used(weight)
             bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
             if bad.any():
                 row = int(np.argwhere(bad)[0][0])
@@ -366,12 +366,7 @@ def make_solver(
 ) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
     its program."""
-    squared = lambda w, m: np.where(w > 0, w * m.reshape(w.shape), 0.0) ** 2
-    squares = sum(
-        float(squared(np.asarray(diagonal_of(w)), np.asarray(m)).sum())
-        for w, measured in zip(problem.data.weight, problem.data.measured)
-        for m in jax.tree.leaves(measured)[:1] if m.size == w.shape[0] * w.shape[1]
-    )
+    squares = sum(map(_measured_squares, problem.data.weight, problem.data.measured))
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
     rows = round_up(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
@@ -379,6 +374,19 @@ def make_solver(
         problem.declared, problem.plan, tolerance, problem.retraction, rows=rows,
         max_steps=jax.device_put(np.int64(max_steps)), **options,
     )  # fmt: skip
+
+
+def _measured_squares(weight, measured) -> float:
+    """The sum of the squares of measured values divided by their σ, which gives the rounding of the
+    residuals. Of several arrays the largest of those with one number for each residual counts; if
+    there is none, the largest number of each observation."""
+    w = diagonal(np.asarray(weight))
+    size = lambda m: (len(w), math.prod(np.shape(m)[1:]))
+    arrays = [np.asarray(m).reshape(size(m)) for m in jax.tree.leaves(measured)]
+    fitting = [m for m in arrays if m.shape == w.shape]
+    if not fitting:
+        fitting = [np.abs(m).max(1, keepdims=True) for m in arrays if m.size]
+    return max((float((np.where(w > 0, w * m, 0.0) ** 2).sum()) for m in fitting), default=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

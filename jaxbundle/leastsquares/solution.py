@@ -237,11 +237,12 @@ class Solution:
         return Reliability(**{f: self._rows(rows) for f, rows in vars(found).items()})
 
     def predicted_tests(self, data: Data) -> Rows:
-        """v/√(1 + h) of all observations with the weights of `data`: the normalised residuals of
-        excluded observations."""
+        """nᵀu/√(1 + h) of all observations with the weights of `data` (`Reliability`; v/σ/√(1 + h)
+        if uncorrelated): the normalised residuals of excluded observations, predicted from those in
+        the adjustment and from the other residuals of their row."""
         given = (*self.given[:3], pad_data(self.problem, data))
         found = reliability(*given, self.cofactors)  # a program that is there already
-        v, h = self._rows(found.residual), self._rows(found.hat)
+        v, h = self._rows(found.standard), self._rows(found.hat)
         return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
     @functools.cached_property

@@ -18,9 +18,10 @@ class OfNetwork(NamedTuple):
     """`Reliability` in the order of the network."""
 
     residual: Rows
+    gain: Rows
     redundancy: Rows
     w: Rows
-    own: Rows
+    hat: Rows
 
 
 class _OfTables(eqx.Module):

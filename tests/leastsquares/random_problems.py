@@ -100,8 +100,9 @@ def _draw(rng, values) -> Random:
         if rng.random() < 0.2 and not floats:
             touched = touched[:1]
         always = meeting and k % 2
+        number = LARGE if large and k == 1 else int(rng.integers(2, 6)) * 6
         observations.append(
-            _observe(rng, values, f"kind {k}", touched, size, floats, large and k == 1, always, orders)
+            _observe(rng, values, f"kind {k}", touched, size, floats, number, always, orders)
         )
     if not floats:
         observations += [_prior(values, t) for t in tables if rng.random() < 0.7]
@@ -120,10 +121,9 @@ def _draw(rng, values) -> Random:
     return Random(tables, observations, options, floats)
 
 
-def _observe(rng, values, name, touched, size, floats, large, meet, orders) -> ls.Observations:
+def _observe(rng, values, name, touched, size, floats, n, meet, orders) -> ls.Observations:
     """Observations of up to five rows; values follow from the present rows and noise. `meet`: the
     first two slots have the same row."""
-    n = LARGE if large else int(rng.integers(2, 6)) * 6
     residuals = int(rng.integers(1, 4))
     common = np.arange(n) % size if rng.random() < 0.5 else rng.integers(0, size, n)
     rows = []
@@ -184,15 +184,29 @@ def _times(c, table, rows, value=None):
     return np.einsum("nrw,nw->nr", c, value[rows])
 
 
+def _whitening(problem: Random):
+    """L⁻¹ [n, r, r] of every set of observations."""
+    roots = []
+    for o in problem.observations:
+        r = np.shape(o.measured["y"])[1]
+        if o.covariance is not None:
+            roots.append(np.linalg.inv(np.linalg.cholesky(o.covariance)))
+            continue
+        sigma = np.asarray(o.sigma)[:, None] if np.ndim(o.sigma) == 1 else o.sigma
+        roots.append(np.eye(r) / (np.ones((o.number, r)) * sigma)[:, :, None])
+    return roots
+
+
 class Dense:
     """The same problem as one dense matrix over all unknowns."""
 
-    def __init__(self, problem: Random, values=None):
+    def __init__(self, problem: Random, values=None, roots=None):
         self.problem = problem
         tables = problem.tables
         values = {t.name: t.value for t in tables} if values is None else values
         self.values = {name: np.array(x, float) for name, x in values.items()}
-        self.first = dict(zip((t.name for t in tables), np.cumsum([0, *(t.free.size for t in tables)])))
+        ends = np.cumsum([t.free.size for t in tables])
+        self.first = {t.name: int(end) - t.free.size for t, end in zip(tables, ends)}
         self.free = np.flatnonzero(np.concatenate([t.free.ravel() for t in tables]))
         self.defect = 0
         if problem.floats and self.free.size:
@@ -202,26 +216,13 @@ class Dense:
             # A direction of the shift is open if no held unknown moves along it.
             open_ = ~held.any(0)
             self.defect, self.gauge = int(open_.sum()), everywhere[self.free][:, open_]
-        self._whiten()
+        self.root = _whitening(problem) if roots is None else roots
+        self.used = [np.diagonal(root, axis1=1, axis2=2) for root in self.root]
         self.linearise()
         self.rank = np.linalg.matrix_rank(self.J, tol=1e-7 * np.linalg.norm(self.J, 2))
         self.unknowns = len(self.free)
         self.observations = int((np.concatenate([w.ravel() for w in self.used]) > 0).sum())
         self.redundancy = self.observations + self.defect - self.unknowns
-
-    def _whiten(self):
-        self.root, self.used = [], []
-        for o in self.problem.observations:
-            r = np.shape(o.measured["y"])[1]
-            if o.covariance is not None:
-                root = np.linalg.inv(np.linalg.cholesky(o.covariance))
-            else:
-                sigma = np.ones((o.number, r)) * (
-                    np.asarray(o.sigma)[:, None] if np.ndim(o.sigma) == 1 else o.sigma
-                )
-                root = np.eye(r) / sigma[:, :, None]
-            self.root.append(root)
-            self.used.append(np.diagonal(root, axis1=1, axis2=2))
 
     def linearise(self):
         """v/σ, and the dense Jacobian J of all unknowns that are free."""
@@ -246,7 +247,7 @@ class Dense:
         self.by_set = J
         self.r = np.concatenate([v.ravel() for v in self.v])
 
-    def solve(self, tolerance=1e-13) -> "Dense":
+    def solve(self, tolerance=1e-12) -> "Dense":
         """Gauss–Newton from here to the last digits, with the smallest change of the unknowns where
         the datum is open."""
         for _ in range(50):
@@ -274,10 +275,14 @@ class Dense:
         """Q of the unknowns with inner constraints on all of them where the datum is open."""
         return np.linalg.pinv(self.J.T @ self.J, rcond=1e-12, hermitian=True)
 
-    def estimable(self, x):
-        """A vector of unknowns without the open shift, as combinations that do not depend on the
-        datum."""
+    @property
+    def projection(self):
+        """Takes the open shift out of the unknowns: what remains does not depend on the datum."""
+        identity = np.eye(len(self.free))
         if not self.defect:
-            return x
+            return identity
         q = np.linalg.qr(self.gauge)[0]
-        return x - q @ (q.T @ x)
+        return identity - q @ q.T
+
+    def estimable(self, x):
+        return self.projection @ x

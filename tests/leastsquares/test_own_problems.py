@@ -1,12 +1,14 @@
 """Problems that are no networks, in a few lines each: a trilateration with blunders and a free
 datum, the hand-eye calibration of a robot."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbundle import NotSolvedError
+from jaxbundle import InputError, NotSolvedError
 from jaxbundle import leastsquares as ls
 from jaxbundle.geometry import quaternion_from_rotation_vector
 from jaxbundle.leastsquares.quality.names import undetermined_rows
@@ -208,3 +210,109 @@ def test_tables_that_share_a_block_and_an_observation_of_the_first_and_last():
     result = ls.adjust(tables, observations, eliminate="x")
     found = np.concatenate([result[name].value for name in "abcx"])
     np.testing.assert_allclose(found, x, atol=1e-9)
+
+
+def line(n=12):
+    """Numbers on a line y = a + b·t of one row [2], exact."""
+    t = np.linspace(-1, 1, n)
+    kind = ls.Kind("reading", lambda x, m: x[0] + x[1] * m[0] - m[1], of=("line",), axes=("y",))
+    return kind, np.zeros(n, int), t, 3.0 + 2.0 * t
+
+
+def test_an_exact_fit_is_a_solution_whatever_is_measured_with_it():
+    """Its residuals are rounding; that no step reduces them further is not a singularity."""
+    kind, row, t, y = line()
+    result = ls.adjust([ls.Table("line", np.zeros((1, 2)))], [kind((row,), (t, y))])
+    assert result.converged, result.termination
+    np.testing.assert_allclose(result["line"].value, [[3.0, 2.0]], atol=1e-12)
+
+
+def test_measured_arrays_of_different_shapes():
+    random = np.random.default_rng(0)
+    a, s, x = random.normal(size=(20, 3)), random.uniform(1, 2, 20), np.array([1.0, 2.0, 3.0])
+    kind = ls.Kind("scaled", lambda x, m: m[1] * (m[0] @ x) - m[2], of=("x",))
+    measured = a, s, s * (a @ x) + 1e-3 * random.normal(size=20)
+    result = ls.adjust([ls.Table("x", np.zeros((1, 3)))], [kind((np.zeros(20, int),), measured)])
+    right = np.linalg.lstsq(s[:, None] * a, measured[2], rcond=None)[0]
+    np.testing.assert_allclose(result["x"].value, [right], atol=1e-9)
+
+
+@pytest.mark.parametrize("eliminate", ["line", None])
+def test_sets_without_observations(eliminate):
+    """They change nothing, whatever is asked of the result."""
+    kind, row, t, y = line()
+    y = y + 0.01 * np.random.default_rng(2).normal(size=len(y))
+    y[4] += 1.0
+    table, seen = ls.Table("line", np.zeros((1, 2))), kind((row,), (t, y), sigma=0.01)
+    other = ls.Kind("other", lambda x, d: x - d, of=("line",))
+    none = other((np.zeros(0, int),), np.zeros((0, 2)), sigma=0.1)
+    also = other((np.zeros(0, int),), np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)))
+    for options in ({"snooping": "pope"}, {"robust": "tukey"}, {"estimate_components": True}):
+        alone = ls.adjust([table], [seen], eliminate=eliminate, **options)
+        result = ls.adjust([table], [none, seen, also], eliminate=eliminate, **options)
+        assert result.counts == alone.counts
+        np.testing.assert_allclose(result["line"].value, alone["line"].value, atol=1e-12)
+        assert [(r.set, r.row) for r in result.removed] == [(1, r.row) for r in alone.removed]
+    assert result.residuals("other")["v"].shape == (0, 2)
+
+
+def test_observations_of_held_rows_determine_nothing_of_a_free_datum():
+    fixed = ls.Table("fixed", np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2]]), free=False)
+    new = ls.Table("new", np.array([[0.5, 0.5, 0.5]]))
+    of = lambda *tables: ls.Kind(" to ".join(tables), RANGE.residual, of=tables)
+    seen = of("fixed", "new")((np.arange(4), np.zeros(4, int)), [0.87, 0.86, 0.87, 1.66])
+    between = of("fixed", "fixed")(([0], [1]), [1.002], sigma=0.01)
+    alone = ls.adjust([fixed, new], [seen], datum="inner")
+    both = ls.adjust([fixed, new], [seen, between], datum="inner")
+    np.testing.assert_allclose(both["new"].value, alone["new"].value, atol=1e-9)
+    assert both.counts.datum == 0 and both.counts.redundancy == alone.counts.redundancy + 1
+
+
+def test_robust_estimation_without_anything_to_weight_is_refused():
+    kind, row, t, y = line()
+    single = dataclasses.replace(kind, snooped="single")
+    with pytest.raises(InputError, match="no kind of observation is weighted as a whole"):
+        ls.adjust([ls.Table("line", np.zeros((1, 2)))], [single((row,), (t, y))], robust="huber")
+
+
+PAIR = ls.Kind("pair", lambda x, m: m["t"] @ x - m["y"], of=("x",), snooped="single")
+
+
+@pytest.fixture
+def pairs():
+    """Pairs with a correlation of 0.9, σ 0.01, of six rows; their design [n, 2, 12]."""
+    random, n, rows = np.random.default_rng(1), 40, 6
+    t, x = random.normal(size=(n, 2, 2)), random.normal(size=(rows, 2))
+    i = random.integers(0, rows, n)
+    C = 1e-4 * np.array([[1.0, 0.9], [0.9, 1.0]])
+    y = np.einsum("nij,nj->ni", t, x[i]) + random.multivariate_normal([0, 0], C, n)
+    A = np.zeros((n, 2, rows, 2))
+    A[np.arange(n), :, i] = t
+    return t, y, i, C, A.reshape(n, 2, -1)
+
+
+@pytest.mark.parametrize("wrong", [[(0, 0.2)], [(1, 0.2)], [(0, 0.2), (1, 0.5)]])
+def test_a_blunder_of_one_of_two_correlated_residuals(pairs, wrong):
+    """It alone is removed; the other keeps its own variance (Baarda's test of correlated
+    observations; the solution by dense algebra without it)."""
+    t, y, i, C, A = pairs
+    y = y.copy()
+    for residual, error in wrong:
+        y[3, residual] += error
+    seen = PAIR((i,), {"t": t, "y": y}, covariance=np.tile(C, (len(i), 1, 1)))
+    result = ls.adjust([ls.Table("x", np.zeros((6, 2)))], [seen], snooping="baarda")
+    found = {(r.row, r.residual) for r in result.removed}
+    assert found == {(3, residual) for residual, _ in wrong}
+    P = np.tile(np.linalg.inv(C), (len(i), 1, 1))
+    P[3] = np.diag([0.0 if (3, k) in found else 1 / C[k, k] for k in range(2)])
+    N = np.einsum("nia,nij,njb->ab", A, P, A)
+    x = np.linalg.solve(N, np.einsum("nia,nij,nj->a", A, P, y))
+    np.testing.assert_allclose(result["x"].value.ravel(), x, atol=1e-10)
+    sigma = np.sqrt(np.diag(np.linalg.inv(N)))
+    np.testing.assert_allclose(result["x"].sigma.ravel() / result.sigma0, sigma, rtol=1e-9)
+    v, s = result.residuals("pair")["v"][3], result.residuals("pair")["sigma"][3]
+    removed = [k for k, _ in wrong]
+    assert np.isnan(v[removed]).all() and np.isinf(s[removed]).all()
+    kept = [k for k in range(2) if k not in removed]
+    np.testing.assert_allclose(v[kept], (A[3] @ x - y[3])[kept], atol=1e-10)
+    np.testing.assert_allclose(s[kept], 0.01)

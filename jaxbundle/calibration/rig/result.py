@@ -24,6 +24,7 @@ from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
 from jaxbundle.network.tables import Camera, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
+from jaxbundle.statistics.inspection import OfNetwork
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -129,14 +130,14 @@ class RigCalibration:
         rows = rig.in_order
         parts = [result_tables.residual_rows(
             self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
-            rows(found.residual), rows([weight(o) for o in range(len(rig.sets))]),
-            rows(found.redundancy), rows(found.w),
+            rows([weight(o) for o in range(len(rig.sets))]),
+            OfNetwork(*(rows(getattr(found, name)) for name in OfNetwork._fields)),
         )]  # fmt: skip
         if rig.point_sigma is not None:
             o, blank = len(rig.sets), np.full(len(ids), "", dtype=object)
             parts.append(result_tables.residual_rows(
-                self, "control", blank, ids, tuple("XYZ"), found.residual[o], weight(o),
-                found.redundancy[o], found.w[o],
+                self, "control", blank, ids, tuple("XYZ"), weight(o),
+                OfNetwork(*(getattr(found, name)[o] for name in OfNetwork._fields)),
             ))  # fmt: skip
         return result_tables.concatenate(parts)
 

@@ -92,7 +92,8 @@ class Grouping:
             for s in slots:
                 slot_of[~present(self.stays)[given.rows[s]]] = s
             # Two held rows of the table may meet: the last counts as eliminated.
-            for slot in self.choose("slots", o, found=np.unique(slot_of).tolist()):
+            # A set without observations is an empty share.
+            for slot in self.choose("slots", o, found=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
                 shares.append(Share(o, rows, None if slot < 0 else slot))
         return shares

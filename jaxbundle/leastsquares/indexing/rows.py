@@ -68,12 +68,19 @@ def lay_out_data(plan: Plan, data: Data) -> Laid:
     )
 
 
+class Elements(tuple):
+    """The elements of an array as scalars; other tuples are those of the declaration."""
+
+
+jax.tree_util.register_pytree_node(Elements, lambda x: (tuple(x), None), lambda _, x: Elements(x))
+
+
 def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
     """The elements of every row: numbers as they are, vectors as tuples, matrices as tuples of
     tuples."""
 
     def split(x):
-        return x if x.ndim == 1 else tuple(split(x[:, i]) for i in range(x.shape[1]))
+        return x if x.ndim == 1 else Elements(split(x[:, i]) for i in range(x.shape[1]))
 
     return jax.tree.map(split, rows)
 
@@ -110,7 +117,7 @@ class Residual:
             else:
                 block = _stack(space.move(block, tuple(change)))
             moved.append(block)
-        given = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is tuple)
+        given = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is Elements)
         found, w = self.kind.residual(*moved, given), jnp.stack(weight)
         v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
         return jnp.where(w > 0, w * v, 0.0)
@@ -131,7 +138,7 @@ def evaluate(kind: Kind, blocks, measured):
     """The residuals of one observation as a tuple of scalars."""
     if not kind.scalars:
         blocks = (_stack(b) for b in blocks)
-        measured = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is tuple)
+        measured = jax.tree.map(_stack, measured, is_leaf=lambda x: type(x) is Elements)
     found = kind.residual(*blocks, measured)
     if isinstance(found, tuple):
         return found
@@ -140,7 +147,7 @@ def evaluate(kind: Kind, blocks, measured):
 
 def _stack(block) -> Any:
     """Tuples of scalars as arrays; other blocks as they are."""
-    if type(block) is tuple and block:
+    if type(block) in (tuple, Elements) and block:
         return jnp.stack([_stack(x) for x in block])
     return block
 

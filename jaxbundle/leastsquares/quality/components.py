@@ -86,11 +86,13 @@ def variance_components(
         weight = take(problem.weights)
         used = weight[weight > 0]
         if used.size:
+            # v·(P·v), of which the expectation is the redundancy number (with covariances too).
             v, r = take(tested.residual.get), take(tested.redundancy.get)
+            square = v * take(tested.gain.get) * take(tested.standard.get)
             factor = factors.get(group.name, 1.0)
             unit = group.unit / factor
             components[group.name] = Component(
-                used.size, float(r.sum()), float((v**2).sum()),
+                used.size, float(r.sum()), float(square.sum()),
                 (float(unit / used.max()), float(unit / used.min())), factor,
             )  # fmt: skip
     return components

@@ -1,18 +1,22 @@
 """Reliability of the observations: redundancy numbers, blunder tests, undetectable errors.
 
-With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) (Baarda 1968; Förstner
-1985):
+For the observations of one row, with covariance C = L·Lᵀ, weight P = C⁻¹, residuals v and their
+cofactors Q_vv = C − J·Q·Jᵀ, and eᵢ the unit vector of one residual (Baarda 1968; Förstner 1985):
 
-    r   = 1 − h                     redundancy number, 0 (uncontrolled) to 1; Σr = redundancy
-    w   = (v/σ)/√r                  Baarda's test, standard normal without a blunder (σ a priori)
-    τ   = w/σ̂0                      Pope's test (1976), σ a posteriori
-    MDB = σ·δ0/√r                   smallest blunder found with the chosen power
-    δ̄   = δ0·√((1 − r)/r)           its largest effect on any unknown, in units of that σ
+    rᵢ  = (Q_vv·P)ᵢᵢ                       redundancy number, Σr = redundancy
+    w   = (P·v)ᵢ/√(P·Q_vv·P)ᵢᵢ             Baarda's test, standard normal without a blunder
+    τ   = w/σ̂0                            Pope's test (1976), σ a posteriori
+    MDB = δ0/√(P·Q_vv·P)ᵢᵢ                 smallest blunder found with the chosen power
+    δ̄   = δ0·√(h/(1 − h))                  its largest effect on any unknown, in units of that σ
 
-For observations with a covariance, v/σ means L⁻¹·v.
+Computed with whitened residuals u = L⁻¹·v and B = L⁻¹·J·Q·Jᵀ·L⁻ᵀ. An error of residual i points
+along n = L⁻¹·eᵢ/|L⁻¹·eᵢ|, so that w = nᵀu/√(1 − h) with h = nᵀ·B·n. For uncorrelated observations
+(n = eᵢ, B diagonal elements alone) this is r = 1 − h, w = (v/σ)/√r and MDB = σ·δ0/√r: r is in
+[0, 1] from uncontrolled to fully controlled, which does not hold for correlated ones.
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -42,10 +46,14 @@ UNCONTROLLED = 1e-8
 
 
 class Reliability(eqx.Module):
-    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN if r is zero), `hat`
-    h = 1 − r, and its part due to the eliminated row of the observation alone."""
+    """By set of observations, [n, r], 0 for residuals without weight: `residual`, v/σ; `standard`,
+    nᵀu (v/σ if uncorrelated); `gain`, σ·√Pᵢᵢ ≥ 1 (1 if uncorrelated), by which the other residuals
+    of its row sharpen it; the redundancy number; Baarda's w (NaN if uncontrolled); `hat`, h; and
+    `own`, its part due to the eliminated row of the observation alone."""
 
     residual: Mapping[int, Float[AnyArray, "n r"]]
+    standard: Mapping[int, Float[AnyArray, "n r"]]
+    gain: Mapping[int, Float[AnyArray, "n r"]]
     redundancy: Mapping[int, Float[AnyArray, "n r"]]
     w: Mapping[int, Float[AnyArray, "n r"]]
     hat: Mapping[int, Float[AnyArray, "n r"]]
@@ -58,40 +66,89 @@ def reliability(
 ) -> Reliability:
     """Redundancy numbers and test statistics of all observations."""
     laid = lay_out_data(plan, data)
-    found = hat_diagonal(declared, plan, values, laid, Q)
-    residual, hat, own = (restore_order(plan, rows) for rows in found)
-    number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
-    r = {o: number(h, diagonal_of(data.weight[o])) for o, h in hat.items()}
-    test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)
-    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r}, hat, own)
+    found = hat_blocks(declared, plan, values, laid, Q)
+    whitened, hats, owns = (restore_order(plan, rows) for rows in found)
+    by_set = {
+        o: _correlated(data.weight[o], u, hats[o], owns[o]) if data.weight[o].ndim == 3
+        else _uncorrelated(data.weight[o], u, hats[o], owns[o])
+        for o, u in whitened.items()
+    }  # fmt: skip
+    columns = {f.name: {o: x[f.name] for o, x in by_set.items()} for f in fields(Reliability)}
+    return Reliability(**columns)
 
 
-def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
-    """v/σ, h = diag(J·Q·Jᵀ) and its part E·V⁻¹·Eᵀ of the eliminated row alone, of every part,
-    [chunks, length, r], from the blocks of Q that each observation touches."""
-    prepared, of_chunk = prepare(declared, values), partial(_of_chunk, Q)
-    found = [
-        differentiate_chunks(declared, plan, number, prepared, laid, of_chunk)
-        for number in range(len(plan.parts))
-    ]
+def _uncorrelated(weight, v, hat, own):
+    used = weight > 0
+    return {
+        "residual": v, "standard": v, "gain": used.astype(float),
+        "redundancy": jnp.where(used, jnp.clip(1 - hat, 0.0, 1.0), 0.0),
+        "w": _test(v, hat, used), "hat": hat, "own": own,
+    }  # fmt: skip
+
+
+def _correlated(weight, u, hat, own):
+    """Of whitening matrices L⁻¹ [n, r, r] and blocks B of the same shape."""
+    used = diagonal_of(weight) > 0
+    L = _invert_lower(jnp.where(used[..., None], weight, jnp.eye(weight.shape[-1])))
+    sigma = jnp.sqrt((L**2).sum(2))
+    length = jnp.sqrt((weight**2).sum(1))  # √Pᵢᵢ
+    n = weight / jnp.where(used, length, 1.0)[:, None, :]
+    along = lambda B: jnp.einsum("nki,nkl,nli->ni", n, B, n)
+    h, standard = along(hat), jnp.einsum("nki,nk->ni", n, u)
+    r = jnp.einsum("nik,nkl,nli->ni", L, jnp.eye(weight.shape[-1]) - hat, weight)
+    return {
+        "residual": jnp.einsum("nik,nk->ni", L, u) / sigma, "standard": standard,
+        "gain": jnp.where(used, sigma * length, 0.0), "redundancy": jnp.where(used, r, 0.0),
+        "w": _test(standard, h, used), "hat": h, "own": along(own),
+    }  # fmt: skip
+
+
+def _test(standard, hat, used):
+    controlled = used & (1 - hat > UNCONTROLLED)
+    return jnp.where(controlled, standard / jnp.sqrt(jnp.where(controlled, 1 - hat, 1.0)), jnp.nan)
+
+
+def _invert_lower(W: Float[AnyArray, "n r r"]) -> Float[AnyArray, "n r r"]:
+    """W⁻¹ of lower triangular matrices, by forward substitution."""
+    size, rows = W.shape[-1], []
+    for i in range(size):
+        right = jnp.broadcast_to(jnp.eye(size)[i], W[:, i].shape)
+        for k, row in enumerate(rows):
+            right = right - W[:, i, k, None] * row
+        rows.append(right / W[:, i, i, None])
+    return jnp.stack(rows, 1)
+
+
+def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
+    """Of every part, from the blocks of Q that each observation touches: whitened residuals
+    [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal,
+    or for correlated observations all of it, [chunks, length, r, r]."""
+    prepared = prepare(declared, values)
+    found = []
+    for number in range(len(plan.parts)):
+        correlated = isinstance(laid.weight[number][0], tuple)
+        of_chunk = partial(_of_chunk, Q, correlated)
+        found.append(differentiate_chunks(declared, plan, number, prepared, laid, of_chunk))
     return zip(*found) if found else ((), (), ())
 
 
-def _of_chunk(Q: Cofactors, part: Part, r, touches, E):
-    """The same of one chunk, [length, r]."""
-    form = lambda a, B, b: jnp.sum((a @ B) * b, -1)
-    hat = own = jnp.zeros_like(r)
+def _of_chunk(Q: Cofactors, correlated: bool, part: Part, r, touches, E):
+    """The same of one chunk, [length, …]."""
+    block = lambda a, b: jnp.einsum("lic,ljc->lij", a, b)
+    form = block if correlated else lambda a, b: jnp.sum(a * b, -1)
+    hat = own = jnp.zeros((*r.shape, r.shape[-1]) if correlated else r.shape)
     if touches:
         J = jnp.concatenate(touches, -1)
-        hat = form(J, _of_kept(part, Q), J)
+        hat = form(J @ _of_kept(part, Q), J)
     if E is not None:
-        own = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
-        own = jnp.sum(own**2, -1)
-        hat = hat + form(E, present(Q.eliminated)[part.eliminated], E)
+        root = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
+        own = form(root, root)
+        hat = hat + form(E @ present(Q.eliminated)[part.eliminated], E)
         for touch, J in zip(part.touches, touches):
             coupled = Q.coupled[touch.group]
             rows = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]
-            hat = hat + 2 * form(E, rows[..., touch.start : touch.stop], J)
+            cross = form(E @ rows[..., touch.start : touch.stop], J)
+            hat = hat + cross + (cross.mT if correlated else cross)
     return r, hat, own
 
 
@@ -119,7 +176,8 @@ def _of_kept(part: Part, Q: Cofactors):
 
 
 def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
-    """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %)."""
+    """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %); for
+    correlated observations with σ/`gain` and 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)
     return np.where(
         r > UNCONTROLLED, np.asarray(sigma) * delta0 / np.sqrt(np.maximum(r, UNCONTROLLED)), np.inf
@@ -127,7 +185,8 @@ def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndar
 
 
 def external_reliability(redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
-    """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ."""
+    """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ; for
+    correlated observations with 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)
     bounded = np.maximum(r, UNCONTROLLED)
     return np.where(r > UNCONTROLLED, delta0 * np.sqrt((1 - bounded) / bounded), np.inf)

@@ -27,6 +27,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, with_data
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile, critical_length
@@ -120,7 +121,11 @@ def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: s
 
     **Arguments:** `adjust_from(problem, start)`: the solution of a changed problem; `estimator`:
     one of `ESTIMATORS`.
+
+    **Raises:** `InputError` if no observations are weighted as a whole.
     """
+    if not any(x.kind.snooped == "whole" and x.number for x in problem.observations):
+        raise InputError("robust estimation: no kind of observation is weighted as a whole")
     given, scale, rests = problem.data.weight, 1.0, False
     t = residual_lengths(Solution(problem, values))
     weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}

@@ -33,6 +33,7 @@ from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
+from jaxbundle.leastsquares.weights import used, without_residual
 
 REMOVED_TOGETHER = 0.5
 """Observations are removed together with the worst if their test is at least this fraction of
@@ -136,7 +137,7 @@ def snoop(
         again = lambda problem, values: readjust(problem, values, adjust_from)
         found = _solve(whole, removed, excluded, found.values, again)
     if doubtful:
-        removed = list(_test(whole, found, removed))
+        removed = list(_with_tests(whole, found, removed))
     if removed:
         found = _solve(whole, removed, excluded, found.values, adjust_from)
     return found, removed
@@ -191,9 +192,12 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     Observations of a row are separable if the test of the suspect exceeds `apart` without the
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
-    alone = [Removed(o, *_place(tests[o]), tests[o].max(initial=0.0)) for o in touched.single]
+    alone = [
+        Removed(o, *_place(tests[o]), float(tests[o].max())) for o in touched.single
+        if tests[o].size
+    ]  # fmt: skip
     together, of, row = [], [], []
-    for o in touched.whole:
+    for o in filter(lambda o: len(tests[o]), touched.whole):
         of_one = tests[o].max(1, initial=0.0)
         lonely = np.where(touched.own[o] < 0, of_one, 0.0)
         alone.append(Removed(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
@@ -235,8 +239,8 @@ def _leverage(found: Solution):
     row alone."""
     tested, tiny = found.reliability, np.finfo(float).tiny
     return {
-        o: (np.clip(1 - r - tested.own[o], 0.0, None) / np.maximum(r, tiny)).max(1, initial=0.0)
-        for o, r in tested.redundancy.items()
+        o: (np.clip(h - tested.own[o], 0.0, None) / np.maximum(1 - h, tiny)).max(1, initial=0.0)
+        for o, h in tested.hat.items()
     }
 
 
@@ -247,8 +251,9 @@ class _Neighbours:
         self.found, self.unit, self.sets = found, unit, touched.own
         self.order, self.sorted = {}, {}
         for o, own in touched.own.items():
-            used = np.flatnonzero((found.problem.weights(o) > 0).any(1) & (own >= 0))
-            self.order[o] = used[np.argsort(own[used], kind="stable")]
+            weighted = used(np.asarray(found.problem.data.weight[o])).any(1)
+            rows = np.flatnonzero(weighted & (own >= 0))
+            self.order[o] = rows[np.argsort(own[rows], kind="stable")]
             self.sorted[o] = own[self.order[o]]
 
     def alternatives(self, o: int, row: int, critical: float, apart: float) -> tuple[int, ...]:
@@ -272,28 +277,56 @@ class _Neighbours:
 def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
     """Sets, rows and residuals of removed observations that agree with the adjustment without
     them."""
-    if not removed:
-        return set()
-    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
+    aside = np.zeros(0, bool)
     if touched.eliminated is not None:
         free = lambda problem: problem.table(touched.eliminated).free.any(1)
         aside = free(whole) & ~free(found.problem)
-        for o, own in touched.own.items():
-            tests[o][(own >= 0) & aside[own]] = np.inf
-    value = lambda r, row: tests[r.set][row, r.residual if r.residual is not None else slice(None)]
+    excluded = lambda r, row: touched.own[r.set][row] >= 0 and aside[touched.own[r.set][row]]
     return {
-        (r.set, row, r.residual) for r in removed for row in r.rows
-        if np.max(value(r, row)) < critical
+        (r.set, row, r.residual)
+        for r, tests in _test_removed(whole, found, removed)
+        for row, test in zip(r.rows, tests) if test < critical and not excluded(r, row)
     }  # fmt: skip
 
 
-def _test(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
+def _with_tests(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
     """The same with the tests of initially doubtful observations."""
-    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
-    for r in removed:
-        yield r if np.isfinite(r.test) else dataclasses.replace(
-            r, test=float(tests[r.set][r.row].max())
-        )
+    for r, tests in _test_removed(whole, found, removed):
+        yield r if np.isfinite(r.test) else dataclasses.replace(r, test=tests[0])
+
+
+def _test_removed(
+    whole: Problem, found: Solution, removed: Sequence[Removed]
+) -> Iterable[tuple[Removed, list[float]]]:
+    """Each of the removed with the test of its rows against what remains.
+
+    Two residuals removed from one correlated observation are tested in separate passes, each
+    without the other, which would predict it."""
+    correlated = lambda r: r.residual is not None and whole.data.weight[r.set].ndim == 3
+    together: dict[tuple[int, int], list[Removed]] = {}
+    for r in filter(correlated, removed):
+        together.setdefault((r.set, r.row), []).append(r)
+    others = lambda r: [x for x in together[r.set, r.row] if x is not r] if correlated(r) else []
+    place = lambda r: together[r.set, r.row].index(r) if correlated(r) else 0
+    for turn in sorted({place(r) for r in removed}):
+        of = [r for r in removed if place(r) == turn]
+        rest = [x for r in of for x in others(r)]
+        data = without(whole, rest).data if rest else whole.data
+        tests = {o: _finite(t) for o, t in found.predicted_tests(data).items()}
+        for r in of:
+            residual = r.residual if r.residual is not None else slice(None)
+            yield r, [float(np.max(tests[r.set][row, residual])) for row in r.rows]
+
+
+def _remove(weight: Float[np.ndarray, "n ..."], removed: Removed) -> None:
+    """Take the weight of what is removed."""
+    rows = list(removed.rows)
+    if removed.residual is None:
+        weight[rows] = 0.0
+    elif weight.ndim == 2:
+        weight[rows, removed.residual] = 0.0
+    else:
+        weight[rows] = [without_residual(weight[row], removed.residual) for row in rows]
 
 
 def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
@@ -318,13 +351,13 @@ def without(problem: Problem, removed: Sequence[Removed], excluded: Iterable[int
     eliminated rows and those left with too few residuals."""
     weight = [np.array(w) for w in problem.data.weight]
     for r in removed:
-        weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0
+        _remove(weight[r.set], r)
     e, lone = problem.plan.eliminated, []
     if e is not None and (removed or excluded):
         touched, width = _Touched(problem), problem.table(e).space.width
         left = np.zeros(problem.table(e).rows)
         for o, own in touched.own.items():
-            rows = (np.asarray(problem.weights(o, weight[o])) > 0).sum(1)
+            rows = used(weight[o]).sum(1)
             np.add.at(left, own[own >= 0], rows[own >= 0])
         changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
         lone = sorted({*excluded} | {row for row in changed if left[row] < width})
