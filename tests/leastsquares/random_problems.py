@@ -203,8 +203,8 @@ class Dense:
     def __init__(self, problem: Random, values=None, roots=None):
         self.problem = problem
         tables = problem.tables
-        values = {t.name: t.value for t in tables} if values is None else values
-        self.values = {name: np.array(x, float) for name, x in values.items()}
+        given = {t.name: t.value for t in tables} if values is None else values
+        self.values = {t.name: np.array(given[t.name], float) for t in tables}
         ends = np.cumsum([t.free.size for t in tables])
         self.first = {t.name: int(end) - t.free.size for t, end in zip(tables, ends)}
         self.free = np.flatnonzero(np.concatenate([t.free.ravel() for t in tables]))
