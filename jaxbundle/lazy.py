@@ -5,10 +5,17 @@ import importlib
 
 def import_on_use(package: dict, homes: dict[str, tuple[str, ...]]) -> tuple:
     """`__getattr__`, `__dir__` and `__all__` of a package, given its `globals()` and the names of
-    each module."""
+    each module. Its subpackages are imported on use as well."""
     module = {name: home for home, names in homes.items() for name in names}
 
     def get(name: str):
+        if name not in module and not name.startswith("_"):
+            room = f"{package['__name__']}.{name}"
+            try:
+                return importlib.import_module(room)
+            except ModuleNotFoundError as error:
+                if error.name != room:
+                    raise
         if name not in module:
             from difflib import get_close_matches  # here: interrupts are handled before it
 
@@ -21,4 +28,10 @@ def import_on_use(package: dict, homes: dict[str, tuple[str, ...]]) -> tuple:
         package[name] = value
         return value
 
-    return get, lambda: sorted({*package, *module}), [*module]
+    def list_names() -> list[str]:
+        from pkgutil import iter_modules  # likewise
+
+        rooms = {found.name for found in iter_modules(package["__path__"]) if found.ispkg}
+        return sorted({*package, *module, *rooms})
+
+    return get, list_names, [*module]

@@ -2,6 +2,8 @@
 
 import hashlib
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -32,6 +34,27 @@ def test_the_version_stands_in_one_place_and_the_others_follow():
     assert PROJECT["dynamic"] == ["version"] and "version" not in PROJECT
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## {__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+ROOMS = """
+import pkgutil, jaxbundle
+rooms = [found.name for found in pkgutil.iter_modules(jaxbundle.__path__) if found.ispkg]
+assert {*rooms} <= {*dir(jaxbundle)}
+print(*(getattr(jaxbundle, room).__name__ for room in rooms))
+try:
+    jaxbundle.leastsquare
+except AttributeError as error:
+    print(error)
+"""
+
+
+def test_subpackages_are_attributes_of_the_package():
+    """Of a process that has imported nothing but the package."""
+    found = subprocess.run([sys.executable, "-c", ROOMS], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    rooms, message = found.stdout.splitlines()
+    assert {"jaxbundle.io", "jaxbundle.leastsquares", "jaxbundle.surface"} <= {*rooms.split()}
+    assert message == "module 'jaxbundle' has no attribute 'leastsquare'"
 
 
 def test_type_checkers_are_told_of_the_annotations():

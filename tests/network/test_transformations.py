@@ -1,0 +1,152 @@
+"""Every kind of observation of a network under jit, vmap, jvp, grad and hessian, and in float32."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle.network.build import make_further
+from jaxbundle.network.further import KINDS
+
+EPOCHS, SIGMA = 4, 0.002
+AXIS = np.array([-1.0, 0.0, 1.0])
+GRID = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), -1).reshape(-1, 3)
+
+
+def rows(images):
+    """Rows of every kind about images and about points "1" to "27" of the grid."""
+    plane = [str(k + 1) for k in np.flatnonzero(GRID[:, 2] == -1)]
+    body = [str(k + 1) for k in np.flatnonzero(GRID[:, 0] == 1)][:5]
+    antenna = {f"s{a}": [0.01] * len(images) for a in "XYZ"} | dict.fromkeys("XYZ", [0.0] * 8)
+    angles = ("omega", "phi", "kappa")
+    return {
+        "antennas": {"image": images, "rXY": [0.8] * 8, "rXZ": [-0.3] * 8, "strip": list("aaaabbbb")}
+        | antenna,
+        "antenna": {"free": ["shift"], "sigma": {"shift": 0.05}},
+        "attitudes": {"image": images}
+        | {a: [0.0] * 8 for a in angles} | {f"s{a}": [1e-3] * 8 for a in angles},
+        "attitude": {"free": ["boresight"], "sigma": {"boresight": 0.01}},
+        "rigs": [
+            {"rig": "pair", "epoch": str(e), "image": images[e + k * EPOCHS]}
+            for k in (0, 1) for e in range(EPOCHS)
+        ],
+        "rig": {"reference": "left", "sigma_position": 0.01, "sigma_angle": 0.001},
+        "velocities": {"image": images} | {f"s{v}": [0.5] * 8 for v in ("vX", "vY", "vZ")}
+        | {f"s{w}": [0.1] * 8 for w in ("wx", "wy", "wz")},
+        "rolling_shutter": {"line_time": 1e-4, "free": ["vX", "vY", "vZ", "wx", "wy", "wz"]},
+        "differences": [{"from": "1", "to": "27", "dX": 0.0, "dY": 0.0, "dZ": None,
+                         "sdX": 0.01, "sdY": 0.01, "sdZ": None}],
+        "angles": [{"from": "1", "at": "2", "to": "14", "value": 1.0, "sigma": 1e-3}],
+        "ties": [{"camera": "left", "other": "right", "parameter": "c", "sigma": 0.1}],
+        "figures": [{"figure": "floor", "type": "plane", "point": p, "sigma": 0.01} for p in plane],
+        "shapes": [
+            {"shape": "body", "point": p, "sigma": 0.01}
+            | dict(zip("xyz", GRID[int(p) - 1] @ [[0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+            for p in body
+        ],
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """Two cameras in a rig at four epochs, with control, distances and priors."""
+    ring = jaxbundle.ring_of_stations(EPOCHS, radius=6.0, height=2.0, roll_every=2)
+    camera = lambda id: jaxbundle.Camera(
+        id, "brown", {"c": 30.0, "K1": -1e-4}, ("c", "K1"), {"c": 0.1}, image_size=(3600, 2400),
+        pixel_size=(0.01, 0.01),
+    )  # fmt: skip
+    shifted = dataclasses.replace(ring, position=ring.position + [0.4, 0.1, 0.0])
+    made = jaxbundle.simulate_with_truth(
+        ring + shifted, GRID, [camera("left"), camera("right")],
+        camera_of_station=[0] * EPOCHS + [1] * EPOCHS, noise=SIGMA, seed=2,
+        disturb=(0.01, 0.002, 0.01), datum="control", control=[0, 8, 20, 26], control_sigma=0.005,
+        distances=((1, 5), (5, 7)), distance_sigma=0.002,
+    )  # fmt: skip
+    network, truth = made.network, made.truth
+    images = list(network.images.id)
+    given = network.replace(
+        further=tuple(make_further(rows(images), 1.0)),
+        images=dataclasses.replace(
+            network.images, sigma=np.tile([0.02] * 3 + [0.002] * 3, (len(images), 1))
+        ),
+    )
+    given = jaxbundle.simulate_further(given, truth, seed=3)
+    seen = given.observations
+    edges = [
+        {"line": str(line), "image": images[i], "sigma": 0.01,
+         "x": float(seen.xy[k, 0]), "y": float(seen.xy[k, 1])}
+        for line, points in enumerate([(0, 1, 2), (6, 7, 8)])
+        for k, (i, p) in enumerate(zip(seen.image, seen.point)) if p in points
+    ]  # fmt: skip
+    given = given.replace(further=(*given.further, *make_further({"edges": edges}, 1.0)))
+    return jaxbundle.make_problem(jaxbundle.check_network(given))
+
+
+def test_every_kind_is_there(problem):
+    assert {type(one).TABLE for one in problem.network.further} == KINDS.keys()
+    assert any(np.ndim(weight) == 3 for _, weight in problem.data.other), "no covariance"
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """The solution along one direction of all data; everything in units of its a priori σ."""
+
+    problem: jaxbundle.Problem
+    base: jaxbundle.Data
+    along: jaxbundle.Data
+    scale: np.ndarray
+
+    def data(self, t):
+        return jax.tree.map(lambda x, d: x + t * d, self.base, self.along)
+
+    def __call__(self, t):
+        values = jaxbundle.solve(self.problem, self.data(t))
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(values)]) / self.scale
+
+
+@pytest.fixture(scope="module")
+def line(problem):
+    random = np.random.default_rng(5)
+    base = jax.tree.map(np.asarray, problem.data)
+    # Weights change by a hundredth, other numbers by a thousandth of their size.
+    of = lambda x, part: part * random.normal(size=np.shape(x)) * np.abs(x)
+    along = jax.tree.map(lambda x: of(x, 1e-3), base)
+    other = tuple((m, of(w, 1e-2)) for (m, _), (_, w) in zip(along.other, base.other))
+    along = dataclasses.replace(along, other=other)
+    values = jax.tree.leaves(jaxbundle.solve(problem))
+    scale = np.concatenate([np.full(np.size(x), np.abs(x).max() + 1e-3) for x in values])
+    return Line(problem, base, along, scale)
+
+
+def test_jit_and_vmap_give_the_same_numbers(line):
+    steps = jnp.array([0.0, 0.5, 1.0])
+    alone = np.stack([line(t) for t in steps])
+    assert np.isfinite(alone).all() and np.abs(alone[1] - alone[0]).max() > 1e-4
+    np.testing.assert_allclose(np.stack([jax.jit(line)(t) for t in steps]), alone, atol=1e-9)
+    np.testing.assert_allclose(jax.vmap(line)(steps), alone, atol=1e-9)
+
+
+def test_derivatives_are_those_of_differences(line):
+    """Forward and reverse, first and second, along one direction of all data."""
+    towards = np.random.default_rng(6).normal(size=len(line.scale))
+    along = jax.jit(lambda t: towards @ line(t))
+    first = jax.jit(jax.grad(along))
+    second = jax.jit(jax.hessian(along))
+    forward = jax.jvp(along, (0.0,), (1.0,))[1]
+    h = 0.1
+    differences = (8 * (along(h) - along(-h)) - (along(2 * h) - along(-2 * h))) / (12 * h)
+    np.testing.assert_allclose([first(0.0), forward], differences, rtol=1e-6)
+    differences = (8 * (first(h) - first(-h)) - (first(2 * h) - first(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(second(0.0), differences, rtol=1e-5)
+
+
+def test_single_precision_is_taken_as_the_numbers_it_holds(line):
+    single = jax.tree.map(lambda x: np.asarray(x, np.float32), line.data(0.3))
+    double = jax.tree.map(lambda x: np.asarray(x, np.float64), single)
+    found, right = (jaxbundle.solve(line.problem, data) for data in (single, double))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(right), strict=True):
+        assert a.dtype == np.float64
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
