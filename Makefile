@@ -19,7 +19,7 @@ BAL ?=
 PEERS ?=
 
 .PHONY: demo test test-all random-problems bench docs install install-docs clean \
-  $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
+  bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -109,6 +109,11 @@ bench-large: $(VENV)/compared
 
 bench-pushbroom bench-orientation bench-measuring bench-blunders bench-design: bench-%: $(VENV)/compared
 	$(BIN)/python benchmarks/$*.py
+
+# On the GPU of this machine and on its processor, in at most eight minutes, with the Python, JAX, equinox,
+# optimistix, lineax and scipy that are there (nothing is installed); BAL problems: make bench-gpu BAL=folder
+bench-gpu:
+	PYTHONPATH=.:$(PYTHONPATH) $(PYTHON) benchmarks/gpu.py $(if $(BAL),--bal $(BAL)) $(if $(OUT),--json $(OUT)/gpu.json)
 
 clean:
 	rm -rf $(VENV) out

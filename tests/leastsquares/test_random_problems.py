@@ -128,7 +128,9 @@ def compare_derivatives(seed: int, variant: int = 0) -> None:
             measured["c"].update({slot: c - mean for slot, c in measured["c"].items()})
     unknowns = _Unknowns(given, here.free)
     solved = lambda data: unknowns(ls.solve(problem, data))
-    forward = here.estimable(np.asarray(jax.jvp(solved, (data,), (along,))[1]))
+    # Under jit, where everything of the problem itself must be a constant.
+    jvp = jax.jit(lambda data, along: jax.jvp(solved, (data,), (along,))[1])
+    forward = here.estimable(np.asarray(jvp(data, along)))
     towards = here.estimable(rng.normal(size=len(here.free)))
     (back,) = jax.vjp(solved, data)[1](jnp.asarray(towards))
     pairs = zip(jax.tree.leaves(back), jax.tree.leaves(along), strict=True)

@@ -12,6 +12,7 @@ from jaxbundle.network.build import make_further
 from jaxbundle.network.further import KINDS
 
 EPOCHS, SIGMA = 4, 0.002
+pytestmark = pytest.mark.further  # minutes of compiling for twenty kinds at once
 AXIS = np.array([-1.0, 0.0, 1.0])
 GRID = np.stack(np.meshgrid(AXIS, AXIS, AXIS, indexing="ij"), -1).reshape(-1, 3)
 
@@ -121,26 +122,27 @@ def line(problem):
     return Line(problem, base, along, scale)
 
 
-def test_jit_and_vmap_give_the_same_numbers(line):
-    steps = jnp.array([0.0, 0.5, 1.0])
-    alone = np.stack([line(t) for t in steps])
-    assert np.isfinite(alone).all() and np.abs(alone[1] - alone[0]).max() > 1e-4
-    np.testing.assert_allclose(np.stack([jax.jit(line)(t) for t in steps]), alone, atol=1e-9)
-    np.testing.assert_allclose(jax.vmap(line)(steps), alone, atol=1e-9)
-
-
-def test_derivatives_are_those_of_differences(line):
-    """Forward and reverse, first and second, along one direction of all data."""
+def test_jit_vmap_and_derivatives(line):
+    """Values, first derivatives (forward and reverse) and second ones along one direction of all
+    data, in one program for five steps: each as by differences of the one before, and the values as
+    those of a single call."""
     towards = np.random.default_rng(6).normal(size=len(line.scale))
-    along = jax.jit(lambda t: towards @ line(t))
-    first = jax.jit(jax.grad(along))
-    second = jax.jit(jax.hessian(along))
-    forward = jax.jvp(along, (0.0,), (1.0,))[1]
+    along = lambda t: towards @ line(t)
+
+    @jax.jit
+    @jax.vmap
+    def evaluate(t):
+        value, forward = jax.jvp(along, (t,), (1.0,))
+        return value, forward, jax.grad(along)(t), jax.hessian(along)(t)
+
     h = 0.1
-    differences = (8 * (along(h) - along(-h)) - (along(2 * h) - along(-2 * h))) / (12 * h)
-    np.testing.assert_allclose([first(0.0), forward], differences, rtol=1e-6)
-    differences = (8 * (first(h) - first(-h)) - (first(2 * h) - first(-2 * h))) / (12 * h)
-    np.testing.assert_allclose(second(0.0), differences, rtol=1e-5)
+    value, forward, first, second = evaluate(h * jnp.arange(-2.0, 3.0))
+    assert np.ptp(value) > 1e-4
+    np.testing.assert_allclose(value[4], along(2 * h), rtol=1e-9)
+    slope = lambda f: (8 * (f[3] - f[1]) - (f[4] - f[0])) / (12 * h)
+    np.testing.assert_allclose(forward, first, rtol=1e-8)
+    np.testing.assert_allclose(first[2], slope(value), rtol=1e-6)
+    np.testing.assert_allclose(second[2], slope(first), rtol=1e-5)
 
 
 def test_single_precision_is_taken_as_the_numbers_it_holds(line):
