@@ -24,8 +24,8 @@ def rows(images):
     antenna = {f"s{a}": [0.01] * len(images) for a in "XYZ"} | dict.fromkeys("XYZ", [0.0] * 8)
     angles = ("omega", "phi", "kappa")
     return {
-        "antennas": {"image": images, "rXY": [0.8] * 8, "rXZ": [-0.3] * 8, "strip": list("aaaabbbb")}
-        | antenna,
+        "antennas": antenna
+        | {"image": images, "rXY": [0.8] * 8, "rXZ": [-0.3] * 8, "strip": list("aaaabbbb")},
         "antenna": {"free": ["shift"], "sigma": {"shift": 0.05}},
         "attitudes": {"image": images}
         | {a: [0.0] * 8 for a in angles} | {f"s{a}": [1e-3] * 8 for a in angles},
