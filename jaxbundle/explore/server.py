@@ -1,9 +1,10 @@
 """One page for one browser, from the loopback address.
 
 The address contains a random token: without it another user of the machine, or a page of another
-site that guesses the port, gets status 403. Bodies are JSON of limited size. Errors of the view are
-returned as `{"error": …}`, one line, with status 400; program faults with status 500 and a line on
-the terminal.
+site that guesses the port, gets status 403; so does a request that the browser says comes from
+another site (`Origin`), or for another host. A request must arrive within `REQUEST_TIMEOUT`. Bodies
+are JSON of limited size. Errors of the view are returned as `{"error": …}`, one line, with status
+400; program faults with status 500 and a line on the terminal.
 
 | request | answer |
 |---|---|
@@ -14,7 +15,9 @@ the terminal.
 """
 
 import json
+import math
 import secrets
+import socket
 import threading
 from collections.abc import Callable
 from http import HTTPStatus
@@ -31,7 +34,9 @@ MOST_BYTES = 256 * 1024
 """Maximum bytes of the body of a request."""
 MOST_READ = 16 * MOST_BYTES
 REQUEST_TIMEOUT = 30.0
-"""Timeout for the announced body of a request, seconds."""
+"""Seconds in which a request must arrive, all of it: a sender that trickles bytes must not hold a
+connection."""
+METHODS = "GET, POST"
 HTML, JSON = "text/html; charset=utf-8", "application/json"
 
 
@@ -79,6 +84,28 @@ class Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "jaxbundle", ""
     timeout = REQUEST_TIMEOUT
 
+    def handle_one_request(self) -> None:
+        """As usual, with a deadline for all that is read: `timeout` is that of one read."""
+        self.deadline = threading.Timer(REQUEST_TIMEOUT, self._stop_reading)
+        self.deadline.daemon = True
+        self.deadline.start()
+        try:
+            super().handle_one_request()
+        finally:
+            self.deadline.cancel()
+
+    def _stop_reading(self) -> None:
+        try:
+            self.connection.shutdown(socket.SHUT_RD)
+        except OSError:
+            pass  # closed meanwhile
+
+    def __getattr__(self, name: str):
+        """Every other method is refused like any other request, not by the page of the library."""
+        if name.startswith("do_"):
+            return lambda: self._respond(_refuse_method, b"")
+        raise AttributeError(name)
+
     def do_GET(self) -> None:
         """The page."""
         self._respond(self._get, b"")
@@ -90,12 +117,15 @@ class Handler(BaseHTTPRequestHandler):
         # Read before it is answered, or the browser would lose the answer; of an oversized one only
         # enough to detect that.
         body = self.rfile.read(min(int(length), MOST_READ)) if known else None
+        if body is not None and len(body) < min(int(length), MOST_READ):
+            return self._respond(_refuse_incomplete, b"")
         self._respond(self._post, body)
 
     def log_message(self, *_: Any) -> None:
         """Requests are not listed on the terminal."""
 
     def _respond(self, act: Callable[[str, bytes], File], body: bytes | None) -> None:
+        self.deadline.cancel()
         try:
             action = self._action()
             if body is None:
@@ -118,20 +148,24 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(file.content)))
         for name, value in (
             ("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"),
-            ("Referrer-Policy", "no-referrer"),
+            ("Referrer-Policy", "no-referrer"), ("Allow", METHODS),
         ):  # fmt: skip
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(file.content)
+        if self.command != "HEAD":
+            self.wfile.write(file.content)
 
     def _action(self) -> str:
         """What the address names after the token.
 
         **Raises:** `Refused` without the token, and for another name of this machine: a site whose
         name leads here must not speak with it."""
-        port = self.server.server_port
-        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
+        hosts = [f"{name}:{self.server.server_port}" for name in (HOST, "localhost")]
+        given, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        if len(given) != 1 or given[0] not in hosts:
             raise Refused(HTTPStatus.FORBIDDEN, f"this page is served at {HOST} only")
+        if any(origin not in [f"http://{host}" for host in hosts] for origin in origins):
+            raise Refused(HTTPStatus.FORBIDDEN, "a page of another site may not ask")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from "
@@ -164,7 +198,9 @@ def respond(view: View, action: str, given: Given) -> File:
 def _parse(body: bytes) -> Given:
     """The values of a body, a JSON object."""
     try:
-        given = json.loads(body, parse_constant=_no_number)
+        given = json.loads(
+            body, parse_constant=_no_number, parse_int=_whole_number, parse_float=_finite_number
+        )
     except (ValueError, RecursionError) as error:
         raise InputError(f"the body is not JSON: {_line(error)}") from None
     if not isinstance(given, dict):
@@ -193,3 +229,22 @@ def _line(error: Exception) -> str:
 
 def _no_number(word: str):
     raise ValueError(f"{word} is not a JSON number")
+
+
+def _finite_number(word: str) -> float:
+    if not math.isfinite(number := float(word)):
+        raise ValueError(f"{word[:20]}… is larger than any number of 64 bits")
+    return number
+
+
+def _whole_number(word: str) -> int:
+    _finite_number(word)
+    return int(word)
+
+
+def _refuse_method(_: str, __: bytes) -> File:
+    raise Refused(HTTPStatus.METHOD_NOT_ALLOWED, f"expected one of the methods {METHODS}")
+
+
+def _refuse_incomplete(_: str, __: bytes) -> File:
+    raise Refused(HTTPStatus.REQUEST_TIMEOUT, "the body ended before its announced length")

@@ -8,9 +8,11 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 import zipfile
 from importlib.resources import files
 from pathlib import Path
@@ -28,6 +30,7 @@ from page_reader import decode
 import jaxbundle
 from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
+from jaxbundle.explore import server as server_module
 from jaxbundle.explore.camera import CameraView
 from jaxbundle.explore.network import NetworkView
 from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
@@ -155,12 +158,65 @@ def test_without_the_token_nothing_is_answered(doubling, path):
     assert ask(doubling, "", Host=f"evil.example:{doubling.server_port}")[0] == 403
 
 
+def raw(server, *lines, wait=10.0):
+    """Status and body of a request of these lines."""
+    with socket.create_connection(("127.0.0.1", server.server_port), wait) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        answer = b"".join(iter(lambda: connection.recv(4096), b"")).decode()
+    head, _, body = answer.partition("\r\n\r\n")
+    return int(head.split()[1]), body
+
+
+def test_another_site_is_refused_even_with_the_token(doubling):
+    here = f"127.0.0.1:{doubling.server_port}"
+    for origin in ("null", "https://evil.example", f"http://{here}.evil.example"):
+        status, said, _ = ask(doubling, "answer", {"x": 1}, Origin=origin)
+        assert status == 403 and "another site" in said
+    assert ask(doubling, "answer", {"x": 1}, Origin=f"http://{here}")[0] == 200
+    get = f"GET /{doubling.token}/ HTTP/1.1"
+    assert raw(doubling, get, f"Host: {here}")[0] == 200
+    assert raw(doubling, get, f"Host: {here}", "Host: evil.example")[0] == 403
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "ANYTHING"])
+def test_other_methods_are_refused_as_all_else(doubling, method):
+    status, said, headers = ask(doubling, "answer", {"x": 1}, method)
+    assert status == 405 and headers["Allow"] == "GET, POST"
+    assert json.loads(said) == {"error": "expected one of the methods GET, POST"}
+
+
+def test_a_request_that_trickles_in_does_not_hold_its_connection(doubling, monkeypatch):
+    """A byte now and then, of the head or of the body, until the deadline of the whole."""
+    monkeypatch.setattr(server_module, "REQUEST_TIMEOUT", 0.5)
+    head = f"POST /{doubling.token}/answer HTTP/1.1\r\nHost: 127.0.0.1:{doubling.server_port}\r\n"
+    for first in (head, f"{head}Content-Length: 1000\r\n\r\n"):
+        begin = time.monotonic()
+        with socket.create_connection(("127.0.0.1", doubling.server_port), 30) as connection:
+            connection.sendall(first.encode())
+            connection.settimeout(0.1)
+            answer = b""
+            while time.monotonic() < begin + 20:
+                try:
+                    connection.sendall(b"x")
+                    if not (more := connection.recv(4096)):
+                        break
+                    answer += more
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+        assert time.monotonic() < begin + 20, "the connection is held"
+    assert b" 408 " in answer
+
+
 @pytest.mark.parametrize("path, body, status, words", [
     ("other", None, 404, "only page"), ("other", {}, 404, "there is no other"),
     ("export/", {}, 404, "there is no export"), ("export/y", {}, 400, "no file 'y'"),
     ("answer", "{", 400, "not JSON"), ("answer", "[1]", 400, "object of values"),
     ("answer", '{"x": NaN}', 400, "not a JSON number"), ("answer", "[" * 5000, 400, "not JSON"),
     ("answer", b"\xff\xfe", 400, "not JSON"),
+    ("answer", '{"x": %s}' % ("1" * 400), 400, "larger than any number"),
+    ("answer", '{"x": 1e999}', 400, "larger than any number"),
     ("answer", {"x": "1"}, 400, "x must be a finite number"),
     ("answer", {"x": True}, 400, "x must be a finite number"),
     ("answer", {"z": 1}, 400, "no value 'z'"), ("answer", {"x": 13}, 500, "a fault"),
