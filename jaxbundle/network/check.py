@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, list_some
+from jaxbundle.network.number_range import check_coordinates
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.rules import (
     AXES,
@@ -72,7 +73,7 @@ def check_tables(network: Network) -> Network:
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
     _check_sizes(network)
-    network = _check_cameras(network)
+    network = _check_cameras(check_coordinates(network))
     _check_images(network)
     network = _check_points(network)
     _check_observations(network)

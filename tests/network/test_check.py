@@ -405,3 +405,30 @@ def test_fields_of_a_camera_of_another_kind(field, value, message):
     fields = {"id": "cam", "model": "brown", "parameters": {"c": 20.0}} | {field: value}
     with pytest.raises(InputError, match=re.escape(message)):
         check_camera(Camera(**fields))
+
+
+def far_away(shift=0.0, scale=1.0):
+    given = tables()
+    for table, axes in (("points", "XYZ"), ("images", ("X0", "Y0", "Z0"))):
+        for row in given[table]:
+            row.update({axis: scale * row[axis] + shift for axis in axes})
+    return make_network(**given)
+
+
+@pytest.mark.parametrize("shift, scale", [(0.0, 1e150), (1e17, 1.0), (1e13, 1e-4)])
+def test_coordinates_that_cannot_be_computed_with_are_refused(shift, scale):
+    with pytest.raises(InputError, match="within ±1e|subtract a common offset"):
+        check_network(far_away(shift, scale))
+
+
+def test_one_coordinate_beyond_all_numbers_is_named():
+    with pytest.raises(InputError, match="image 'i1': expected Z0 within ±1e.75, got 1e.300"):
+        check_network(broken("images", 1, Z0=1e300))
+
+
+def test_coordinates_with_too_few_digits_are_told_with_their_step():
+    """At 1e11 neighbouring numbers are 1.5e-5 apart, 3e-7 of the network; in a national grid 1e-9 m
+    are nothing."""
+    (warning,) = [w for w in check_network(far_away(1e11)).warnings if "held in steps" in w]
+    assert "1e+11 are held in steps of 1.5e-05 m" in warning and "51 m wide" in warning
+    assert not any("held in steps" in w for w in check_network(far_away(5e6)).warnings)
