@@ -1,0 +1,42 @@
+"""Coordinates that 64-bit numbers can hold, with the digits that a network needs."""
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Network
+
+LARGEST = 1e75
+"""Normal equations and cofactors have products of four lengths; the largest number is 1.8e308."""
+FINEST, COARSEST = 1e-7, 1e-3
+"""Steps between neighbouring numbers, relative to the extent of the network: σ of the best
+networks are 1e-6 to 1e-7 of it, so larger steps are noticed; at a thousandth the object is lost."""
+
+
+def check_coordinates(network: Network) -> Network:
+    """The network, with a warning if its coordinates are so large that rounding matters.
+
+    **Raises:** `InputError` for coordinates that cannot be computed with."""
+    for table, thing, axes in (
+        (network.points, "point", ("X", "Y", "Z")), (network.images, "image", ("X0", "Y0", "Z0")),
+    ):  # fmt: skip
+        x = table.position
+        for row, k in np.argwhere(np.isfinite(x) & (np.abs(x) > LARGEST))[:1]:
+            raise InputError(
+                f"{table.source(row)}: {thing} {table.id[row]!r}: expected {axes[k]} within "
+                f"±{LARGEST:g}, got {x[row, k]:g}"
+            )
+    position = np.concatenate([network.points.position, network.images.position])
+    position = position[np.isfinite(position).all(1)]
+    extent = np.ptp(position, 0).max() if len(position) else 0.0
+    largest = np.abs(position).max(initial=0.0)
+    step = np.spacing(largest)
+    if step <= FINEST * extent or extent == 0:
+        return network
+    what = (
+        f"coordinates of {largest:.3g} are held in steps of {step:.2g} {network.object_unit}, and "
+        f"the network is {extent:.3g} {network.object_unit} wide: subtract a common offset from "
+        "all of them"
+    )
+    if step > COARSEST * extent:
+        raise InputError(f"{network.points.source.name}: {what}")
+    return network.warn(what)
