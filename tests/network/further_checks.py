@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.bundle.minimum import minimise
-from jaxbundle.leastsquares.indexing.rows import evaluate
+from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 
 STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 
@@ -25,7 +25,8 @@ def check_jacobians(problem, values, skip=("image coordinates",)):
         spaces = [system.declared.spaces[name] for name in kind.of]
         touched = [jax.tree.map(lambda x, r=rows[row]: jnp.asarray(x)[r], tables[name])
                    for name, rows in zip(kind.of, given.rows)]  # fmt: skip
-        measured = jax.tree.map(lambda x, row=row: _scalars(x[row]), given.measured)
+        one_row = jax.tree.map(lambda x, row=row: x[row : row + 1], given.measured)
+        measured = jax.tree.map(lambda x: x[0], scalars(one_row))
         along = [random.normal(size=s.width) for s in spaces]
 
         def moved(step, spaces=spaces, touched=touched, along=along, kind=kind, measured=measured):
@@ -46,10 +47,6 @@ def check_jacobians(problem, values, skip=("image coordinates",)):
         differences = factors / h @ np.asarray(retracted(h * steps))
         assert np.abs(slope).max() > 1e-6, kind.name
         np.testing.assert_allclose(slope, differences, rtol=1e-7, atol=1e-7, err_msg=kind.name)
-
-
-def _scalars(x):
-    return x if np.ndim(x) == 0 else tuple(map(_scalars, x))
 
 
 def sample(problem, values, tables, draws=24):
