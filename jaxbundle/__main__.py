@@ -7,7 +7,6 @@ library reads the variable on import.
 import gc
 import os
 import sys
-import warnings
 
 from jaxbundle.system.interrupts import handle_interrupts, set_status
 
@@ -39,25 +38,6 @@ def _keep_programs() -> None:
     from jaxbundle.system.configuration import keep_programs
 
     keep_programs()
-    _tell_once_of_damage()
-
-
-def _tell_once_of_damage() -> None:
-    """JAX warns of every unreadable cached program, in every run, since it does not replace it."""
-    show, told = warnings.showwarning, []
-
-    def tell(message, *where):
-        if "persistent compilation cache entry" not in str(message):
-            return show(message, *where)
-        if not told and "--quiet" not in sys.argv:
-            print(
-                "jaxbundle: compiled programs cannot be read or written; delete the folder"
-                f" {sys.modules['jax'].config.jax_compilation_cache_dir}",
-                file=sys.stderr,
-            )
-        told.append(message)
-
-    warnings.showwarning = tell
 
 
 if __name__ == "__main__":

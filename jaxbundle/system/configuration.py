@@ -5,16 +5,20 @@ import re
 import socket
 import sys
 import time
+import warnings
+from contextlib import suppress
+from pathlib import Path
 from typing import NoReturn
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 
-_folders: list[str] = []
-"""That of kept programs, if some are kept."""
 SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
+
+LONGEST_WRITING = 60.0
+"""Seconds within which another process has written the file of a program, some megabytes."""
 
 THREADS = "NPROC"
 """XLA's environment variable of the number of threads of its pool; default: one for each core."""
@@ -49,8 +53,8 @@ def use_cores(number: int | None = None) -> None:
 
 
 def keep_programs(folder: str | os.PathLike | None = None) -> bool:
-    """Keep compiled programs in a folder, so that later processes start without compiling; call it
-    before the first JAX computation.
+    """Keep compiled programs in a folder by JAX's persistent cache, so that later processes start
+    without compiling; call it before the first JAX computation.
 
     `folder`: default that of the environment variable JAX_COMPILATION_CACHE_DIR, else
     `jaxbundle` in the user's cache folder.
@@ -74,19 +78,34 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         usable = False
     # JAX has already read the variable, and would warn of a bad folder for every program.
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
-    _folders.clear()
     if not usable:
         return False
     watch_cache(folder)
-    _folders.append(os.path.abspath(folder))
+    _remove_damaged_programs(Path(os.path.abspath(folder)))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
     return True
 
 
-def folder_of_programs() -> str | None:
-    """The folder of kept programs; None if none are kept."""
-    return _folders[-1] if _folders else None
+def _remove_damaged_programs(folder: Path) -> None:
+    """Remove the files of programs that JAX cannot read, instead of showing its warnings.
+
+    JAX compiles them again, in every process, since it does not replace a file. A damaged one is
+    left by a full disk; one that is just being written by another process is not touched."""
+    show, about = warnings.showwarning, "Error (reading|writing) persistent compilation cache entry"
+
+    def handle(message, *where, **options):
+        if not re.match(about, str(message)):
+            return show(message, *where, **options)
+        name, latest = re.search(r"'(\w+)", str(message)), time.time() - LONGEST_WRITING
+        for file in folder.glob(f"{name[1]}-*-cache") if name else ():
+            with suppress(OSError):
+                if file.stat().st_mtime < latest:
+                    file.unlink()
+
+    # "always": as an error, by -W error, it would end the computation.
+    warnings.filterwarnings("always", about)
+    warnings.showwarning = handle
 
 
 def join_processes(
