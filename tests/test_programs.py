@@ -99,8 +99,8 @@ def test_line_scanners_draw_random_errors(home):
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the folder ../shared/data/real is not here")
 def test_models_of_real_files(home):
-    said = run_twice([f"camera {SHARED}/tp.toml#a", f"convert {SHARED}/tpcol out.csv"], home)
-    assert "thin-prism-fisheye" in said
+    lines = [f"camera {SHARED}/tp.toml#a", f"convert {SHARED}/tpcol out.csv --force"]
+    assert "thin-prism-fisheye" in run_twice(lines, home)
     assert len(Path(home["HOME"], "out.csv").read_text().splitlines()) > 1
 
 
@@ -111,10 +111,10 @@ jaxbundle.keep_programs()
 if "replaced" in sys.argv:
     from jaxbundle.leastsquares import spaces
     ray = spaces.Posed.ray
-    def longer(*given):
+    def bent(*given):  # by nothing that a parameter of the camera can be
         x, y, z = ray(*given)
-        return x, y, 1.5 * z
-    spaces.Posed.ray = longer
+        return x + 0.1 * y**3 / z**2, y, z
+    spaces.Posed.ray = bent
 print(repr(jaxbundle.adjust(jaxbundle.read_network(sys.argv[1])).sigma0))
 """
 
@@ -139,9 +139,7 @@ def test_damaged_programs_are_compiled_again_and_replaced(home):
         file.write_bytes([b"", content[:middle], bytes(len(content)), noise][number % 4])
         os.utime(file, (0, 0))  # by a process that ended long ago
     run(code, environment=home, options=("-W", "error"))
-    assert not set(files) & set(programs(home)), "removed, since JAX does not replace them"
-    run(code, environment=home)
-    assert set(files) <= set(programs(home))
+    assert all(file.stat().st_mtime > 0 for file in files), "JAX alone does not replace them"
 
 
 def test_a_full_disk_is_no_matter(home):
