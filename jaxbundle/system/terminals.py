@@ -13,10 +13,14 @@ from collections.abc import Iterable
 HANDLER = "jaxbundle.ascii"
 ASCII = {
     "σ": "s", "µ": "u", "μ": "u", "·": "*", "−": "-", "–": "-", "—": "-", "─": "-", "━": "-",
-    "×": "x", "→": "->", "←": "<-", "±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "√": "sqrt",
-    "∞": "inf", "°": "deg", "′": "'", "⁄": "/", "∂": "d", "∇": "grad", "∠": "angle",
+    "×": "x", "±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "√": "sqrt", "∞": "inf",
+    "→": "->", "←": "<-", "°": "deg", "′": "'", "⁄": "/", "∂": "d", "∇": "grad", "∠": "angle",
+    "λ": "lambda",
 }  # fmt: skip
 """As `sX` is the column of σX in tables: one letter, so that columns stay aligned."""
+
+
+SURROGATES = re.compile("[\ud800-\udfff]")
 
 
 def write_everywhere() -> None:
@@ -30,23 +34,35 @@ def write_everywhere() -> None:
 def write_json(text: str | Iterable[str]) -> None:
     """Write JSON, or its pieces, to standard output: in UTF-8, or with escapes."""
     codec = codecs.lookup(sys.stdout.encoding or "utf-8").name
-    beyond = re.compile("[\ud800-\udfff]" if codec.startswith("utf") else "[^\0-\x7f]")
-    for piece in (text,) if isinstance(text, str) else text:
-        sys.stdout.write(beyond.sub(_escape, piece))
+    for piece in map(in_utf8, (text,) if isinstance(text, str) else text):
+        sys.stdout.write(piece if codec.startswith("utf") else re.sub("[^\0-\x7f]", _escape, piece))
+
+
+def in_utf8(text: str) -> str:
+    """A text without what UTF-8 cannot write: bytes in names of files (`os.fsdecode`) that are no
+    UTF-8, and halves of letters. Names that Python could not read in a locale without UTF-8 become
+    what they are."""
+    if not SURROGATES.search(text):
+        return text
+    text = re.sub("[\ud800-\udc7f\udd00-\udfff]", "\ufffd", text)
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def for_output(text: str) -> str:
     """A text as standard output can write it."""
     codec = getattr(sys.stdout, "encoding", None) or "utf-8"
-    try:
-        text.encode(codec)
-    except UnicodeEncodeError:
-        return "".join(map(_in_ascii, text))
-    return text
+    codecs.register_error(HANDLER, _replace)
+    return text.encode(codec, HANDLER).decode(codec, "surrogateescape")
+
+
+def for_printing(text: str) -> str:
+    """A text that `print` can write: unchanged where its stream replaces what it cannot write."""
+    strict = getattr(sys.stdout, "errors", None) in (None, "strict")
+    return for_output(text) if strict else text
 
 
 def _escape(found: re.Match) -> str:
-    units = found[0].encode("utf-16-be", "surrogatepass")
+    units = found[0].encode("utf-16-be")
     return "".join(f"\\u{units[i : i + 2].hex()}" for i in range(0, len(units), 2))
 
 
