@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
+from jaxbundle.system.xla_flags import jaxlib_version
 
 SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
@@ -29,14 +30,18 @@ def allow_programs_at_once() -> None:
     the first JAX computation.
 
     jaxlib 0.10 waits in XLA's pool for the parts of such a factorisation: as many programs as the
-    pool has threads deadlock. More threads than cores make large networks up to a sixth slower
+    pool has threads deadlock. From 0.11 on they do not (tests/test_float64.py, with one thread
+    too), and nothing is set: more threads than cores make large networks up to a sixth slower
     (`NPROC=4 python benchmarks/bal_ours.py FILE --devices 2`).
     """
-    os.environ.setdefault(THREADS, str(available_cores() + 2))
+    if jaxlib_version() < (0, 11):
+        os.environ.setdefault(THREADS, str(available_cores() + 2))
 
 
 def can_run_two_programs() -> bool:
     """Whether XLA's pool has a thread left while two programs wait in it."""
+    if jaxlib_version() >= (0, 11):
+        return True  # they do not wait there
     given = os.environ.get(THREADS, "")
     return (int(given) if given.isdecimal() else available_cores()) > 2
 
@@ -59,7 +64,9 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     `folder`: default that of the environment variable JAX_COMPILATION_CACHE_DIR, else
     `jaxbundle` in the user's cache folder.
 
-    **Returns:** whether the folder is writable; if not, nothing is kept.
+    **Returns:** whether the folder is writable, and jaxlib 0.10.2 or later; if not, nothing is
+    kept. For every kept program earlier ones print two errors, about features of the processor
+    that are none.
     """
     import jax
 
@@ -76,6 +83,7 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         usable = os.access(folder, os.W_OK | os.X_OK)
     except OSError:
         usable = False
+    usable = usable and jaxlib_version() >= (0, 10, 2)
     # JAX has already read the variable, and would warn of a bad folder for every program.
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
     if not usable:
