@@ -46,8 +46,10 @@ random-problems: install
 	cd tests/leastsquares && ../../$(BIN)/python test_random_problems.py 500
 
 # Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
-# Python (make test-newest PYTHON=python3.13), each in an environment of its own.
-SOME = tests/test_saved.py tests/cli/test_first_touch.py tests/adjustment/test_solve.py
+# Python (make test-newest PYTHON=python3.13), each in an environment of its own: what depends on them,
+# commands as processes, and the times of a first and a second process.
+SOME = tests/test_saved.py tests/test_float64.py tests/test_programs.py tests/cli/test_first_touch.py \
+  tests/cli/test_terminals.py tests/adjustment/test_solve.py
 
 out/oldest/installed: VERSIONS = -c out/oldest/versions.txt
 $(BOUNDS:%=out/%/installed): out/%/installed: pyproject.toml
@@ -62,6 +64,7 @@ $(BOUNDS:%=install-%): install-%: out/%/installed
 $(BOUNDS:%=test-%): test-%: install-%
 	out/$*/bin/python -m jaxbundle --version
 	out/$*/bin/python -m pytest -q -p no:cacheprovider $(SOME) -W ignore::DeprecationWarning
+	out/$*/bin/python benchmarks/first.py --repeat 1
 
 $(VENV)/documented: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \

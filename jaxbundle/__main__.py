@@ -7,9 +7,9 @@ library reads the variable on import.
 import gc
 import os
 import sys
-import warnings
 
 from jaxbundle.system.interrupts import handle_interrupts, set_status
+from jaxbundle.system.terminals import write_everywhere
 
 GC_THRESHOLDS = 50_000, 20, 100
 """Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
@@ -19,6 +19,7 @@ permanent: with the default thresholds the collector takes a sixth of the tracin
 def main() -> None:
     """Run the command line, as the whole of this process."""
     handle_interrupts()
+    write_everywhere()
     gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "reconstruct" in sys.argv[1:2]:
@@ -39,25 +40,6 @@ def _keep_programs() -> None:
     from jaxbundle.system.configuration import keep_programs
 
     keep_programs()
-    _tell_once_of_damage()
-
-
-def _tell_once_of_damage() -> None:
-    """JAX warns of every unreadable cached program, in every run, since it does not replace it."""
-    show, told = warnings.showwarning, []
-
-    def tell(message, *where):
-        if "persistent compilation cache entry" not in str(message):
-            return show(message, *where)
-        if not told and "--quiet" not in sys.argv:
-            print(
-                "jaxbundle: compiled programs cannot be read or written; delete the folder"
-                f" {sys.modules['jax'].config.jax_compilation_cache_dir}",
-                file=sys.stderr,
-            )
-        told.append(message)
-
-    warnings.showwarning = tell
 
 
 if __name__ == "__main__":

@@ -4,10 +4,13 @@ Arrays are shown by type and shape, long lists by their first entries; nothing i
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
+
+from jaxbundle.system.terminals import for_printing
 
 LINES, WIDTH = 24, 100
 SHOWN_ENTRIES = 4
@@ -18,7 +21,19 @@ T = TypeVar("T", bound=type)
 def print_in_one_screen(cls: T) -> T:
     """A dataclass of results whose `repr` is one screen: what `str` says, else its fields."""
     setattr(cls, "__repr__", describe)  # noqa: B010
+    return print_anywhere(cls)
+
+
+def print_anywhere(cls: T) -> T:
+    """A class whose own `str` and `repr` can be printed where standard output is not UTF-8, as in
+    a redirect on Windows: "s0" for σ0 (`for_printing`)."""
+    for name in {"__str__", "__repr__"} & vars(cls).keys():
+        setattr(cls, name, _as_printed(vars(cls)[name]))
     return cls
+
+
+def _as_printed(say: Callable[[Any], str]) -> Callable[[Any], str]:
+    return functools.wraps(say)(lambda self: for_printing(say(self)))
 
 
 def describe(value: Any) -> str:

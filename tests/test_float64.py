@@ -18,7 +18,6 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras
 from jaxbundle.cameras.distortion_table import distortion_table
 from jaxbundle.cli.small_inputs import SMALL_INPUT, is_small
-from jaxbundle.float64 import LITTLE_OPTIMISATION
 from jaxbundle.network import Camera
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.pushbroom import (
@@ -31,6 +30,8 @@ from jaxbundle.pushbroom import (
     make_image,
     position_table,
 )
+from jaxbundle.system import xla_flags
+from jaxbundle.system.xla_flags import LITTLE_OPTIMISATION
 
 PACKAGE = Path(jaxbundle.__file__).parent
 NETWORK = synthetic()[0]
@@ -125,16 +126,29 @@ for _ in range(100):
 
 def test_batched_factorisations_at_once_come_to_an_end():
     """jaxlib 0.10 deadlocks if as many of them as XLA has threads are running."""
-    here = {k: v for k, v in os.environ.items() if k != "NPROC"}
-    program = [sys.executable, "-c", FACTORISATIONS_AT_ONCE]
-    subprocess.run(program, env=here, check=True, timeout=120)
+    run_without_settings(FACTORISATIONS_AT_ONCE, 120)
 
 
 def test_programs_in_as_many_threads_as_cores_end():
     """They wait for their factorisations in XLA's pool, and deadlock if all of it waits."""
-    here = {k: v for k, v in os.environ.items() if k != "NPROC"}
-    program = [sys.executable, "-c", PROGRAMS_AT_ONCE]
-    subprocess.run(program, env=here, check=True, timeout=240)
+    run_without_settings(PROGRAMS_AT_ONCE, 240)
+
+
+def run_without_settings(program, timeout):
+    here = {k: v for k, v in os.environ.items() if k not in ("NPROC", "XLA_FLAGS")}
+    subprocess.run([sys.executable, "-c", program], env=here, check=True, timeout=timeout)
+
+
+def test_the_compiler_is_given_only_flags_that_it_knows(monkeypatch):
+    """XLA ends the process at any other one; a later jaxlib than those tried is asked."""
+    run_without_settings("import jax, jaxbundle; jaxbundle.enable_x64(compile_quickly=True); "
+                         "assert float(jax.jit(abs)(-1.0)) == 1.0", 120)  # fmt: skip
+    flags = [xla_flags.QUICK_LOOPS, LITTLE_OPTIMISATION, "--xla_unheard_of=1"]
+    here = xla_flags._known(flags[:2])
+    monkeypatch.setattr(xla_flags, "jaxlib_version", lambda: (99, 0, 0))
+    assert xla_flags._known(flags) == here and LITTLE_OPTIMISATION in here
+    monkeypatch.setattr(sys, "executable", "/nowhere")
+    assert xla_flags._known(flags) == []
 
 
 def test_small_inputs_are_compiled_quickly(tmp_path, monkeypatch):

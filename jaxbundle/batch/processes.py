@@ -94,14 +94,14 @@ def _clear(file: str | Path, waiting: str) -> None:
 
 def _tell(waiting: str, name: str, words: str = "") -> None:
     path = Path(waiting, f".{name}")
-    path.write_text(words)
+    path.write_text(words, encoding="utf-8")
     path.rename(Path(waiting, name))
 
 
 def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
     """The reports of these processes, once all are there."""
     while True:
-        found = {name: Path(waiting, name).read_text() for name in names
+        found = {name: Path(waiting, name).read_text("utf-8") for name in names
                  if Path(waiting, name).exists()}  # fmt: skip
         if len(found) == len(names):
             return found

@@ -34,6 +34,7 @@ from jaxbundle.adjustment.unknowns import angles_near
 from jaxbundle.arguments import number, show
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import get_model
+from jaxbundle.display import print_anywhere
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.similarity import compose, helmert_point
@@ -55,6 +56,7 @@ SHOWN_ROWS = 12
 """Rows of a comparison on the screen."""
 
 
+@print_anywhere
 @dataclasses.dataclass(frozen=True)
 class Congruency:
     """A test that several differences are 0 together: F, its degrees of freedom `rank` and
@@ -72,6 +74,7 @@ class Congruency:
         return f"F = {self.f:.4g} ({self.rank}, {self.freedom:.0f}), p = {self.probability:.2g}"
 
 
+@print_anywhere
 @dataclasses.dataclass(frozen=True)
 class AdjustmentComparison:
     """Two adjustments compared: one row an unknown that both have.

@@ -28,6 +28,7 @@ from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle import tables as result_tables
 from jaxbundle.bundle.storage import network_fingerprint, store
 from jaxbundle.cameras import get_model
+from jaxbundle.display import print_anywhere
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
@@ -58,6 +59,7 @@ from jaxbundle.statistics.weakness import Weakness, weakness
 from jaxbundle.system.programs import compile_once
 
 
+@print_anywhere
 class Adjustment:
     """An adjusted network. It prints as a summary; `report()` is the full report.
 

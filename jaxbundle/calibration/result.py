@@ -17,6 +17,7 @@ from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
 from jaxbundle.cameras import get_model
+from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
@@ -26,6 +27,7 @@ DISTANCES = 400
 """Number of distances of an uncertainty curve, dense enough to show every dip."""
 
 
+@print_anywhere
 class Calibration:
     """A calibrated camera. It prints as a summary; `report()` is the full report.
 

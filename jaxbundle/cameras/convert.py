@@ -27,6 +27,7 @@ from jaxbundle.cameras.convert_wide import exact_wide
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
+from jaxbundle.display import print_anywhere
 from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
@@ -36,6 +37,7 @@ SAME_POINT = 1e-9
 """Displacement of a point by rounding along the ray and back, relative to the image size."""
 
 
+@print_anywhere
 @dataclasses.dataclass(frozen=True)
 class Conversion:
     """A camera in its new model, and the differences.

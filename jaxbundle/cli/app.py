@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 import jaxbundle
 from jaxbundle.choices import CAMERA_MODELS, FORMATS, MODEL_FAMILIES
@@ -19,6 +19,7 @@ from jaxbundle.cli.habits import add_habits
 from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave
+from jaxbundle.system.terminals import for_output
 
 BAD_INPUT, NOT_SOLVED = 2, 3
 NO_READER = 128 + 13
@@ -47,6 +48,10 @@ class Command(TyperCommand):
             jaxbundle.enable_x64(compile_quickly=small)
         return super().invoke(ctx)
 
+    def get_help(self, ctx) -> str:
+        # For a stream of ASCII, click would write UTF-8.
+        return for_output(super().get_help(ctx))
+
     def get_short_help_str(self, limit: int = 0) -> str:
         """The complete first sentence, for the list of commands."""
         return super().get_short_help_str(1000)
@@ -59,14 +64,21 @@ class Command(TyperCommand):
             formatter.write_text(EXIT_STATUS)
 
 
+class Group(TyperGroup):
+    """A group of commands."""
+
+    def get_help(self, ctx) -> str:
+        return for_output(super().get_help(ctx))
+
+
 class Application(typer.Typer):
     """A group of such commands; without a command it lists them. Help is plain text: rich takes as
     long to import as all the rest."""
 
     def __init__(self, help: str, **options: Any):
         super().__init__(
-            help=help, short_help=help, rich_markup_mode=None, invoke_without_command=True,
-            callback=_list_commands, **options,
+            cls=Group, help=help, short_help=help, rich_markup_mode=None, callback=_list_commands,
+            invoke_without_command=True, **options,
         )  # fmt: skip
 
     def command(
@@ -180,6 +192,14 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         _end(f"unexpected end of file: {error.__cause__}", BAD_INPUT)
     except (OSError, OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
+    except UnicodeEncodeError as error:
+        # a name of a file, in a locale without its letters
+        if error.encoding != sys.getfilesystemencoding():
+            raise
+        _end(
+            f"{error.object}: this system writes names of files in {error.encoding}, which has no "
+            f"{error.object[error.start]!r}; set PYTHONUTF8=1", BAD_INPUT,
+        )  # fmt: skip
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if message := getattr(error, "format_message", None):

@@ -9,6 +9,7 @@ import typer
 from jaxbundle.choices import CLOUD_FILES, CUBE_POINTS
 from jaxbundle.cli.app import app, choice
 from jaxbundle.errors import InputError
+from jaxbundle.system.terminals import write_json
 
 
 @app.command(example="out/surface/cloud.csv --cube 0.05 --out out/thinned.las")
@@ -72,7 +73,7 @@ def cloud(
         write_cloud(found, out)
     text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"
     if json == "-":
-        print(text, end="")
+        write_json(text)
         return
     if json:
         write_text(Path(json), text)

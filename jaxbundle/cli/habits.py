@@ -53,8 +53,9 @@ _nothing = contextlib.nullcontext
 def _silent(values: dict) -> Iterator[None]:
     """Discard all output; errors are printed afterwards."""
     named = any(str(values.get(name)) == "-" for name in ("json", "csv"))
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
-        with _nothing() if named else contextlib.redirect_stdout(nowhere):
+    with open(os.devnull, "w", encoding="utf-8", errors="replace") as nowhere:
+        silent = contextlib.redirect_stdout(nowhere)
+        with contextlib.redirect_stderr(nowhere), _nothing() if named else silent:
             yield
 
 

@@ -34,6 +34,7 @@ from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.budget import describe_budget
+from jaxbundle.system.terminals import write_json
 
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
@@ -187,7 +188,7 @@ def write_result(
     belong to it.
     """
     if json == "-":
-        sys.stdout.writelines((text,) if isinstance(text, str) else text)
+        write_json(text)
     if out is None:
         yield None
     else:

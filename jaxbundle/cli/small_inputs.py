@@ -17,8 +17,8 @@ def is_small(path: Path) -> bool:
             total += file.stat().st_size
             if total > SMALL_INPUT or file.is_dir():
                 return False
-        if path.suffix == ".toml" and re.search(r"""["'](\.\.|/|\w:)""", path.read_text()):
-            return False
+        if path.suffix == ".toml":
+            return not re.search(r"""["'](\.\.|/|\w:)""", path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False  # The command says so.
     return True

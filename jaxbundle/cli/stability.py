@@ -19,7 +19,6 @@ def stability(
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
     """Test whether calibrations of one camera differ significantly."""
-    import sys
     from json import dumps
     from pathlib import Path
 
@@ -28,6 +27,7 @@ def stability(
     from jaxbundle.cli.camera_inputs import calibration_given
     from jaxbundle.io.text.csv_tables import write_bytes
     from jaxbundle.report.layout import table
+    from jaxbundle.system.terminals import write_json
 
     calibrations = []
     for file in files:
@@ -43,7 +43,7 @@ def stability(
     if json:
         text = dumps(found.to_dict(), indent=1) + "\n"
         if json == "-":
-            sys.stdout.write(text)
+            write_json(text)
             return
         write_bytes(Path(json), text.encode())
     rows = []

@@ -9,6 +9,7 @@ import typer
 from jaxbundle.choices import SURFACE_POINTS
 from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.errors import InputError
+from jaxbundle.system.terminals import write_json
 
 FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm_sigma.tif",
          "orthophoto.tif")  # fmt: skip
@@ -114,7 +115,7 @@ def surface(
         write_text(folder / "surface.json", text)
         write_text(folder / "report.txt", text_of(report) + "\n")
     if json == "-":
-        print(text, end="")
+        write_json(text)
     elif json:
         write_text(Path(json), text)
     if not quiet and json != "-":

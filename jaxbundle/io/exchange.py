@@ -11,6 +11,7 @@ from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, Conversion, key_of
+from jaxbundle.display import print_anywhere
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import fit_messages
@@ -38,6 +39,7 @@ MOST_SHOWN = 8
 """Conversions reported individually, the worst first."""
 
 
+@print_anywhere
 @dataclasses.dataclass(frozen=True)
 class Converted:
     """The written output: kind and path, camera differences, what is not kept, warnings."""

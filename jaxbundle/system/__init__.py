@@ -1,1 +1,1 @@
-"""The machine: files, temporary files, interrupts, and JAX settings."""
+"""The machine: files, temporary files, terminals, interrupts, and JAX settings."""

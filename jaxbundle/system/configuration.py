@@ -5,16 +5,21 @@ import re
 import socket
 import sys
 import time
+import warnings
+from contextlib import suppress
+from pathlib import Path
 from typing import NoReturn
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
+from jaxbundle.system.xla_flags import jaxlib_version
 
-_folders: list[str] = []
-"""That of kept programs, if some are kept."""
 SHORTEST_KEPT = 0.02
 """Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
 them."""
+
+LONGEST_WRITING = 60.0
+"""Seconds within which another process has written the file of a program, some megabytes."""
 
 THREADS = "NPROC"
 """XLA's environment variable of the number of threads of its pool; default: one for each core."""
@@ -25,14 +30,18 @@ def allow_programs_at_once() -> None:
     the first JAX computation.
 
     jaxlib 0.10 waits in XLA's pool for the parts of such a factorisation: as many programs as the
-    pool has threads deadlock. More threads than cores make large networks up to a sixth slower
+    pool has threads deadlock. From 0.11 on they do not (tests/test_float64.py, with one thread
+    too), and nothing is set: more threads than cores make large networks up to a sixth slower
     (`NPROC=4 python benchmarks/bal_ours.py FILE --devices 2`).
     """
-    os.environ.setdefault(THREADS, str(available_cores() + 2))
+    if jaxlib_version() < (0, 11):
+        os.environ.setdefault(THREADS, str(available_cores() + 2))
 
 
 def can_run_two_programs() -> bool:
     """Whether XLA's pool has a thread left while two programs wait in it."""
+    if jaxlib_version() >= (0, 11):
+        return True  # they do not wait there
     given = os.environ.get(THREADS, "")
     return (int(given) if given.isdecimal() else available_cores()) > 2
 
@@ -49,13 +58,15 @@ def use_cores(number: int | None = None) -> None:
 
 
 def keep_programs(folder: str | os.PathLike | None = None) -> bool:
-    """Keep compiled programs in a folder, so that later processes start without compiling; call it
-    before the first JAX computation.
+    """Keep compiled programs in a folder by JAX's persistent cache, so that later processes start
+    without compiling; call it before the first JAX computation.
 
     `folder`: default that of the environment variable JAX_COMPILATION_CACHE_DIR, else
     `jaxbundle` in the user's cache folder.
 
-    **Returns:** whether the folder is writable; if not, nothing is kept.
+    **Returns:** whether the folder is writable, and jaxlib 0.10.2 or later; if not, nothing is
+    kept. For every kept program earlier ones print two errors, about features of the processor
+    that are none.
     """
     import jax
 
@@ -72,21 +83,37 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         usable = os.access(folder, os.W_OK | os.X_OK)
     except OSError:
         usable = False
+    usable = usable and jaxlib_version() >= (0, 10, 2)
     # JAX has already read the variable, and would warn of a bad folder for every program.
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
-    _folders.clear()
     if not usable:
         return False
     watch_cache(folder)
-    _folders.append(os.path.abspath(folder))
+    _remove_damaged_programs(Path(os.path.abspath(folder)))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
     return True
 
 
-def folder_of_programs() -> str | None:
-    """The folder of kept programs; None if none are kept."""
-    return _folders[-1] if _folders else None
+def _remove_damaged_programs(folder: Path) -> None:
+    """Remove the files of programs that JAX cannot read, instead of showing its warnings.
+
+    JAX compiles them again, in every process, since it does not replace a file. A damaged one is
+    left by a full disk; one that is just being written by another process is not touched."""
+    show, about = warnings.showwarning, "Error (reading|writing) persistent compilation cache entry"
+
+    def handle(message, *where, **options):
+        if not re.match(about, str(message)):
+            return show(message, *where, **options)
+        name, latest = re.search(r"'(\w+)", str(message)), time.time() - LONGEST_WRITING
+        for file in folder.glob(f"{name[1]}-*-cache") if name else ():
+            with suppress(OSError):
+                if file.stat().st_mtime < latest:
+                    file.unlink()
+
+    # "always": as an error, by -W error, it would end the computation.
+    warnings.filterwarnings("always", about)
+    warnings.showwarning = handle
 
 
 def join_processes(

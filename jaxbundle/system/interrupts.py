@@ -133,7 +133,7 @@ def _say_and_exit(number: int) -> "NoReturn":
     try:
         if os.isatty(_screen):  # A progress bar may have hidden the cursor.
             line = "\r\x1b[2K\x1b[?25h" + line
-        os.write(_screen, line.encode())
+        os.write(_screen, line.encode(errors="backslashreplace"))
     except OSError:
         pass  # Nobody listens.
     os._exit(128 + number)
@@ -157,4 +157,4 @@ def _open_standard_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))

@@ -5,13 +5,11 @@ import json
 import shutil
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import pytest
 
 import jaxbundle
-from jaxbundle.__main__ import _tell_once_of_damage as tell_once_of_damage
 from jaxbundle.io import exchange
 
 ROOT = Path(__file__).parents[2]
@@ -161,41 +159,6 @@ def test_what_nobody_thought_of_ends_in_one_line(command, error, status, monkeyp
     done = command("convert", EXAMPLE, "nowhere")
     lines = done.err.splitlines()
     assert done.status == status and len(lines) == 1 and lines[0].startswith("jaxbundle: ")
-
-
-def test_compiled_programs_are_kept_and_damaged_ones_told_at_most_once(tmp_path, monkeypatch):
-    programs, file = tmp_path / "programs", tmp_path / "file"
-    file.write_text("")
-
-    def told(folder, code="from jaxbundle.__main__ import _keep_programs; _keep_programs()"):
-        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
-        code = (
-            f"import jax, jaxbundle\n{code}; jaxbundle.enable_x64()\n"
-            "jax.jit(lambda x: x + 1)(1.0); jax.jit(lambda x: x + 2)(1.0)"
-        )
-        command = [sys.executable, "-W", "default", "-c", code]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stderr
-
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    kept = f"not jaxbundle.keep_programs({str(file)!r}) and jaxbundle.keep_programs()"
-    assert told(programs, f"assert {kept}") == ""
-    damaged = list(programs.glob("*-cache"))
-    for program in damaged:
-        program.write_bytes(b"damaged")
-    said = told(programs)
-    assert len(damaged) >= 2 and said.count("\n") == 1 and f"delete the folder {programs}" in said
-    assert told(file) == ""
-
-
-def test_damaged_programs_are_no_matter_of_a_quiet_command(monkeypatch, capsys):
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    said = "Error reading persistent compilation cache entry for 'jit_f'"
-    for options, lines in (["--quiet"], 0), ([], 1):
-        monkeypatch.setattr(sys, "argv", ["jaxbundle", "adjust", "x", *options])
-        tell_once_of_damage()
-        for _ in range(2):
-            warnings.showwarning(said, UserWarning, __file__, 1)
-        assert capsys.readouterr().err.count("\n") == lines
 
 
 def test_a_level_of_significance_is_between_0_and_1(command):

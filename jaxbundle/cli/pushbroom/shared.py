@@ -23,6 +23,7 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
+from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Column
 
 
@@ -116,7 +117,7 @@ def write_rows(
         rows = [dict(zip(columns, row)) for row in rows]
         text = json.dumps(without_nan({**(head or {}), "rows": rows}), ensure_ascii=False) + "\n"
         if json_ == "-":
-            print(text, end="")
+            write_json(text)
         else:
             write_text(Path(json_), text)
     rows = [["" if v != v else v for v in row] for row in zip(*columns.values())]

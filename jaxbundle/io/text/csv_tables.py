@@ -15,6 +15,7 @@ from jaxbundle.io.writing.replacing import replace_file, unwritable
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import DESCRIPTORS, parse_toml, read_content
+from jaxbundle.system.terminals import in_utf8
 
 PORTION = 10_000
 """Rows converted to text at a time."""
@@ -114,7 +115,7 @@ def take_portions(rows: Iterable[Any]) -> Iterator[list]:
 def write_text(path: Path, text: str | Iterable[str]) -> None:
     """Write a text, or its pieces, in UTF-8, whole or not at all (`write_bytes`)."""
     pieces = (text,) if isinstance(text, str) else text
-    write_bytes(path, (piece.encode() for piece in pieces))
+    write_bytes(path, (in_utf8(piece).encode() for piece in pieces))
 
 
 def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
