@@ -44,19 +44,24 @@ SAMPLING = 0.045
 class Target:
     """The measured centre of a target.
 
-    **Fields:** `xy` and `sigma`, pixels; `bright`: lighter than its surroundings; `threshold`,
+    **Fields:** `xy` and its `covariance`, pixels, with `sigma` their standard deviations; `bright`: lighter than its surroundings; `threshold`,
     `contrast`, `noise`: grey values; `axes`, `angle`: semi-axes (the longer first) in pixels and
     the direction of the longer one in radians, x right, y down.
     """
 
     xy: Float[np.ndarray, "2"]
-    sigma: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
     axes: Float[np.ndarray, "2"]
     angle: float
     bright: bool
     threshold: float
     contrast: float
     noise: float
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "2"]:
+        """Standard deviations of the coordinates, pixels."""
+        return np.sqrt(np.diagonal(self.covariance))
 
 
 def centre_by_grey_values(grey, near) -> Target:
@@ -70,8 +75,9 @@ def centre_by_grey_values(grey, near) -> Target:
     xy, spread, total = _moments(spot)
     away = _places(spot) - xy[:, None, None]
     region = _region(spot)
-    sigma = spot.noise / abs(spot.contrast) * np.sqrt((away**2 * region).sum((1, 2))) / total
-    return _target(spot, xy, sigma, *_axes_of(spread))
+    away = (away * region).reshape(2, -1)
+    covariance = (spot.noise / (spot.contrast * total)) ** 2 * away @ away.T
+    return _target(spot, xy, covariance, *_axes_of(spread))
 
 
 def centre_by_ellipse(grey, near) -> Target:
@@ -87,12 +93,12 @@ def centre_by_ellipse(grey, near) -> Target:
     centre, covariance, axes, angle = _fit_robustly(np.nan_to_num(edge), weights)
     if not np.isfinite(covariance).all():
         raise InputError(f"{_place(spot, xy)}: the edge of the target is not an ellipse")
-    return _target(spot, centre, np.sqrt(np.diagonal(covariance)), axes, angle)
+    return _target(spot, centre, covariance, axes, angle)
 
 
-def _target(spot, xy, sigma, axes, angle):
+def _target(spot, xy, covariance, axes, angle):
     return Target(
-        xy=xy + spot.corner, sigma=sigma, axes=np.asarray(axes), angle=float(angle),
+        xy=xy + spot.corner, covariance=covariance, axes=np.asarray(axes), angle=float(angle),
         bright=spot.contrast > 0, threshold=spot.threshold, contrast=abs(spot.contrast),
         noise=spot.noise,
     )  # fmt: skip
