@@ -23,6 +23,11 @@ NARROWEST = 2.0
 """Narrowest strip, a cell of the marker or of its margin, in τ: below, blurred edges are one."""
 FIRST_BLUR = 0.8
 """τ before it is estimated: a lens in focus, and the pixel."""
+CELL_FOR_SHIFT = 7.0
+"""Cells at least as wide as this, in τ, show the shift of edges: 2·2.7 at the ends of an edge are
+left out."""
+FEWEST_INNER_EDGES, MOST_INNER_EDGES = 8, 100
+"""Edges between cells that determine it, and are enough."""
 GROUPS = (12, 24, 48)
 """Limits of lengths, pixels, of edges that are fitted together."""
 CURVATURE = 0.5
@@ -60,6 +65,10 @@ def fit_marker_corners(
         fits = _fit_by_length(grey, edges, blur.ravel(), curvature, coarse)
         xy, covariance = _intersect(edges, _with_model_errors(edges, fits), number)
         blur = np.repeat(np.median(fits.blur.reshape(number, 4), axis=1), 4).reshape(number, 4)
+    shift = edge_shift(grey, xy, cells, fits, curvature)
+    if shift is not None:
+        fits = _shifted(fits, *shift)
+        xy, covariance = _intersect(edges, _with_model_errors(edges, fits), number)
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
     solved = (fits.solved & _alike(fits, number)).reshape(number, 4)
     why = np.full((number, 4), "", dtype=object)
@@ -72,6 +81,104 @@ def fit_marker_corners(
     moved = np.linalg.norm(xy - near, axis=2)
     why[~(moved < np.maximum(0.15 * side, 2.5)[:, None])] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
+
+
+def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float] | None:
+    """The shift of edges towards their dark side in τ (of inverted markers their light side, which is
+    negative), and its σ; None if the markers are too small.
+
+    Grey values are often not proportional to light (gamma), and ink spreads: at the half level, light
+    cells are too wide and dark ones too narrow. Of the shift δ the homography of the corners, which
+    lie on shifted sides too, explains s·(1 − 2·x/n)·δ at x of n cells from a side, where s is 1 if the
+    dark cell is beyond, −1 if it is before; so an edge between two cells is seen at a from its expected
+    place, with
+
+        a = δ·(1 − s·(1 − 2·x/n))
+
+    δ is proportional to τ: the mean of a/(τ·(…)) over the inner edges of the largest markers.
+    """
+    n, number = cells.shape[1], len(xy)
+    blur = np.median(fits.blur.reshape(number, 4), axis=1)
+    side = np.linalg.norm(xy - np.roll(xy, 1, 1), axis=2).min(1)
+    ready = fits.solved.reshape(number, 4).all(1) & (side / n > CELL_FOR_SHIFT * blur)
+    H = _homographies(xy, n)
+    parts = []
+    for marker in np.flatnonzero(ready)[np.argsort(-side[ready])]:
+        parts.append(_inner_edges(marker, xy, cells[marker] > 0, H))
+        if sum(len(part[0]) for part in parts) >= MOST_INNER_EDGES:
+            break
+    if not parts:
+        return None
+    marker, start, end, factor, width = map(np.concatenate, zip(*parts))
+    along = end - start
+    across = np.stack([-along[:, 1], along[:, 0]], 1)
+    ends = np.zeros((len(start), 2))
+    inside = Edges(
+        start, end, np.stack([start, -across], 1), np.stack([end, across], 1), ends + width[:, None],
+        ends + width[:, None], np.tile([-1.0, 1.0], (len(start), 1)), np.zeros((len(start), 1)),
+    )  # fmt: skip
+    for direction in (inside.before, inside.after):
+        direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
+    found = fit_edges(grey, inside, blur[marker], curvature)
+    shift = found.curve[:, 0] / (found.blur * factor)
+    sigma = np.sqrt(found.covariance[:, 0, 0]) / (found.blur * factor)
+    good = found.solved & (sigma < 0.5) & (found.contrast * fits.contrast[4 * marker] > 0)
+    if good.sum() < FEWEST_INNER_EDGES:
+        return None
+    for _ in range(3):
+        middle = np.median(shift[good])
+        spread = 1.4826 * np.median(np.abs(shift[good] - middle)) + 0.01
+        good &= np.abs(shift - middle) < 3.5 * spread
+    weight = 1 / (sigma[good] ** 2 + 0.02**2)
+    mean = weight @ shift[good] / weight.sum()
+    scatter = weight @ (shift[good] - mean) ** 2 / weight.sum()
+    return float(mean), float(np.sqrt(scatter / (good.sum() - 1)))
+
+
+def _inner_edges(marker, xy, light, H):
+    """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
+    start, end, factor 1 − s·(1 − 2·x/n), narrowest cell."""
+    n = len(light)
+    start, end, factor = [], [], []
+    for turn in (0, 1):  # edges along columns, along rows
+        here = light if turn == 0 else light.T
+        row, column = np.nonzero(here[:, 1:] != here[:, :-1])
+        x = column + 1.0
+        dark_beyond = here[row, column]  # the cell before is light
+        a, b = np.stack([x, row], 1), np.stack([x, row + 1.0], 1)
+        if turn:
+            a, b = a[:, ::-1], b[:, ::-1]
+        # the inner side is to the right of start → end as seen in the image
+        swap = dark_beyond if turn == 0 else ~dark_beyond
+        start.append(np.where(swap[:, None], b, a))
+        end.append(np.where(swap[:, None], a, b))
+        s = np.where(dark_beyond, 1.0, -1.0)
+        factor.append(1 - s * (1 - 2 * x / n))
+    start, end = (
+        _image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end)
+    )
+    factor = np.concatenate(factor)
+    useful = factor > 0.5
+    four = xy[marker]
+    width = _narrowest(four) / n
+    number = int(useful.sum())
+    return (np.full(number, marker), start[useful], end[useful], factor[useful],
+            np.full(number, width))  # fmt: skip
+
+
+def _narrowest(four):
+    """The smaller distance of opposite sides of a quadrilateral, roughly."""
+    a, b = four[2] - four[0], four[3] - four[1]
+    area = abs(a[0] * b[1] - a[1] * b[0]) / 2
+    return area / np.linalg.norm(four - np.roll(four, 1, 0), axis=1).max()
+
+
+def _shifted(fits: EdgeFits, shift, sigma) -> EdgeFits:
+    """Sides moved back outwards by a shift towards the dark side, in τ."""
+    curve, covariance = fits.curve.copy(), fits.covariance.copy()
+    curve[:, 0] -= shift * fits.blur
+    covariance[:, 0, 0] += (sigma * fits.blur) ** 2
+    return dataclasses.replace(fits, curve=curve, covariance=covariance)
 
 
 def _with_model_errors(edges: Edges, fits: EdgeFits) -> EdgeFits:
