@@ -212,12 +212,16 @@ def _contrast(grey, xy):
 def _charuco(cv2, grey, board):
     aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
     marker = board.marker or MARKER * board.square
-    best = None
+    best, seen = None, {}
     for legacy in (False, True):
         size = (board.columns, board.rows)
         known = aruco.CharucoBoard(size, board.square, marker, dictionary)
         known.setLegacyPattern(legacy)
-        xy, ids, *_ = aruco.CharucoDetector(known).detectBoard(grey)
+        # markers are searched once: they take the time
+        xy, ids, *markers = aruco.CharucoDetector(known).detectBoard(grey, **seen)
+        if markers[1] is None:
+            break
+        seen = dict(zip(("markerCorners", "markerIds"), markers))
         if ids is not None and (best is None or len(ids) > len(best[1])):
             best = xy.reshape(-1, 2), ids.ravel()
     if best is None or len(best[1]) < 4:
