@@ -48,8 +48,8 @@ STEPS, CONVERGED = 12, 4e-3
 """Most steps, and the change of nearly all corners, in pixels, after which the next is negligible."""
 TERMS, NEGLIGIBLE = 8, 3e-3
 """Most terms of the series for oblique lines, and the size of the last one, relative to the contrast."""
-SECTORS = 8
-"""Sectors about the corner whose residuals are compared."""
+PAIRS = 8
+"""Pairs of opposite sectors about the corner whose residuals are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,13 +260,14 @@ def _normal(J, r, weight, prior, away, noise):
 
 
 def _excess(J, r, weight, Q, noise, away):
-    """By how much the residuals are alike in whole sectors about the corner, more than noise is."""
+    """By how much the corners from opposite pairs of sectors scatter more than the noise says (1: not);
+    what is alike on opposite sides does not move the corner."""
     angle = np.arctan2(away[..., 1], away[..., 0])
-    sector = np.minimum(((angle / np.pi + 1) / 2 * SECTORS).astype(int), SECTORS - 1)
-    total = np.zeros(len(r))
-    for k in range(SECTORS):
-        score = np.einsum("npi,np->ni", J, weight * r * (sector == k))
-        total += np.einsum("ni,nij,nj->n", score, Q, score)
-    ratio = total / (UNKNOWNS * (1 - 1 / SECTORS) * noise**2)
-    spread = np.sqrt(2 / (UNKNOWNS * SECTORS / 2))
-    return np.where(ratio > 1 + 3 * spread, np.sqrt(ratio), 1.0)
+    pair = ((angle / np.pi + 1) * PAIRS).astype(int) % PAIRS
+    total, inverse = np.zeros(len(r)), np.linalg.inv(Q[:, :2, :2])
+    for k in range(PAIRS):
+        score = np.einsum("npi,np->ni", J, weight * r * (pair == k))
+        moved = np.einsum("nij,nj->ni", Q[:, :2], score)
+        total += np.einsum("ni,nij,nj->n", moved, inverse, moved)
+    ratio = total / (2 * (PAIRS - 1) * noise**2)
+    return np.where(ratio > 1 + 3 * np.sqrt(1 / PAIRS), np.sqrt(ratio), 1.0)
