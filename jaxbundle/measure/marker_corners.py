@@ -21,6 +21,11 @@ from jaxbundle.measure.straight_edges import EdgeFits, Edges, fit_edges, take
 
 NARROWEST = 2.0
 """Narrowest strip, a cell of the marker or of its margin, in τ: below, blurred edges are one."""
+NARROW, NARROW_OBLIQUE = 0.5, 1.0
+"""σ, in τ, of what the model neglects in strips of a width of one τ; it decreases by exp(−(width/τ)²/2).
+The second is multiplied by the cosine of the angle between adjacent sides. Found on rendered markers."""
+SURE = 4.0
+"""A strip of this width, in τ, hardly depends on how well its place is known."""
 FIRST_BLUR = 0.8
 """τ before it is estimated: a lens in focus, and the pixel."""
 CELL_FOR_SHIFT = 7.0
@@ -60,11 +65,18 @@ def fit_marker_corners(
     xy = np.asarray(near, float)
     blur = np.full((number, 4), FIRST_BLUR)
     curvature = CURVATURE / max(grey.shape)
-    for coarse in (True, False, False):
-        edges = _sides_of(xy, cells, border)
-        fits = _fit_by_length(grey, edges, blur.ravel(), curvature, coarse)
-        xy, covariance = _intersect(edges, _with_model_errors(edges, fits), number)
-        blur = np.repeat(np.median(fits.blur.reshape(number, 4), axis=1), 4).reshape(number, 4)
+    for coarse in (True, False):
+        edges, fits, xy, covariance = _fit_sides(grey, xy, cells, border, blur, curvature, coarse)
+        before, blur = blur, _blur_of(fits)
+    # where the cells are narrow, or the blur was not the expected one, once more from there
+    strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
+    again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < SURE * blur)).any(1)
+    if again.any():
+        of = np.repeat(again, 4)
+        parts = _fit_sides(grey, xy[again], cells[again], border, blur[again], curvature, False)
+        _put(edges, of, parts[0])
+        _put(fits, of, parts[1])
+        xy[again], covariance[again] = parts[2:]
     shift = edge_shift(grey, xy, cells, fits, curvature)
     if shift is not None:
         fits = _shifted(fits, *shift)
@@ -81,6 +93,25 @@ def fit_marker_corners(
     moved = np.linalg.norm(xy - near, axis=2)
     why[~(moved < np.maximum(0.15 * side, 2.5)[:, None])] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
+
+
+def _fit_sides(grey, xy, cells, border, blur, curvature, coarse):
+    """The sides of markers whose corners are expected at `xy`: edges, fits, corners, covariance."""
+    edges = _sides_of(xy, cells, border)
+    fits = _fit_by_length(grey, edges, blur.ravel(), curvature, coarse)
+    return edges, fits, *_intersect(edges, _with_model_errors(edges, fits), len(xy))
+
+
+def _blur_of(fits: EdgeFits):
+    """τ of the markers, for each of their sides."""
+    blur = fits.blur.reshape(-1, 4)
+    return np.repeat(np.median(blur, axis=1), 4).reshape(blur.shape)
+
+
+def _put(whole, rows, part) -> None:
+    """Replace some rows of the arrays of a dataclass."""
+    for field in dataclasses.fields(whole):
+        getattr(whole, field.name)[rows] = getattr(part, field.name)
 
 
 def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float] | None:
@@ -184,7 +215,9 @@ def _shifted(fits: EdgeFits, shift, sigma) -> EdgeFits:
 def _with_model_errors(edges: Edges, fits: EdgeFits) -> EdgeFits:
     """The fits with the σ of what the model neglects in narrow strips added to a."""
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
-    neglected = fits.blur * 0.5 * np.exp(-(strip**2) / 2)
+    oblique = np.abs([np.einsum("ni,ni->n", near[:, 1], edges.along) for near in
+                      (edges.before, edges.after)]).max(0)  # fmt: skip
+    neglected = fits.blur * (NARROW + NARROW_OBLIQUE * oblique) * np.exp(-(strip**2) / 2)
     covariance = fits.covariance.copy()
     covariance[:, 0, 0] += neglected**2
     return dataclasses.replace(fits, covariance=covariance)
@@ -281,7 +314,7 @@ def _fit_by_length(grey, edges: Edges, blur, curvature, coarse) -> EdgeFits:
     ))  # fmt: skip
 
 
-def _intersect(edges: Edges, fits: EdgeFits, number):
+def _intersect(edges: Edges, fits: EdgeFits, number: int):
     """Corners [markers, 4, 2], corner k between the sides k − 1 and k, and their covariance."""
     of = np.arange(4 * number).reshape(number, 4)
     pair = np.stack([np.roll(of, 1, 1), of], 2)  # [markers, 4, 2 sides]

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
-FINE = 5
+FINE = 4
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,9 @@ def photograph(pattern, H, size, blur=0.7, noise=1.5, levels=(30.0, 220.0), gamm
     dy = np.hypot(back[1, 0] - back[2, 0] * y, back[1, 1] - back[2, 1] * y) / np.abs(w)
     fine = pattern.mean(x, y, dx / (2 * FINE), dy / (2 * FINE))
     if blur:
-        fine = ndimage.gaussian_filter(fine, blur * FINE, truncate=5)
-    grey = fine.reshape(rows, FINE, columns, FINE).mean((1, 3))
+        taps = 2 * int(4.5 * blur * FINE) + 1
+        fine = cv2.GaussianBlur(fine, (taps, taps), blur * FINE, borderType=cv2.BORDER_REPLICATE)
+    grey = np.clip(fine.reshape(rows, FINE, columns, FINE).mean((1, 3)), 0, 1)
     grey = levels[0] + (levels[1] - levels[0]) * grey ** (1 / gamma)
     grey = grey + noise * np.random.default_rng(seed).normal(size=grey.shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
