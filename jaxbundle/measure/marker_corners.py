@@ -135,12 +135,13 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     H = _homographies(xy, n)
     parts = []
     for marker in np.flatnonzero(ready)[np.argsort(-side[ready])]:
-        parts.append(_inner_edges(marker, xy, cells[marker] > 0, H))
+        bend = fits.curve.reshape(number, 4, 3)[marker, :, 2]
+        parts.append(_inner_edges(marker, xy, cells[marker] > 0, H, bend))
         if sum(len(part[0]) for part in parts) >= MOST_INNER_EDGES:
             break
     if not parts:
         return None
-    marker, start, end, factor, width = map(np.concatenate, zip(*parts))
+    marker, start, end, factor, bent, width = map(np.concatenate, zip(*parts))
     along = end - start
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     ends = np.zeros((len(start), 2))
@@ -151,7 +152,7 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     for direction in (inside.before, inside.after):
         direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
     found = fit_edges(grey, inside, blur[marker], curvature)
-    shift = found.curve[:, 0] / (found.blur * factor)
+    shift = (found.curve[:, 0] - bent) / (found.blur * factor)
     sigma = np.sqrt(found.covariance[:, 0, 0]) / (found.blur * factor)
     good = found.solved & (sigma < 0.5) & (found.contrast * fits.contrast[4 * marker] > 0)
     if good.sum() < FEWEST_INNER_EDGES:
@@ -166,11 +167,17 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     return float(mean), float(np.sqrt(scatter / (good.sum() - 1)))
 
 
-def _inner_edges(marker, xy, light, H):
+def _inner_edges(marker, xy, light, H, bend):
     """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
-    start, end, factor 1 − s·(1 − 2·x/n), narrowest cell."""
+    start, end, factor 1 − s·(1 − 2·x/n), the part of a by the lens, narrowest cell.
+
+    `bend`: c of the upper, right, lower and left side, which is how far they bulge. With x, y = −1 … 1
+    across the marker, radial distortion about its middle moves points by −c·(x, y)·(x² + y² − 2)
+    relative to the corners; what bends opposite sides to the same direction, by (1 − y²) or (1 − x²).
+    """
     n = len(light)
-    start, end, factor = [], [], []
+    mean = bend.mean()
+    start, end, factor, bent = [], [], [], []
     for turn in (0, 1):  # edges along columns, along rows
         here = light if turn == 0 else light.T
         row, column = np.nonzero(here[:, 1:] != here[:, :-1])
@@ -185,15 +192,18 @@ def _inner_edges(marker, xy, light, H):
         end.append(np.where(swap[:, None], a, b))
         s = np.where(dark_beyond, 1.0, -1.0)
         factor.append(1 - s * (1 - 2 * x / n))
+        p, q = 2 * x / n - 1, 2 * (row + 0.5) / n - 1
+        beyond, before = ((bend[1], bend[3]), (bend[2], bend[0]))[turn]
+        along = (1 + p) / 2 * (beyond - mean) - (1 - p) / 2 * (before - mean)
+        bent.append(s * (along * (1 - q**2) - mean * p * (p**2 + q**2 - 2)))
     start, end = (
         _image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end)
     )
-    factor = np.concatenate(factor)
+    factor, bent = np.concatenate(factor), np.concatenate(bent)
     useful = factor > 0.5
-    four = xy[marker]
-    width = _narrowest(four) / n
+    width = _narrowest(xy[marker]) / n
     number = int(useful.sum())
-    return (np.full(number, marker), start[useful], end[useful], factor[useful],
+    return (np.full(number, marker), start[useful], end[useful], factor[useful], bent[useful],
             np.full(number, width))  # fmt: skip
 
 

@@ -3,10 +3,10 @@ r"""Corners where four squares meet, two light and two dark, fitted to the grey 
 Two lines cross at the corner x at the angles θ₁, θ₂; with sᵢ = nᵢ·(p − x) the distances of a pixel p
 from them and E(s) = 2·Φ(s/τ) − 1 a blurred change from −1 to 1,
 
-    g(p) = M + m·(p − x) + D·E(s₁)·E(s₂)
+    g(p) = (M + D·E(s₁)·E(s₂))·(1 + m·(p − x))
 
 (for oblique lines the joint distribution of both blurs, of correlation n₁·n₂, `_joint`). M is the mean
-level, m its change by uneven light, D half the contrast, τ the blur of lens and pixel. All nine unknowns of
+level, m the change of the light, D half the contrast, τ the blur of lens and pixel. All nine unknowns of
 a corner are estimated from the grey values of its pixels, without interpolation; the covariance
 follows from the noise, which is that of the residuals. The model, like the image, is
 symmetrical about x, so that neither the encoding of the grey values (gamma) nor spreading ink nor an
@@ -27,6 +27,8 @@ from jaxbundle.measure.corner_quality import LARGEST_SIGMA, NO_CORNER, TOO_SMALL
 LARGEST_HALF = 7
 """Most pixels from the corner: the lens bends lines; 10 make σ smaller by a fifth and take twice the
 time."""
+COMPLETE = 5.0
+"""Pixels from the corner, in τ, for a blurred image, to separate edges from uneven light."""
 PART = 0.4
 """Pixels used, from the corner, in distances to the nearest other corner."""
 FIRST_BLUR = 1.0
@@ -73,7 +75,9 @@ def fit_saddles(
     corner (or other edge) along both lines, pixels; `strips`, for ChArUco boards: distances of the
     marker's corner from both lines, in the quarter of these signs of s₁ and s₂ (0: negative).
     """
-    found, blur = _fit(grey, near, lines, strips)
+    found, blur = _fit(grey, near, lines, strips, LARGEST_HALF)
+    if COMPLETE * np.median(blur) > LARGEST_HALF:
+        found, blur = _fit(grey, near, lines, strips, COMPLETE * np.median(blur))
     if np.median(blur) < SOFT:
         return found
     # an image blurred over several pixels loses nothing in half the pixels, and the windows then
@@ -84,10 +88,10 @@ def fit_saddles(
     return Saddles(2 * found.xy + 0.5, 4 * found.covariance, found.why)
 
 
-def _fit(grey, near, lines, strips):
+def _fit(grey, near, lines, strips, largest):
     """The corners, and τ of each."""
     length = np.linalg.norm(lines, axis=2)
-    half = np.clip(PART * length.min(1), 2.0, LARGEST_HALF)
+    half = np.clip(PART * length.min(1), 2.0, largest)
     angle = np.arctan2(lines[..., 1], lines[..., 0])
     oblique = np.abs(np.sin(angle[:, 0] - angle[:, 1]))
     window = int(np.ceil(half.max()))
@@ -105,7 +109,7 @@ def _fit(grey, near, lines, strips):
     theta[:, 6] = np.log(FIRST_BLUR)
     reference, prior = theta.copy(), np.zeros(UNKNOWNS)
     reference[:, 6] = np.log(0.8)
-    prior[2:4], prior[6], prior[7:] = 0.3**-2.0, 1.0, 20.0**-2
+    prior[2:4], prior[6], prior[7:] = 0.3**-2.0, 1.0, 0.1**-2.0
     noise = np.ones(len(near))
     for step in range(STEPS):
         weight = inside & (np.linalg.norm(place - theta[:, None, :2], axis=2) <= half[:, None])
@@ -118,7 +122,7 @@ def _fit(grey, near, lines, strips):
         r = g - model
         N, b = _normal(J, r, weight, prior, reference - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
-        limit = [0.7, 0.7, 0.2, 0.2, 100, 100, 0.4, 20, 20]
+        limit = [0.7, 0.7, 0.2, 0.2, 100, 100, 0.4, 0.1, 0.1]
         theta = theta + np.clip(d, np.negative(limit), limit)
         theta[:, 6] = np.clip(theta[:, 6], np.log(SHARPEST), np.log(SOFTEST))
         freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
@@ -212,17 +216,21 @@ def _model(theta, place, strips):
         k = (np.abs(s) - _strip_of(s, strips)) / tau[..., None]
         side = np.sign(s)
         P, along = _joint(k, rho * side[..., 0] * side[..., 1])
-        light = 2 * np.sign(D) * (side[..., 0] * side[..., 1] == np.sign(D))
-        X = X - light * P
-        slope = slope - light[..., None] * along * side / tau[..., None]
-        of_blur += light * (k * along).sum(2)
+        there = 2 * np.sign(D) * (side[..., 0] * side[..., 1] == np.sign(D))
+        X = X - there * P
+        slope = slope - there[..., None] * along * side / tau[..., None]
+        of_blur += there * (k * along).sum(2)
     away = place - theta[:, None, :2]
     c, n = np.cos(theta[:, None, 2:4]), np.sin(theta[:, None, 2:4])
+    light = 1 + (away * theta[:, None, 7:]).sum(2)
+    squares = M + D * X
+    slope, of_blur = slope * (D * light)[..., None], of_blur * D * light
     J = np.stack([
-        D * (slope * n).sum(2), -D * (slope * c).sum(2), -D * slope[..., 0] * t[..., 0],
-        -D * slope[..., 1] * t[..., 1], np.ones_like(X), X, D * of_blur, away[..., 0], away[..., 1],
+        (slope * n).sum(2), -(slope * c).sum(2), -slope[..., 0] * t[..., 0],
+        -slope[..., 1] * t[..., 1], light, X * light, of_blur, squares * away[..., 0],
+        squares * away[..., 1],
     ], 2)  # fmt: skip
-    return M + D * X + (away * theta[:, None, 7:]).sum(2), J
+    return squares * light, J
 
 
 def _density(z):

@@ -50,17 +50,19 @@ class Rings:
 
     def mean(self, x, y, half_x, half_y):
         """As `Cells.mean`, from the distances of the boxes' centres from the rims."""
-        return self._value(x, y, half_x, half_y)
-
-    def _value(self, x, y, half_x, half_y):
-        out, size = np.full(np.shape(x), self.ground), np.maximum(half_x, half_y) * 2
+        out, all_sizes = np.full(np.shape(x), self.ground), np.maximum(half_x, half_y) * 2
         for cx, cy, inner, outer, first, last, value in self.parts:
-            r = np.hypot(x - cx, y - cy)
-            cover = np.clip((outer - r) / size + 0.5, 0, 1) * np.clip((r - inner) / size + 0.5, 0, 1)
+            reach = outer * 1.1
+            near = np.nonzero((np.abs(x - cx) < reach) & (np.abs(y - cy) < reach))
+            u, v, size = x[near] - cx, y[near] - cy, all_sizes[near]
+            r = np.hypot(u, v)
+            cover = np.clip((outer - r) / size + 0.5, 0, 1)
+            if inner:
+                cover *= np.clip((r - inner) / size + 0.5, 0, 1)
             if last - first < 2 * np.pi:
-                t = (np.arctan2(y - cy, x - cx) - (first + last) / 2 + np.pi) % (2 * np.pi) - np.pi
-                cover = cover * np.clip(((last - first) / 2 - np.abs(t)) * r / size + 0.5, 0, 1)
-            out = out + cover * (value - out)
+                t = (np.arctan2(v, u) - (first + last) / 2 + np.pi) % (2 * np.pi) - np.pi
+                cover *= np.clip(((last - first) / 2 - np.abs(t)) * r / size + 0.5, 0, 1)
+            out[near] += cover * (value - out[near])
         return out
 
 
