@@ -44,8 +44,9 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
 
 
 STRAIGHT, SAME = 0.01, 0.01
-"""Largest change of scale across half of a board that is seen from the front, and largest difference of
-it between photographs that are tilted alike: a tilt of 20° at a distance of five boards makes 0.04."""
+"""Largest change of scale across half of a board that is seen from the front, and largest
+difference of it between photographs that are tilted alike: a tilt of 20° at a distance of five
+boards makes 0.04."""
 
 
 def weak_geometry(
@@ -53,11 +54,11 @@ def weak_geometry(
     xy: Float[np.ndarray, "views points 2"],
     visible: Bool[np.ndarray, "views points"],
 ) -> str:
-    """Why views of a flat board do not determine a principal distance, in words; "" if their geometry
-    does, or the board is not flat.
+    """Why views of a flat board do not determine a principal distance, in words; "" if their
+    geometry does, or the board is not flat.
 
-    The vanishing line of the board, by the homography of each view, shows its tilt: w = 1 + l·x is the
-    relative distance of a point at x from the middle of the view. Equal l in all views give two
+    The vanishing line of the board, by the homography of each view, shows its tilt: w = 1 + l·x is
+    the relative distance of a point at x from the middle of the view. Equal l in all views give two
     conditions for the camera, however many there are (Sturm and Maybank, 1999).
     """
     centred = points - points.mean(0)
@@ -97,8 +98,8 @@ def weak_geometry(
     about_one = tilts / (1 - np.einsum("vi,vi->v", tilts, shift))[:, None]
     if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < SAME:
         return (
-            "all photographs show the board tilted alike, in the same direction of the image: one tilt "
-            "does not separate the principal distance from the distance, nor the principal point from "
-            "the tilt"
+            "all photographs show the board tilted alike, in the same direction of the image: one "
+            "tilt does not separate the principal distance from the distance, nor the principal "
+            "point from the tilt"
         )
     return ""

@@ -1,10 +1,9 @@
 """Detection of boards in photographs by OpenCV, with the numbering of `boards`.
 
-Corners of squares are fitted to the grey values around them (`saddles`), circles by `targets`: each with
-its covariance. Boards of light squares on dark ground, the negative of the usual ones, are searched if
-nothing else is found. Boards are searched in a reduced copy
-of a large photograph (24 million pixels take 25 s, one of 1600 columns 1 s), points are measured in
-the original.
+Corners of squares are fitted to the grey values around them (`saddles`), circles by `targets`: each
+with its covariance. Boards of light squares on dark ground, the negative of the usual ones, are
+searched if nothing else is found. Boards are searched in a reduced copy of a large photograph (24
+million pixels take 25 s, one of 1600 columns 1 s), points are measured in the original.
 """
 
 import dataclasses
@@ -14,7 +13,6 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import MARKER, SMALLEST_SIDE, Board
-from jaxbundle.measure.corner_quality import TOO_SMALL
 from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
 from jaxbundle.measure.tag_grids import BoardPoints, find_tags, get_dictionary, make_points
 from jaxbundle.measure.targets import centre_by_ellipse
@@ -39,8 +37,8 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
 
 
 def find_board_points(grey: Grey, board: Board) -> BoardPoints:
-    """The image points of a board in a photograph with their covariance; boards that are the negative
-    of the usual ones too.
+    """The image points of a board in a photograph with their covariance; boards that are the
+    negative of the usual ones too.
 
     **Raises:** `InputError` with the reason if there are none.
     """
@@ -244,8 +242,8 @@ def _charuco(cv2, grey, board):
 
 
 def _strips(image, X, lines, board):
-    """Distances of the corners of markers from the lines through the corners of a ChArUco board, for
-    `fit_saddles`."""
+    """Distances of the corners of markers from the lines through the corners of a ChArUco board,
+    for `fit_saddles`."""
     width = (1 - (board.marker or MARKER * board.square) / board.square) / 2
     normal = np.stack([-lines[..., 1], lines[..., 0]], 2)
     normal /= np.linalg.norm(normal, axis=2)[..., None]

@@ -1,14 +1,14 @@
 """Corners of square markers (ArUco, AprilTag) as intersections of their sides.
 
-The outer corner of a marker is no saddle of the grey values: a gradient method (`cornerSubPix`) puts
-it 0.3 px towards the middle of the marker. Here the four sides are fitted to the grey values
+The outer corner of a marker is no saddle of the grey values: a gradient method (`cornerSubPix`)
+puts it 0.3 px towards the middle of the marker. Here the four sides are fitted to the grey values
 beside them (`straight_edges`), and a corner is where two of them intersect. Its covariance follows
 from those of the two sides at their ends,
 
     n₁·x = u₁,  n₂·x = u₂       C = A⁻¹·diag(σ₁², σ₂²)·A⁻ᵀ,   A = [n₁ᵀ; n₂ᵀ]
 
-A marker is expected in a light margin of at least one of its cells, as it is defined. Corners whose σ
-is above a limit are left out.
+A marker is expected in a light margin of at least one of its cells, as it is defined. Corners whose
+σ is above a limit are left out.
 """
 
 import dataclasses
@@ -22,8 +22,9 @@ from jaxbundle.measure.straight_edges import EdgeFits, Edges, fit_edges, take
 NARROWEST = 2.0
 """Narrowest strip, a cell of the marker or of its margin, in τ: below, blurred edges are one."""
 NARROW, NARROW_OBLIQUE = 0.5, 1.0
-"""σ, in τ, of what the model neglects in strips of a width of one τ; it decreases by exp(−(width/τ)²/2).
-The second is multiplied by the cosine of the angle between adjacent sides. Found on rendered markers."""
+"""σ, in τ, of what the model neglects in strips of a width of one τ; it decreases by
+exp(−(width/τ)²/2). The second is multiplied by the cosine of the angle between adjacent sides.
+Found on rendered markers."""
 SURE = 4.0
 """A strip of this width, in τ, hardly depends on how well its place is known."""
 FIRST_BLUR = 0.8
@@ -36,8 +37,9 @@ FEWEST_INNER_EDGES, MOST_INNER_EDGES = 8, 100
 GROUPS = (12, 24, 48)
 """Limits of lengths, pixels, of edges that are fitted together."""
 CURVATURE = 0.5
-"""Prior σ of the curvature of a straight line's image, times the longer side of the image: with radial
-distortion k1 a line at the distance d from the centre has 2·k1·d/f²; 0.2·1/f for k1 = 0.2."""
+"""Prior σ of the curvature of a straight line's image, times the longer side of the image: with
+radial distortion k1 a line at the distance d from the centre has 2·k1·d/f²; 0.2·1/f for k1 =
+0.2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,14 +117,14 @@ def _put(whole, rows, part) -> None:
 
 
 def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float] | None:
-    """The shift of edges towards their dark side in τ (of inverted markers their light side, which is
-    negative), and its σ; None if the markers are too small.
+    """The shift of edges towards their dark side in τ (of inverted markers their light side, which
+    is negative), and its σ; None if the markers are too small.
 
-    Grey values are often not proportional to light (gamma), and ink spreads: at the half level, light
-    cells are too wide and dark ones too narrow. Of the shift δ the homography of the corners, which
-    lie on shifted sides too, explains s·(1 − 2·x/n)·δ at x of n cells from a side, where s is 1 if the
-    dark cell is beyond, −1 if it is before; so an edge between two cells is seen at a from its expected
-    place, with
+    Grey values are often not proportional to light (gamma), and ink spreads: at the half level,
+    light cells are too wide and dark ones too narrow. Of the shift δ the homography of the corners,
+    which lie on shifted sides too, explains s·(1 − 2·x/n)·δ at x of n cells from a side, where s is
+    1 if the dark cell is beyond, −1 if it is before; so an edge between two cells is seen at a from
+    its expected place, with
 
         a = δ·(1 − s·(1 − 2·x/n))
 
@@ -146,8 +148,9 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     ends = np.zeros((len(start), 2))
     inside = Edges(
-        start, end, np.stack([start, -across], 1), np.stack([end, across], 1), ends + width[:, None],
-        ends + width[:, None], np.tile([-1.0, 1.0], (len(start), 1)), np.zeros((len(start), 1)),
+        start, end, np.stack([start, -across], 1), np.stack([end, across], 1), ends + width[:,
+        None], ends + width[:, None], np.tile([-1.0, 1.0], (len(start), 1)), np.zeros((len(start),
+        1)),
     )  # fmt: skip
     for direction in (inside.before, inside.after):
         direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
@@ -171,9 +174,10 @@ def _inner_edges(marker, xy, light, H, bend):
     """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
     start, end, factor 1 − s·(1 − 2·x/n), the part of a by the lens, narrowest cell.
 
-    `bend`: c of the upper, right, lower and left side, which is how far they bulge. With x, y = −1 … 1
-    across the marker, radial distortion about its middle moves points by −c·(x, y)·(x² + y² − 2)
-    relative to the corners; what bends opposite sides to the same direction, by (1 − y²) or (1 − x²).
+    `bend`: c of the upper, right, lower and left side, which is how far they bulge. With x, y = −1
+    … 1 across the marker, radial distortion about its middle moves points by −c·(x, y)·(x² + y² −
+    2) relative to the corners; what bends opposite sides to the same direction, by (1 − y²) or (1 −
+    x²).
     """
     n = len(light)
     mean = bend.mean()
@@ -256,7 +260,6 @@ def _sides_of(xy, cells, border) -> Edges:
     inner, outer, far, level = [], [], [], []
     for k in range(4):
         turned = np.rot90(cells, k, axes=(1, 2))  # the side k is the first row
-        place = lambda t, depth, k=k: _image(H, _on_side(k, n, t, depth))
         middle = (xy[:, k] + following[:, k]) / 2
         half = np.linalg.norm(following[:, k] - xy[:, k], axis=1)[:, None] / 2
 

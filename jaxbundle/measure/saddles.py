@@ -1,19 +1,19 @@
 r"""Corners where four squares meet, two light and two dark, fitted to the grey values around them.
 
-Two lines cross at the corner x at the angles θ₁, θ₂; with sᵢ = nᵢ·(p − x) the distances of a pixel p
-from them and E(s) = 2·Φ(s/τ) − 1 a blurred change from −1 to 1,
+Two lines cross at the corner x at the angles θ₁, θ₂; with sᵢ = nᵢ·(p − x) the distances of a pixel
+p from them and E(s) = 2·Φ(s/τ) − 1 a blurred change from −1 to 1,
 
     g(p) = (M + D·E(s₁)·E(s₂))·(1 + m·(p − x))
 
-(for oblique lines the joint distribution of both blurs, of correlation n₁·n₂, `_joint`). M is the mean
-level, m the change of the light, D half the contrast, τ the blur of lens and pixel. All nine unknowns of
-a corner are estimated from the grey values of its pixels, without interpolation; the covariance
-follows from the noise, which is that of the residuals. The model, like the image, is
-symmetrical about x, so that neither the encoding of the grey values (gamma) nor spreading ink nor an
-oblique view shifts the corner.
+(for oblique lines the joint distribution of both blurs, of correlation n₁·n₂, `_joint`). M is the
+mean level, m the change of the light, D half the contrast, τ the blur of lens and pixel. All nine
+unknowns of a corner are estimated from the grey values of its pixels, without interpolation; the
+covariance follows from the noise, which is that of the residuals. The model, like the image, is
+symmetrical about x, so that neither the encoding of the grey values (gamma) nor spreading ink nor
+an oblique view shifts the corner.
 
-In the light squares of a ChArUco board, markers with a dark border are a strip of width oᵢ away from
-the lines; D·E·E has then the term −2·|D|·Φ((|s₁| − o₁)/τ)·Φ((|s₂| − o₂)/τ) there.
+In the light squares of a ChArUco board, markers with a dark border are a strip of width oᵢ away
+from the lines; D·E·E has then the term −2·|D|·Φ((|s₁| − o₁)/τ)·Φ((|s₂| − o₂)/τ) there.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from jaxtyping import Float
 from jaxbundle.measure.corner_quality import LARGEST_SIGMA, NO_CORNER, TOO_SMALL
 
 LARGEST_HALF = 7
-"""Most pixels from the corner: the lens bends lines; 10 make σ smaller by a fifth and take twice the
-time."""
+"""Most pixels from the corner: the lens bends lines; 10 make σ smaller by a fifth and take twice
+the time."""
 COMPLETE = 5.0
 """Pixels from the corner, in τ, for a blurred image, to separate edges from uneven light."""
 PART = 0.4
@@ -42,14 +42,16 @@ NARROWEST = 1.5
 WIDE = 4.5
 """A strip of this width, in τ, shows the whole step."""
 NEGLECTED, NEGLECTED_NARROW = 0.01, 0.06
-"""σ, in τ·|n₁·n₂|, of what is not modelled beside markers under oblique lines, to whose sides they are
-not parallel; the second decreases by exp(−(width/τ)²/2). Found on rendered boards tilted by 50° and
-65°."""
+"""σ, in τ·|n₁·n₂|, of what is not modelled beside markers under oblique lines, to whose sides they
+are not parallel; the second decreases by exp(−(width/τ)²/2). Found on rendered boards tilted by 50°
+and 65°."""
 UNKNOWNS = 9
 STEPS, CONVERGED = 12, 4e-3
-"""Most steps, and the change of nearly all corners, in pixels, after which the next is negligible."""
+"""Most steps, and the change of nearly all corners, in pixels, after which the next is
+negligible."""
 TERMS, NEGLIGIBLE = 8, 3e-3
-"""Most terms of the series for oblique lines, and the size of the last one, relative to the contrast."""
+"""Most terms of the series for oblique lines, and the size of the last one, relative to the
+contrast."""
 PAIRS = 8
 """Pairs of opposite sectors about the corner whose residuals are compared."""
 
@@ -201,8 +203,8 @@ def _levels(theta, place, g, weight):
 
 
 def _model(theta, place, strips):
-    """Grey values of the pixels, and their derivatives [n, pixels, unknowns]; those by θ and τ without
-    the part through ρ: they are even about the corner, and do not touch it."""
+    """Grey values of the pixels, and their derivatives [n, pixels, unknowns]; those by θ and τ
+    without the part through ρ: they are even about the corner, and do not touch it."""
     s, t = _distances(theta, place)
     tau, M, D = np.exp(theta[:, None, 6]), theta[:, None, 4], theta[:, None, 5]
     rho = np.cos(theta[:, 2] - theta[:, 3])[:, None]
@@ -268,8 +270,8 @@ def _normal(J, r, weight, prior, away, noise):
 
 
 def _excess(J, r, weight, Q, noise, away):
-    """By how much the corners from opposite pairs of sectors scatter more than the noise says (1: not);
-    what is alike on opposite sides does not move the corner."""
+    """By how much the corners from opposite pairs of sectors scatter more than the noise says (1:
+    not); what is alike on opposite sides does not move the corner."""
     angle = np.arctan2(away[..., 1], away[..., 0])
     pair = ((angle / np.pi + 1) * PAIRS).astype(int) % PAIRS
     total, inverse = np.zeros(len(r)), np.linalg.inv(Q[:, :2, :2])

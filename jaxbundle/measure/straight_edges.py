@@ -8,17 +8,17 @@ along it, −1 … 1 from end to end, the edge is at s = u(t) = a + b·t + c·t�
 
 W and B are the outer and the inner level, linear in t; Φ the normal distribution and τ the blur,
 that of the lens and of the pixel's area (1/12 pixel²). The second term is the far side of the inner
-strip of width w, behind which q (0 … 1) is at the outer level again; the third an unknown level V + W
-beyond the outer strip of width o. Both are 0 unless the strips are narrow. All unknowns of an edge are
-estimated at once from its pixels, nothing is interpolated, so that their covariance
-follows from the noise, which is that of the residuals. The half level of the *grey values* counts as
-the edge: they are taken as proportional to light. An encoded photograph (gamma) shifts every edge
-towards its dark side (`edge_shift`).
+strip of width w, behind which q (0 … 1) is at the outer level again; the third an unknown level V +
+W beyond the outer strip of width o. Both are 0 unless the strips are narrow. All unknowns of an
+edge are estimated at once from its pixels, nothing is interpolated, so that their covariance
+follows from the noise, which is that of the residuals. The half level of the *grey values* counts
+as the edge: they are taken as proportional to light. An encoded photograph (gamma) shifts every
+edge towards its dark side (`edge_shift`).
 
 c takes up the curvature by the lens. It is bounded by a prior σ, so that short edges are
-straight. Pixels near the ends, where the blur of the adjacent edges reaches, are left out. Parts of an
-edge that contradict the others (dirt, a shadow) are left out, and if the others still
-scatter more than their σ, the covariance is increased.
+straight. Pixels near the ends, where the blur of the adjacent edges reaches, are left out. Parts of
+an edge that contradict the others (dirt, a shadow) are left out, and if the others still scatter
+more than their σ, the covariance is increased.
 """
 
 import dataclasses
@@ -28,10 +28,11 @@ import scipy  # its parts are loaded on use
 from jaxtyping import Bool, Float
 
 COLUMNS = 32
-"""Most rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a quarter and take
-twice the time."""
+"""Most rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a quarter and
+take twice the time."""
 REACH = 3.5
-"""Pixels are used to this distance from the edge, in τ, and one pixel more: the step is complete."""
+"""Pixels are used to this distance from the edge, in τ, and one pixel more: the step is
+complete."""
 CLEAR = 2.7
 """Distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is left."""
 DENSITY = np.float32((2 * np.pi) ** -0.5)
@@ -51,11 +52,11 @@ UNKNOWNS = 9
 class Edges:
     """The expected edges: what is known of `n` of them before the fit.
 
-    **Fields:** `start`, `end`, pixels, the inner side to the right of their direction as seen in the
-    image (u right, v down); `before`, `after`: a point and the direction of the adjacent edges, [n, 2,
-    2]; `inner`, `outer`: widths of the strips at both ends, pixels, [n, 2]; `far`: positions t of the
-    boundaries of cells behind the inner strip, [n, cells + 1], and `level` of each cell, 1 for
-    the outer level and 0 for the inner one, [n, cells].
+    **Fields:** `start`, `end`, pixels, the inner side to the right of their direction as seen in
+    the image (u right, v down); `before`, `after`: a point and the direction of the adjacent edges,
+    [n, 2, 2]; `inner`, `outer`: widths of the strips at both ends, pixels, [n, 2]; `far`: positions
+    t of the boundaries of cells behind the inner strip, [n, cells + 1], and `level` of each cell, 1
+    for the outer level and 0 for the inner one, [n, cells].
     """
 
     start: Float[np.ndarray, "n 2"]
@@ -87,8 +88,8 @@ class Edges:
 
 @dataclasses.dataclass(frozen=True)
 class EdgeFits:
-    """Fitted edges: a, b, c in pixels and their covariance; blur τ and its σ of ln τ; contrast (inner
-    minus outer level) and noise in grey values; `solved`: whether there is such an edge."""
+    """Fitted edges: a, b, c in pixels and their covariance; blur τ and its σ of ln τ; contrast
+    (inner minus outer level) and noise in grey values; `solved`: whether there is such an edge."""
 
     curve: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
@@ -192,14 +193,14 @@ class _Pixels:
         place = np.where(flat[:, None, None, None], np.stack([major, minor], -1),
                          np.stack([minor, major], -1)).reshape(len(k), -1, 2)  # fmt: skip
         height, width = grey.shape
-        inside = ((place >= 0) & (place < [width, height])).all(2)
+        inside = np.all((place >= 0) & (place < [width, height]), axis=2)
         u, v = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
         away = place - edges.middle[:, None]
         s = np.einsum("npk,nk->np", away, inward)
         t = np.einsum("npk,nk->np", away, along) / half[:, None]
         ends = np.stack([(1 - t) / 2, (1 + t) / 2], 2)
         inner, outer = (np.einsum("npe,ne->np", ends, w) for w in (edges.inner, edges.outer))
-        weight = inside & (s < np.minimum(inner, REACH * blur[:, None] + 1))
+        weight = np.asarray(inside & (s < np.minimum(inner, REACH * blur[:, None] + 1)))
         weight &= s > -np.minimum(outer, REACH * blur[:, None] + 1)
         for near in (edges.before, edges.after):
             apart = place - near[:, None, 0]
@@ -207,7 +208,7 @@ class _Pixels:
             weight &= clear > np.maximum(CLEAR * blur, 0.5)[:, None]
         weight &= np.abs(t) < 1
         level = np.zeros_like(t)
-        if (weight & (s > inner - REACH * blur[:, None])).any():
+        if np.any(weight & (s > inner - REACH * blur[:, None])):
             # the cells behind the strip, blurred along the edge
             sharp = (half / blur)[:, None, None]
             passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))

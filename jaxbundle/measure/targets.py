@@ -10,10 +10,10 @@
 
        g = G + m·(p − x) + C·Φ(d/τ)        d = ρ·(1 − ρ)/|M·(p − x)|,  ρ² = (p − x)ᵀ·M·(p − x)
 
-   with d the distance of the pixel p inside the ellipse ρ = 1 (Sampson, 1982), G and m the ground and
-   its change, C the contrast, τ the blur of lens and pixel. Nothing is interpolated; the covariance
-   follows from the residuals. (Blur σ makes a disc of radius r smaller by about σ²/2r, and an encoding
-   of the grey values shifts its rim; its centre is unchanged by both.)
+   with d the distance of the pixel p inside the ellipse ρ = 1 (Sampson, 1982), G and m the ground
+   and its change, C the contrast, τ the blur of lens and pixel. Nothing is interpolated; the
+   covariance follows from the residuals. (Blur σ makes a disc of radius r smaller by about σ²/2r,
+   and an encoding of the grey values shifts its rim; its centre is unchanged by both.)
 
 Both centres are those of the ellipse, not of the circle: `circle_centre_shift`.
 """
@@ -32,8 +32,8 @@ REACH = 3.5
 """Pixels are used to this distance from the rim, in τ, and one more, but not beyond `MARGIN` pixels
 outside, nor 0.8 of the shorter semi-axis inside."""
 SECTORS, OUTLIER = 16, 3.5
-"""Sectors of the rim that are compared, and the limit of their shifts in standard deviations: others are
-left out."""
+"""Sectors of the rim that are compared, and the limit of their shifts in standard deviations:
+others are left out."""
 STEPS, CONVERGED = 15, 1e-3
 """Most steps, and the last change of the centre in pixels."""
 LEAST_SEEN = 0.6
@@ -46,9 +46,10 @@ UNKNOWNS = 10
 class Target:
     """The measured centre of a target.
 
-    **Fields:** `xy` and its `covariance`, pixels, with `sigma` their standard deviations; `bright`: lighter than its surroundings; `threshold`,
-    `contrast`, `noise`: grey values; `axes`, `angle`: semi-axes (the longer first) in pixels and
-    the direction of the longer one in radians, x right, y down.
+    **Fields:** `xy` and its `covariance`, pixels, with `sigma` their standard deviations; `bright`:
+    lighter than its surroundings; `threshold`, `contrast`, `noise`: grey values; `axes`, `angle`:
+    semi-axes (the longer first) in pixels and the direction of the longer one in radians, x right,
+    y down.
     """
 
     xy: Float[np.ndarray, "2"]
@@ -142,42 +143,46 @@ def _fit_disc(spot, xy, axes, angle):
     scale = np.array([1, 1, *[2 / axes[1] ** 3] * 3, abs(spot.contrast), abs(spot.contrast), 1,
                       spot.noise, spot.noise])  # fmt: skip
     places, grey = _places(spot).reshape(2, -1), spot.grey.ravel()
-    sector, kept = None, np.ones(len(grey))
-    for step in range(STEPS):
+    theta, A, r, weight, sector = _iterate(theta, scale, places, grey, 1.0)
+    kept = _consistent_sectors(A, r, weight, sector)
+    if not kept.all():
+        theta, A, r, weight, sector = _iterate(theta, scale, places, grey, kept)
+    noise = max(np.sqrt(r @ r / max(weight.sum() - UNKNOWNS, 1)), 12**-0.5)
+    inverse = np.linalg.inv(_normal_matrix(A))
+    covariance = (noise * _excess(A, r, inverse, sector, noise)) ** 2 * inverse[:2, :2]
+    seen = np.unique(sector[weight > 0]).size / SECTORS
+    values, vectors = np.linalg.eigh([[theta[2], theta[3]], [theta[3], theta[4]]])
+    angle = np.arctan2(vectors[1, 0], vectors[0, 0])
+    angle = np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2
+    return theta[:2], covariance, values**-0.5, angle, seen
+
+
+def _iterate(theta, scale, places, grey, kept):
+    """The disc that fits the kept pixels: its parameters, scaled derivatives, residuals, and pixels
+    used."""
+    step = 0
+    while True:
         g, J, d, sector, minor = _blurred_disc(theta, places)
         reach = REACH * np.exp(theta[7]) + 1
         weight = kept * ((d < min(reach, 0.8 * minor)) & (d > -min(reach, MARGIN)))
         r = weight * (grey - g)
         A = J * (weight * scale[:, None])
-        # levels and their change: σ of one contrast, of the noise; the others as weak
-        N = A @ A.T + 1e-6 * np.trace(A @ A.T) * np.eye(UNKNOWNS)
-        change = scale * np.linalg.solve(N, A @ r)
+        change = scale * np.linalg.solve(_normal_matrix(A), A @ r)
         change[:2] = np.clip(change[:2], -1, 1)
         change[7] = np.clip(change[7], -0.4, 0.4)
-        damped = theta + change
-        while _is_no_ellipse(damped) and np.abs(change).max() > 1e-12:
+        while _is_no_ellipse(theta + change) and np.abs(change).max() > 1e-12:
             change = change / 2
-            damped = theta + change
-        theta = damped
+        theta = theta + change
         theta[7] = np.clip(theta[7], np.log(0.35), np.log(0.5 * minor + 1))
-        if step > 2 and np.abs(change[:2]).max() < CONVERGED:
-            if step > 3 and not kept.all() or step == STEPS - 1:
-                break
-            kept_now = _consistent_sectors(J, r, weight, sector)
-            if kept_now.all():
-                break
-            kept = kept_now
-    freedom = max(weight.sum() - UNKNOWNS, 1)
-    noise = max(np.sqrt(r @ r / freedom), 12**-0.5)
-    inverse = np.linalg.inv(N)
-    excess = _excess(A, r, inverse, sector, noise)
-    covariance = (noise * excess) ** 2 * inverse[:2, :2]
-    seen = np.unique(sector[weight > 0]).size / SECTORS
-    A, B, C = theta[2:5]
-    values, vectors = np.linalg.eigh([[A, B], [B, C]])
-    angle = np.arctan2(vectors[1, 0], vectors[0, 0])
-    angle = np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2
-    return theta[:2], covariance, values**-0.5, angle, seen
+        step += 1
+        if step == STEPS or step > 3 and np.abs(change[:2]).max() < CONVERGED:
+            return theta, A, r, weight, sector
+
+
+def _normal_matrix(A):
+    """A·Aᵀ, and a millionth of its trace on the diagonal: few pixels may leave a level open."""
+    N = A @ A.T
+    return N + 1e-6 * np.trace(N) * np.eye(UNKNOWNS)
 
 
 def _is_no_ellipse(theta) -> bool:
@@ -186,8 +191,8 @@ def _is_no_ellipse(theta) -> bool:
 
 
 def _blurred_disc(theta, places):
-    """Grey values of the pixels, their derivatives [unknowns, pixels], distances from the rim, sector,
-    and the shorter semi-axis."""
+    """Grey values of the pixels, their derivatives [unknowns, pixels], distances from the rim,
+    sector, and the shorter semi-axis."""
     x, y, A, B, C, ground, contrast, lntau, mx, my = theta
     tau = np.exp(lntau)
     u, v = places[0] - x, places[1] - y
@@ -220,8 +225,8 @@ def _consistent_sectors(J, r, weight, sector):
 
 
 def _excess(A, r, inverse, sector, noise):
-    """By how much the centres from opposite pairs of sectors scatter more than the noise says (1: not);
-    what is alike on opposite sides does not move the centre."""
+    """By how much the centres from opposite pairs of sectors scatter more than the noise says (1:
+    not); what is alike on opposite sides does not move the centre."""
     score = np.stack([np.bincount(sector, a * r, SECTORS) for a in A])
     pairs = inverse[:2] @ (score[:, : SECTORS // 2] + score[:, SECTORS // 2 :])
     ratio = np.einsum("is,ij,js->", pairs, np.linalg.inv(inverse[:2, :2]), pairs)

@@ -167,8 +167,8 @@ BOARDS = [(False, 12, 0, 0.5), (False, 24, 50, 1.0), (False, 30, 0, 2.0), (True,
 
 @pytest.mark.parametrize("case", BOARDS)
 def test_corners_of_squares(case):
-    """`cornerSubPix` has no bias here, but errors of 0.02 px from the pixel raster, and of 0.3 px where
-    a marker reaches into its window."""
+    """`cornerSubPix` has no bias here, but errors of 0.02 px from the pixel raster, and of 0.3 px
+    where a marker reaches into its window."""
     error, _ = boards(*case)
     assert np.abs(error.mean(0)).max() < BIAS / 2
     assert np.sqrt((error**2).mean()) < 0.015
@@ -274,7 +274,8 @@ def test_ring_coded_targets(negative):
 
 
 def test_corners_of_tags_of_a_grid():
-    """With the black squares of the gaps: by themselves `aprilgrid` of coded targets, and the board."""
+    """With the black squares of the gaps: by themselves `aprilgrid` of coded targets, and the
+    board."""
     words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     columns, rows, cells, gap = 3, 2, 10, 3
     step = cells + gap
