@@ -39,7 +39,7 @@ from jaxbundle.batch.result import BatchCalibration as BatchCalibration
 from jaxbundle.batch.snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.batch.start import start_values
 from jaxbundle.batch.test_values import point_tests
-from jaxbundle.batch.weakness import is_vague, vanishing
+from jaxbundle.batch.weakness import is_vague, vanishing, weak_geometry
 from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import (
@@ -156,18 +156,32 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     solved = ended == CONVERGED
     undetermined = _undetermined(model, batch, ended, rows)
+    weak = _weak_geometry(batch, ended)
+    rms = np.where(ended == LIMIT, rows["rms"], np.nan)
     for name in OF_A_VIEW:
         rows[name][~rows["views"]] = np.nan
     for values in rows.values():
         if np.issubdtype(values.dtype, np.floating):
             values[~solved] = np.nan
+    rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
+    ended = np.where(weak != "", WEAK, ended)
     ended = np.where(solved & undetermined.any(1), WEAK, ended)
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
     del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
     rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
+    rows["remark"] = np.where(weak != "", weak, rows["remark"])
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
+
+
+def _weak_geometry(batch: Batch, ended) -> np.ndarray:
+    """Why the views of cameras do not determine them, of those without a solution; ""."""
+    found = np.full(len(batch), "", dtype=object)
+    for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
+        points = batch.point if batch.point.ndim == 2 else batch.point[i]
+        found[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
+    return found
 
 
 def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:

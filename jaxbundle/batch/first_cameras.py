@@ -51,6 +51,10 @@ class FirstCamera:
         return str(self.batch.status[self.row])
 
     @property
+    def remark(self) -> str:
+        return str(self.batch.remark[self.row])
+
+    @property
     def views(self) -> Bool[np.ndarray, " views"]:
         return self.batch.views[self.row]
 

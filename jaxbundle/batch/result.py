@@ -79,8 +79,8 @@ class BatchCalibration:
 
     @property
     def solved(self) -> Bool[np.ndarray, " cameras"]:
-        """Which have values, including weak ones and misfits."""
-        return np.isin(self.status, SOLVED)
+        """Which have values, including misfits and those of the weak ones that have any."""
+        return np.isin(self.status, SOLVED) & np.isfinite(self.interior).all(1)
 
     def __len__(self) -> int:
         return len(self.status)

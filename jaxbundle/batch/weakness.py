@@ -41,3 +41,65 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
     return finite[:, None] & (share > SMALLEST_PART)
+
+
+STRAIGHT, SAME = 0.01, 0.01
+"""Largest change of scale across half of a board that is seen from the front, and largest
+difference of it between photographs that are tilted alike: a tilt of 20° at a distance of five
+boards makes 0.04."""
+
+
+def weak_geometry(
+    points: Float[np.ndarray, "points 3"],
+    xy: Float[np.ndarray, "views points 2"],
+    visible: Bool[np.ndarray, "views points"],
+) -> str:
+    """Why views of a flat board do not determine a principal distance, in words; "" if their
+    geometry does, or the board is not flat.
+
+    The vanishing line of the board, by the homography of each view, shows its tilt: w = 1 + l·x is
+    the relative distance of a point at x from the middle of the view. Equal l in all views give two
+    conditions for the camera, however many there are (Sturm and Maybank, 1999).
+    """
+    centred = points - points.mean(0)
+    axes, size = np.linalg.svd(centred)[2], np.linalg.svd(centred, compute_uv=False)
+    if size[2] > 1e-6 * size[0]:
+        return ""
+    X = centred @ axes[:2].T / size[0] * np.sqrt(len(points))
+    tilts, middles, extents = [], [], []
+    for view, seen in zip(xy, visible):
+        if seen.sum() < 6:
+            continue
+        middle = view[seen].mean(0)
+        extent = np.sqrt(((view[seen] - middle) ** 2).sum(1).mean())
+        x, ones = (view[seen] - middle) / extent, np.ones((int(seen.sum()), 1))
+        from_plane, zero = np.concatenate([X[seen], ones], 1), np.zeros((int(seen.sum()), 3))
+        A = np.concatenate([
+            np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
+            np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
+        ])  # fmt: skip
+        H = np.linalg.svd(A)[2][-1].reshape(3, 3)
+        line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
+        with np.errstate(all="ignore"):
+            tilts.append(line[:2] / line[2])
+        middles.append(middle)
+        extents.append(extent)
+    if len(tilts) < 2 or not np.isfinite(tilts).all():
+        return ""
+    extent = np.median(extents)
+    # the tilts about the middle of one view, in the same unit of length
+    tilts, middles = np.array(tilts) * (extent / np.array(extents))[:, None], np.array(middles)
+    if np.linalg.norm(tilts, axis=1).max() < STRAIGHT:
+        return (
+            "all photographs look straight at the board: a longer principal distance and a larger "
+            "distance give the same images"
+        )
+    shift = (middles - middles[0]) / extent
+    about_one = tilts / (1 - np.einsum("vi,vi->v", tilts, shift))[:, None]
+    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < SAME:
+        return (
+            "all photographs show the board tilted alike, in the same direction of the image: one "
+            "tilt does not separate the principal distance from the distance, nor the principal "
+            "point from the tilt"
+        )
+    return ""

@@ -177,6 +177,12 @@ def board_network(
     )  # fmt: skip
     for warning in views.warnings:
         network = network.warn(warning)
+    if start.behind:
+        network = network.warn(
+            "every photograph sees the board from behind, as in a mirror: its points are numbered "
+            "from the other side, or the photographs are mirrored; number them from the upper "
+            "left, each row to the right, or mirror the photographs back"
+        )
     if board_free and not board.unique:
         network = network.warn(
             f"the {board} looks the same rotated by 180°: its points are estimated "

@@ -50,6 +50,7 @@ def photograph_facts(views) -> list[tuple[str, str]]:
         ("Board", str(views.board)),
         ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
         ("Points", f"{int(views.visible.sum())} of {views.visible.size} image points found"),
+        *(("Note", note) for note in views.notes),
     ]
 
 

@@ -12,6 +12,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.batch.camera import STATUS
+from jaxbundle.batch.camera import WEAK as WEAK_NUMBER
 from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
 from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.cameras import CameraModel
@@ -25,16 +27,22 @@ GROSS_LIMIT = 12.0
 LEAST_GROSS = 3.0
 """And above this many pixels."""
 PART = 1 / 3
+MIRRORED = "its points are numbered as in a mirror: it would see the board from behind"
+WEAK = STATUS[WEAK_NUMBER]
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """Usable views, camera parameters, X0 and ω, φ, κ (radians) of every view."""
+    """Usable views, camera parameters, X0 and ω, φ, κ (radians) of every view.
+
+    `behind`: every view shows the board as a mirror image.
+    """
 
     views: BoardViews
     parameters: dict[str, float]
     position: Float[np.ndarray, "views 3"]
     angles: Float[np.ndarray, "views 3"]
+    behind: bool = False
 
 
 def start_values(
@@ -58,7 +66,7 @@ def start_values(
             continue
         behind = solved.position[:, 2] < views.board.points[:, 2].mean()
         if behind.any() and not behind.all():
-            views = views.take(~behind, "its points are numbered as in a mirror")
+            views = views.take(~behind, MIRRORED)
             continue
         gross = _gross_views(views, solved)
         if not gross.any():
@@ -73,7 +81,7 @@ def start_values(
     parameters = parameters_of(
         solved, views.xy[views.visible], views.image_size, model, free, pixel_size, given
     )
-    return Start(views, parameters, solved.position, solved.angles)
+    return Start(views, parameters, solved.position, solved.angles, bool(behind.all()))
 
 
 def _why(views):
@@ -86,9 +94,10 @@ def _solve(views: BoardViews, model: CameraModel, free) -> FirstCamera:
     )
     if found.solved:
         return found
+    why = found.remark if found.status == WEAK else found.status
     raise NotSolvedError(
         f"not solved: {len(views)} photographs of the board do not determine the camera "
-        f"({found.status}); take it from different directions, tilted by 20° to 45°, some with "
+        f"({why}); take it from different directions, tilted by 20° to 45°, some with "
         "the camera turned by 90°, or free fewer parameters",
         free,
     )

@@ -23,15 +23,12 @@ from jaxbundle.choices import CODED_TARGETS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
-from jaxbundle.measure.corners import find_board
+from jaxbundle.measure.corners import find_board_points
+from jaxbundle.measure.marker_corners import fit_marker_corners
 from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.photographs.opencv import need_opencv
 
-CORNER = 0.1
-"""σ of a corner, pixels."""
-CORNER_HALF_WINDOW = 3
-"""Half a window in which a corner is refined, pixels."""
 SAMPLES = 20
 """Samples in every sector of a ring."""
 GAP, RING, BEYOND = 1.5, 2.5, 3.4
@@ -45,14 +42,21 @@ SECTOR_TOLERANCE = 0.3
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class NamedPoints:
-    """Points found in a photograph: names, pixels, σ in pixels."""
+    """Points found in a photograph: names, pixels and their covariance; `left_out`: names of points
+    that could not be measured, and why."""
 
     names: tuple[str, ...]
     xy: Float[np.ndarray, "n 2"]
-    sigma: Float[np.ndarray, "n 2"]
+    covariance: Float[np.ndarray, "n 2 2"]
+    left_out: tuple[tuple[str, str], ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "n 2"]:
+        """Standard deviations of the coordinates, pixels."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> NamedPoints:
@@ -63,10 +67,11 @@ def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> Na
     check_kind(kind)
     name, _, option = kind.partition(":")
     if name in ("ring12", "ring14"):
-        return _unique(_rings(grey, int(name[4:])))
+        found = _rings(grey, int(name[4:])) or _rings(255 - grey, int(name[4:]))
+        return _unique(found)
     if name == "charuco":
         return _unique(_charuco(grey, option))
-    return _unique(_markers(grey, *_dictionary(name, option)))
+    return _markers(grey, *_dictionary(name, option))
 
 
 def check_kind(kind: str) -> None:
@@ -93,27 +98,36 @@ def _unique(found) -> NamedPoints:
     return NamedPoints(
         tuple(name for name, *_ in kept),
         np.array([xy for _, xy, _ in kept], float).reshape(-1, 2),
-        np.array([sigma for *_, sigma in kept], float).reshape(-1, 2),
+        np.array([covariance for *_, covariance in kept], float).reshape(-1, 2, 2),
     )
 
 
-def _markers(grey, dictionary, border):
+def _markers(grey, dictionary, border) -> NamedPoints:
     cv2 = need_opencv()
     known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
     if dictionary.upper() not in known:
         raise InputError(f"dictionary {dictionary!r}{did_you_mean(dictionary, known)}")
+    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, known[dictionary.upper()]))
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
-    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, known[dictionary.upper()]))
-    corners, ids, _ = cv2.aruco.ArucoDetector(words, parameters).detectMarkers(grey)
-    found = []
-    for four, id in zip(corners, [] if ids is None else ids.ravel().tolist()):
-        side = np.linalg.norm(np.diff(four[0], axis=0), axis=1).min()
-        half = int(np.clip(side / 8, 1, CORNER_HALF_WINDOW))
-        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.005)
-        xy = cv2.cornerSubPix(grey, four[0].astype(np.float32).copy(), (half, half), (-1, -1), stop)
-        found += [(f"{id}-{k}", place, (CORNER, CORNER)) for k, place in enumerate(xy, 1)]
-    return found
+    for parameters.detectInvertedMarker in (False, True):
+        corners, ids, _ = cv2.aruco.ArucoDetector(words, parameters).detectMarkers(grey)
+        if ids is not None:
+            break
+    ids = np.zeros(0, int) if ids is None else ids.ravel().astype(int)
+    once = np.bincount(ids, minlength=1)[ids] == 1
+    ids, near = ids[once], np.array([four[0] for four in corners], float).reshape(-1, 4, 2)[once]
+    if not len(ids):
+        return _unique([])
+    side = words.markerSize + 2 * border
+    draw = lambda id: cv2.aruco.generateImageMarker(words, id, side, borderBits=border) > 0
+    found = fit_marker_corners(grey, near, np.array([draw(id) for id in ids.tolist()]), border)
+    names = np.array([[f"{id}-{k}" for k in range(1, 5)] for id in ids], dtype=object)
+    good = found.why == ""
+    return NamedPoints(
+        tuple(names[good]), found.xy[good], found.covariance[good],
+        tuple(zip(names[~good], found.why[~good])),
+    )  # fmt: skip
 
 
 def _charuco(grey, option):
@@ -123,11 +137,12 @@ def _charuco(grey, option):
         raise InputError(f"charuco:{option}: COLUMNSxROWS is expected, such as 8x6") from None
     dictionary = option.split(":")[1] if ":" in option else "DICT_4X4_50"
     board = Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
-    xy = find_board(grey, board)
-    if xy is None:
+    try:
+        points = find_board_points(grey, board)
+    except InputError:
         return []
-    return [(id, place, (CORNER, CORNER)) for id, place in zip(board.ids, xy)
-            if np.isfinite(place).all()]  # fmt: skip
+    return [(id, xy, covariance) for id, xy, covariance in
+            zip(board.ids, points.xy, points.covariance) if np.isfinite(xy).all()]  # fmt: skip
 
 
 def _rings(grey, bits):
@@ -145,7 +160,7 @@ def _rings(grey, bits):
         reach = 3 * target.axes[0]
         if all(np.linalg.norm(target.xy - t.xy) > max(reach, 3 * t.axes[0]) for _, t in kept):
             kept.append((code, target))
-    return [(str(code), target.xy, target.sigma) for code, target in kept]
+    return [(str(code), target.xy, target.covariance) for code, target in kept]
 
 
 def _discs(grey):

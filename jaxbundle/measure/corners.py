@@ -1,10 +1,9 @@
 """Detection of boards in photographs by OpenCV, with the numbering of `boards`.
 
-Corners of squares are refined by OpenCV's `cornerSubPix`: the point to which all grey-value
-gradients around it are perpendicular (Förstner and Gülch, 1987). Its window is chosen from the
-distance to the next corner. Circles are refined by `targets`. Boards are searched in a reduced copy
-of a large photograph (24 million pixels take 25 s, one of 1600 columns 1 s), points are measured in
-the original.
+Corners of squares are fitted to the grey values around them (`saddles`), circles by `targets`: each
+with its covariance. Boards of light squares on dark ground, the negative of the usual ones, are
+searched if nothing else is found. Boards are searched in a reduced copy of a large photograph (24
+million pixels take 25 s, one of 1600 columns 1 s), points are measured in the original.
 """
 
 import dataclasses
@@ -14,8 +13,8 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import MARKER, SMALLEST_SIDE, Board
-from jaxbundle.measure.corner_windows import half_window, refine_by_gradients
-from jaxbundle.measure.tag_grids import find_tags, get_dictionary
+from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
+from jaxbundle.measure.tag_grids import BoardPoints, find_tags, get_dictionary, make_points
 from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.photographs.opencv import need_opencv
 
@@ -34,15 +33,42 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
 
     **Raises:** `InputError` with the reason if there are none.
     """
+    return find_board_points(grey, board).xy
+
+
+def find_board_points(grey: Grey, board: Board) -> BoardPoints:
+    """The image points of a board in a photograph with their covariance; boards that are the
+    negative of the usual ones too.
+
+    **Raises:** `InputError` with the reason if there are none.
+    """
     cv2 = need_opencv()
     if min(grey.shape) < 16:
         raise InputError(f"the image of {grey.shape[1]} × {grey.shape[0]} pixels is too small")
     finders = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": find_tags}
     find = finders.get(board.kind, _circles)
     try:
-        return find(cv2, grey, board)
+        try:
+            return find(cv2, grey, board)
+        except InputError as error:
+            # circles are searched light and dark anyway
+            if find is _circles or find is _chessboard and not _is_in_small(cv2, 255 - grey, board):
+                raise
+            try:
+                return dataclasses.replace(find(cv2, 255 - grey, board), negative=True)
+            except InputError:
+                raise error from None
     except cv2.error as error:
         raise InputError(f"OpenCV cannot search this image: {error.err}") from None
+
+
+def _is_in_small(cv2, grey, board) -> bool:
+    """Whether a chessboard is in a small copy of a photograph: much faster than a full search."""
+    small, _ = _reduce(cv2, grey, QUICK_SIDE)
+    found, _ = cv2.findChessboardCornersSB(
+        small, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    return found
 
 
 def other_sizes(grey: Grey, board: Board) -> Board | None:
@@ -126,8 +152,9 @@ def _chessboard(cv2, grey, board):
             f"no chessboard of {size[0]} × {size[1]} inner corners found: it must be seen whole, "
             "with a light margin"
         )
-    xy = _refine(cv2, grey, xy.reshape(*board.grid, 2))
-    return _first_black(grey, _turn_upright(xy), board).reshape(-1, 2)
+    xy = _first_black(grey, _turn_upright(xy.reshape(*board.grid, 2)), board)
+    lines = lines_of_grid(xy).reshape(-1, 2, 2)
+    return make_points(fit_saddles(grey, xy.reshape(-1, 2), lines), np.arange(xy.size // 2), board)
 
 
 def _in_copies(cv2, grey, seek):
@@ -149,13 +176,6 @@ def _reduce(cv2, grey, side):
     rows, columns = (n // factor * factor for n in grey.shape)
     size = (columns // factor, rows // factor)
     return cv2.resize(grey[:rows, :columns], size, interpolation=cv2.INTER_AREA), factor
-
-
-def _refine(cv2, grey, xy):
-    """Refined corners [rows, columns, 2], each in a window without other corners."""
-    near = [np.linalg.norm(np.diff(xy, axis=axis), axis=2) for axis in (0, 1)]
-    half = half_window(min(d.min() for d in near))
-    return refine_by_gradients(grey, xy.reshape(-1, 2), half).reshape(xy.shape)
 
 
 def _turn_upright(xy):
@@ -190,12 +210,16 @@ def _contrast(grey, xy):
 def _charuco(cv2, grey, board):
     aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
     marker = board.marker or MARKER * board.square
-    best = None
+    best, seen = None, {}
     for legacy in (False, True):
         size = (board.columns, board.rows)
         known = aruco.CharucoBoard(size, board.square, marker, dictionary)
         known.setLegacyPattern(legacy)
-        xy, ids, *_ = aruco.CharucoDetector(known).detectBoard(grey)
+        # markers are searched once: they take the time
+        xy, ids, *markers = aruco.CharucoDetector(known).detectBoard(grey, **seen)
+        if markers[1] is None:
+            break
+        seen = dict(zip(("markerCorners", "markerIds"), markers))
         if ids is not None and (best is None or len(ids) > len(best[1])):
             best = xy.reshape(-1, 2), ids.ravel()
     if best is None or len(best[1]) < 4:
@@ -204,13 +228,32 @@ def _charuco(cv2, grey, board):
             f"with {board.dictionary} markers found"
         )
     xy, ids = best
-    apart = np.linalg.norm(xy[:, None] - xy[None], axis=2)
-    # no markers beside a corner in its window
-    free = 0.5 * (1 - marker / board.square)
-    half = half_window(apart[apart > 0].min(), free)
-    found = np.full((len(board.ids), 2), np.nan)
-    found[ids] = refine_by_gradients(grey, xy, half)
-    return found
+    X = board.points[ids, :2] / board.square
+    on_grid = np.full((*board.grid, 2), np.nan)
+    on_grid.reshape(-1, 2)[ids] = xy
+    lines = lines_of_grid(on_grid).reshape(-1, 2, 2)[ids]
+    H, _ = cv2.findHomography(X, xy, cv2.LMEDS)
+    if H is None:
+        raise InputError("the corners of the ChArUco board found lie on a line")
+    image = lambda X: cv2.perspectiveTransform(X[None], H)[0]
+    expected = np.stack([image(X + [1, 0]) - image(X), image(X + [0, -1]) - image(X)], 1)
+    lines = np.where(np.isfinite(lines), lines, expected)
+    return make_points(fit_saddles(grey, xy, lines, _strips(image, X, lines, board)), ids, board)
+
+
+def _strips(image, X, lines, board):
+    """Distances of the corners of markers from the lines through the corners of a ChArUco board,
+    for `fit_saddles`."""
+    width = (1 - (board.marker or MARKER * board.square) / board.square) / 2
+    normal = np.stack([-lines[..., 1], lines[..., 0]], 2)
+    normal /= np.linalg.norm(normal, axis=2)[..., None]
+    strips, rows = np.empty((len(X), 2, 2, 2)), np.arange(len(X))
+    for right in (-width, width):
+        for up in (-width, width):
+            away = np.einsum("ni,nki->nk", image(X + [right, up]) - image(X), normal)
+            first, second = (away > 0).astype(int).T
+            strips[rows, first, second] = np.abs(away)
+    return strips
 
 
 def _circles(cv2, grey, board):
@@ -237,7 +280,12 @@ def _circles(cv2, grey, board):
         xy = _number_asymmetric(xy)
     else:
         xy = _turn_upright(xy)
-    return np.array([centre_by_ellipse(grey, place).xy for place in xy.reshape(-1, 2)])
+    targets = [centre_by_ellipse(grey, place) for place in xy.reshape(-1, 2)]
+    centres = Saddles(
+        np.array([t.xy for t in targets]), np.array([t.covariance for t in targets]),
+        np.full(len(targets), "", dtype=object),
+    )  # fmt: skip
+    return make_points(centres, np.arange(len(targets)), board)
 
 
 def _blob_finder(cv2, grey, shade):

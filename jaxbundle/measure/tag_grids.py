@@ -8,14 +8,18 @@ left, and borders of one bit, are recognised.
 Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
 """
 
+import dataclasses
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import MARKER, Board
-from jaxbundle.measure.corner_windows import Grey, half_window, refine_by_gradients
+from jaxbundle.measure.corner_quality import TOO_SMALL
+from jaxbundle.measure.saddles import Saddles, fit_saddles
+
+Grey = UInt8[np.ndarray, "rows columns"]
 
 BORDERS = (2, 1)
 """Bits of the border: of Kalibr, of other printed tags."""
@@ -25,6 +29,29 @@ NEIGHBOURS = 9
 """Tags whose middles give the places of the corners of a tag."""
 LARGEST_OFFSET = 0.25
 """Largest distance of a corner from its place by the homography, in sides of its tag."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardPoints:
+    """The points of a board in a photograph, in the order of `Board.ids`: pixels and their
+    covariance, NaN for missing points; `negative`: light squares on dark ground."""
+
+    xy: Float[np.ndarray, "points 2"]
+    covariance: Float[np.ndarray, "points 2 2"]
+    negative: bool = False
+
+
+def make_points(fits: Saddles, rows, board: Board) -> BoardPoints:
+    """The points in these rows of a board; those that could not be measured are missing.
+
+    **Raises:** `InputError` if fewer than four are left."""
+    good = fits.why == ""
+    if good.sum() < min(4, len(board.ids)):
+        reasons = sorted({why for why in fits.why if why}) or [TOO_SMALL]
+        raise InputError(f"the points of the {board} cannot be measured: {' or '.join(reasons)}")
+    xy, covariance = np.full((len(board.ids), 2), np.nan), np.full((len(board.ids), 2, 2), np.nan)
+    xy[rows[good]], covariance[rows[good]] = fits.xy[good], fits.covariance[good]
+    return BoardPoints(xy, covariance)
 
 
 def get_dictionary(name: str) -> Any:
@@ -41,8 +68,8 @@ def get_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def find_tags(cv2, grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
-    """The corners of the tags in a photograph, in the order of `board.ids`; NaN where missing.
+def find_tags(cv2, grey: Grey, board: Board) -> BoardPoints:
+    """The corners of the tags in a photograph.
 
     **Raises:** `InputError` for fewer than four tags, or tags in one row.
     """
@@ -61,21 +88,20 @@ def find_tags(cv2, grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
             break
     else:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
-    found = np.full((len(board.ids), 2), np.nan)
     side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
+    marker = board.marker or MARKER * board.square
+    gap = min(1.0, board.square / marker - 1)
+    xy, rows, lines = [], [], []
     for which, there, four, length in zip(corners, near, seen, side):
         apart = np.linalg.norm(there[:, None] - four, axis=2)
         if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < LARGEST_OFFSET * length:
-            found[which] = there  # OpenCV's corners reach into the squares of the gaps
-    known = np.isfinite(found[:, 0])
-    marker = board.marker or MARKER * board.square
-    half = half_window(side.min() * min(1.0, board.square / marker - 1))
-    refined = refine_by_gradients(grey, found[known], half)
-    moved = np.linalg.norm(refined - found[known], axis=1)
-    found[known] = np.where(((moved > 0) & (moved < half + 1))[:, None], refined, np.nan)
-    if np.isnan(found).all():
+            xy += list(there)  # OpenCV's corners reach into the squares of the gaps
+            rows += which.tolist()
+            along = gap * (np.roll(there, -1, 0) - there)
+            lines += list(np.stack([along, np.roll(along, 1, 0)], 1))
+    if not rows:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
-    return found
+    return make_points(fit_saddles(grey, np.array(xy), np.array(lines)), np.array(rows), board)
 
 
 def _read_tags(

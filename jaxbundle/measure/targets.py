@@ -6,16 +6,19 @@
 
        w = (g − b)/(f − b)        x̄ = Σw·x/Σw        σ² = σg²/(f − b)²·Σ(x − x̄)²/(Σw)²
 
-3. Centre by an ellipse: grey-value profiles across the edge, along the normals of the spot's
-   ellipse of inertia; the edge is at the mean of the local levels of target and background;
-   then `fit_ellipse`. (Blur σ makes a disc of radius r smaller
-   by about σ²/2r; its centre is unchanged.)
+3. Centre by an ellipse: a blurred disc fitted to the grey values about its rim,
+
+       g = G + m·(p − x) + C·Φ(d/τ)        d = ρ·(1 − ρ)/|M·(p − x)|,  ρ² = (p − x)ᵀ·M·(p − x)
+
+   with d the distance of the pixel p inside the ellipse ρ = 1 (Sampson, 1982), G and m the ground
+   and its change, C the contrast, τ the blur of lens and pixel. Nothing is interpolated; the
+   covariance follows from the residuals. (Blur σ makes a disc of radius r smaller by about σ²/2r,
+   and an encoding of the grey values shifts its rim; its centre is unchanged by both.)
 
 Both centres are those of the ellipse, not of the circle: `circle_centre_shift`.
 """
 
 import dataclasses
-from functools import partial
 
 import numpy as np
 import scipy  # its parts are loaded on use
@@ -23,20 +26,19 @@ from jaxtyping import Float
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.measure.ellipses import fit_ellipse
 from jaxbundle.measure.spots import MARGIN, find_spot
-from jaxbundle.system.programs import compile_once
 
-PROFILES = (16, 32, 64)
-"""Numbers of profiles: the largest not above the circumference in pixels, so that no pixel is
-measured twice."""
-STEP = 0.25
-"""Step along a profile, in pixels."""
-SAMPLING = 0.045
-"""σ of an edge point due to the pixel raster, in pixels: with few profiles the fit hides it.
-
-(Rendered discs of 2 to 10 pixels radius, blur 0.7 to 1.2: 0.03 to 0.045.)
-"""
+REACH = 3.5
+"""Pixels are used to this distance from the rim, in τ, and one more, but not beyond `MARGIN` pixels
+outside, nor 0.8 of the shorter semi-axis inside."""
+SECTORS, OUTLIER = 16, 3.5
+"""Sectors of the rim that are compared, and the limit of their shifts in standard deviations:
+others are left out."""
+STEPS, CONVERGED = 15, 1e-3
+"""Most steps, and the last change of the centre in pixels."""
+LEAST_SEEN = 0.6
+"""Part of the rim that must be used."""
+UNKNOWNS = 10
 
 
 @print_in_one_screen
@@ -44,19 +46,25 @@ SAMPLING = 0.045
 class Target:
     """The measured centre of a target.
 
-    **Fields:** `xy` and `sigma`, pixels; `bright`: lighter than its surroundings; `threshold`,
-    `contrast`, `noise`: grey values; `axes`, `angle`: semi-axes (the longer first) in pixels and
-    the direction of the longer one in radians, x right, y down.
+    **Fields:** `xy` and its `covariance`, pixels, with `sigma` their standard deviations; `bright`:
+    lighter than its surroundings; `threshold`, `contrast`, `noise`: grey values; `axes`, `angle`:
+    semi-axes (the longer first) in pixels and the direction of the longer one in radians, x right,
+    y down.
     """
 
     xy: Float[np.ndarray, "2"]
-    sigma: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
     axes: Float[np.ndarray, "2"]
     angle: float
     bright: bool
     threshold: float
     contrast: float
     noise: float
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "2"]:
+        """Standard deviations of the coordinates, pixels."""
+        return np.sqrt(np.diagonal(self.covariance))
 
 
 def centre_by_grey_values(grey, near) -> Target:
@@ -70,8 +78,9 @@ def centre_by_grey_values(grey, near) -> Target:
     xy, spread, total = _moments(spot)
     away = _places(spot) - xy[:, None, None]
     region = _region(spot)
-    sigma = spot.noise / abs(spot.contrast) * np.sqrt((away**2 * region).sum((1, 2))) / total
-    return _target(spot, xy, sigma, *_axes_of(spread))
+    away = (away * region).reshape(2, -1)
+    covariance = (spot.noise / (spot.contrast * total)) ** 2 * away @ away.T
+    return _target(spot, xy, covariance, *_axes_of(spread))
 
 
 def centre_by_ellipse(grey, near) -> Target:
@@ -79,20 +88,17 @@ def centre_by_ellipse(grey, near) -> Target:
     edge; arguments and errors as in `centre_by_grey_values`."""
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, _ = _moments(spot)
-    axes, angle = _axes_of(spread)
-    edge = _edge_points(spot, xy, axes, angle)
-    weights = np.isfinite(edge).all(1).astype(float)
-    if weights.sum() < 0.6 * len(edge):
+    centre, covariance, axes, angle, seen = _fit_disc(spot, xy, *_axes_of(spread))
+    if seen < LEAST_SEEN:
         raise InputError(f"{_place(spot, xy)}: the edge of the target is not fully visible")
-    centre, covariance, axes, angle = _fit_robustly(np.nan_to_num(edge), weights)
-    if not np.isfinite(covariance).all():
+    if not np.isfinite(covariance).all() or np.linalg.norm(centre - xy) > 0.3 * axes[0] + 1:
         raise InputError(f"{_place(spot, xy)}: the edge of the target is not an ellipse")
-    return _target(spot, centre, np.sqrt(np.diagonal(covariance)), axes, angle)
+    return _target(spot, centre, covariance, axes, angle)
 
 
-def _target(spot, xy, sigma, axes, angle):
+def _target(spot, xy, covariance, axes, angle):
     return Target(
-        xy=xy + spot.corner, sigma=sigma, axes=np.asarray(axes), angle=float(angle),
+        xy=xy + spot.corner, covariance=covariance, axes=np.asarray(axes), angle=float(angle),
         bright=spot.contrast > 0, threshold=spot.threshold, contrast=abs(spot.contrast),
         noise=spot.noise,
     )  # fmt: skip
@@ -128,58 +134,102 @@ def _axes_of(spread):
     return 2 * np.sqrt(values[::-1]), np.arctan2(y, x)
 
 
-def _edge_points(spot, xy, axes, angle):
-    """Points of the edge [profiles, 2], NaN for profiles without one."""
-    circumference = np.pi * axes.sum()
-    number = max([n for n in PROFILES if n <= circumference] or PROFILES[:1])
-    t = 2 * np.pi * (np.arange(number) + 0.5) / number
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    start = xy + (axes * np.stack([np.cos(t), np.sin(t)], 1)) @ turn.T
-    normal = np.stack([np.cos(t) / axes[0], np.sin(t) / axes[1]], 1) @ turn.T
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    reach = min(MARGIN, 0.8 * axes[1])
-    s = np.arange(-reach, MARGIN + STEP / 2, STEP)
-    x, y = (start[:, None] + s[:, None] * normal[:, None]).transpose(2, 0, 1)
-    profile = scipy.ndimage.map_coordinates(spot.grey, [y, x], order=3, mode="nearest")
-    profile = (profile - spot.background) / spot.contrast
-    inner, outer = profile[:, :3].mean(1), profile[:, -3:].mean(1)
-    middle = (inner + outer) / 2
-    crosses = (profile[:, :-1] > middle[:, None]) & (profile[:, 1:] <= middle[:, None])
-    # of several crossings, the one nearest to the expected edge
-    away = np.where(crosses, np.abs(s[:-1]), np.inf)
-    k, all_of_them = away.argmin(1), np.arange(number)
-    upper, lower = profile[all_of_them, k], profile[all_of_them, k + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = s[k] + STEP * (upper - middle) / (upper - lower)
-    good = crosses.any(1) & (inner - outer > 0.3)
-    return np.where(good[:, None], start + at[:, None] * normal, np.nan)
+def _fit_disc(spot, xy, axes, angle):
+    """Centre, its covariance, semi-axes, angle, and the part of the rim that was used."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    M = turn @ np.diag(np.asarray(axes) ** -2.0) @ turn.T
+    theta = np.array([*xy, M[0, 0], M[0, 1], M[1, 1], spot.background, spot.contrast, 0.0, 0, 0])
+    scale = np.array([1, 1, *[2 / axes[1] ** 3] * 3, abs(spot.contrast), abs(spot.contrast), 1,
+                      spot.noise, spot.noise])  # fmt: skip
+    places, grey = _places(spot).reshape(2, -1), spot.grey.ravel()
+    theta, A, r, weight, sector = _iterate(theta, scale, places, grey, 1.0)
+    kept = _consistent_sectors(A, r, weight, sector)
+    if not kept.all():
+        theta, A, r, weight, sector = _iterate(theta, scale, places, grey, kept)
+    noise = max(np.sqrt(r @ r / max(weight.sum() - UNKNOWNS, 1)), 12**-0.5)
+    inverse = np.linalg.inv(_normal_matrix(A))
+    covariance = (noise * _excess(A, r, inverse, sector, noise)) ** 2 * inverse[:2, :2]
+    seen = np.unique(sector[weight > 0]).size / SECTORS
+    values, vectors = np.linalg.eigh([[theta[2], theta[3]], [theta[3], theta[4]]])
+    angle = np.arctan2(vectors[1, 0], vectors[0, 0])
+    angle = np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2
+    return theta[:2], covariance, values**-0.5, angle, seen
 
 
-@partial(compile_once, static=())
-def _fit(xy, weights):
-    return fit_ellipse(xy, weights)
+def _iterate(theta, scale, places, grey, kept):
+    """The disc that fits the kept pixels: its parameters, scaled derivatives, residuals, and pixels
+    used."""
+    step = 0
+    while True:
+        g, J, d, sector, minor = _blurred_disc(theta, places)
+        reach = REACH * np.exp(theta[7]) + 1
+        weight = kept * ((d < min(reach, 0.8 * minor)) & (d > -min(reach, MARGIN)))
+        r = weight * (grey - g)
+        A = J * (weight * scale[:, None])
+        change = scale * np.linalg.solve(_normal_matrix(A), A @ r)
+        change[:2] = np.clip(change[:2], -1, 1)
+        change[7] = np.clip(change[7], -0.4, 0.4)
+        while _is_no_ellipse(theta + change) and np.abs(change).max() > 1e-12:
+            change = change / 2
+        theta = theta + change
+        theta[7] = np.clip(theta[7], np.log(0.35), np.log(0.5 * minor + 1))
+        step += 1
+        if step == STEPS or step > 3 and np.abs(change[:2]).max() < CONVERGED:
+            return theta, A, r, weight, sector
 
 
-def _fit_robustly(xy, weights):
-    """Centre, its covariance, axes and angle of the ellipse; the worst points are left out once."""
-    for _ in range(2):
-        found = _fit(xy, weights)
-        away = _distances(found, xy)
-        limit = 3.5 * max(1.4826 * np.median(np.abs(away[weights > 0])), 0.02)
-        weights = weights * (np.abs(away) < limit)
-    found = _fit(xy, weights)
-    worse = max(SAMPLING / float(found.sigma0), 1.0)
-    return tuple(
-        np.asarray(x)
-        for x in (found.centre, worse**2 * found.covariance, found.axes, found.angle)
-    )
+def _normal_matrix(A):
+    """A·Aᵀ, and a millionth of its trace on the diagonal: few pixels may leave a level open."""
+    N = A @ A.T
+    return N + 1e-6 * np.trace(N) * np.eye(UNKNOWNS)
 
 
-def _distances(ellipse, xy):
-    """Distances of points [n, 2] from an ellipse, to first order."""
-    c, s = np.cos(ellipse.angle), np.sin(ellipse.angle)
-    along = (xy - np.asarray(ellipse.centre)) @ np.array([[c, -s], [s, c]])
-    axes = np.asarray(ellipse.axes)
-    radius = np.linalg.norm(along / axes, axis=1)
-    slope = np.linalg.norm(along / axes**2, axis=1) / np.maximum(radius, 1e-9)
-    return (radius - 1) / np.maximum(slope, 1e-9)
+def _is_no_ellipse(theta) -> bool:
+    A, B, C = theta[2:5]
+    return not (A > 0 and C > 0 and A * C > 1.01 * B * B)
+
+
+def _blurred_disc(theta, places):
+    """Grey values of the pixels, their derivatives [unknowns, pixels], distances from the rim,
+    sector, and the shorter semi-axis."""
+    x, y, A, B, C, ground, contrast, lntau, mx, my = theta
+    tau = np.exp(lntau)
+    u, v = places[0] - x, places[1] - y
+    gu, gv = A * u + B * v, B * u + C * v
+    rho = np.sqrt(np.maximum(u * gu + v * gv, 1e-6))
+    slope = np.maximum(np.hypot(gu, gv), 1e-9)
+    d = rho * (1 - rho) / slope
+    z = d / tau
+    step, density = scipy.special.ndtr(z), np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
+    f = contrast * density / tau
+    J = np.stack([
+        f * gu / slope, f * gv / slope, -f * u * u / (2 * slope), -f * u * v / slope,
+        -f * v * v / (2 * slope), np.ones_like(u), step, -contrast * z * density, u, v,
+    ])  # fmt: skip
+    sector = ((np.arctan2(v, u) / np.pi + 1) / 2 * SECTORS).astype(int) % SECTORS
+    half, other = (A + C) / 2, np.hypot((A - C) / 2, B)
+    return ground + contrast * step + mx * u + my * v, J, d, sector, (half + other) ** -0.5
+
+
+def _consistent_sectors(J, r, weight, sector):
+    """1 for pixels of sectors whose rim agrees with the ellipse, within the noise or the scatter of
+    all."""
+    normal = np.hypot(J[0], J[1]) * weight
+    information = np.bincount(sector, normal**2, SECTORS)
+    shift = np.bincount(sector, normal * r * np.sign(J[6]), SECTORS)
+    z = shift / np.sqrt(np.maximum(information, 1e-12))
+    noise = np.sqrt(max(r @ r / max(weight.sum() - UNKNOWNS, 1), 1 / 12))
+    spread = max(1.4826 * np.median(np.abs(z)), noise)
+    return (np.abs(z) < OUTLIER * spread)[sector].astype(float)
+
+
+def _excess(A, r, inverse, sector, noise):
+    """By how much the centres from opposite pairs of sectors scatter more than the noise says (1:
+    not); what is alike on opposite sides does not move the centre."""
+    score = np.stack([np.bincount(sector, a * r, SECTORS) for a in A])
+    pairs = inverse[:2] @ (score[:, : SECTORS // 2] + score[:, SECTORS // 2 :])
+    ratio = np.einsum("is,ij,js->", pairs, np.linalg.inv(inverse[:2, :2]), pairs)
+    ratio /= (SECTORS - 2) * noise**2
+    spread = np.sqrt(2 / SECTORS)
+    return np.sqrt(ratio) if ratio > 1 + 3 * spread else 1.0

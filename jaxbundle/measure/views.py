@@ -16,7 +16,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
-from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
+from jaxbundle.measure.corners import find_board_points, largest_chessboard, other_sizes
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
@@ -45,7 +45,7 @@ class BoardViews:
 
     **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN for missing
     points; `failed`: name and reason of every photograph not used; `warnings`: probable
-    mistakes.
+    mistakes; `notes`: what was found otherwise than usual.
     """
 
     board: Board
@@ -54,6 +54,7 @@ class BoardViews:
     xy: Float[np.ndarray, "views points 2"]
     failed: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         require_board(self.board)
@@ -136,15 +137,24 @@ def measure_boards(
         raise InputError("no photographs are given")
     file_of = name_photographs(files)
     repeated = _find_repeated(file_of)
-    search = lambda name: repeated.get(name) or search_board(file_of[name], board)
-    looks = {}
+
+    def search(name) -> tuple[Look, bool]:
+        return (repeated[name], False) if name in repeated else _search(file_of[name], board)
+
+    looks, negatives = {}, {}
     with ThreadPoolExecutor(available_cores()) as pool:
-        for done, (name, look) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
-            looks[name] = look
+        for done, (name, found) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
+            looks[name], negatives[name] = found
             if progress is not None:
                 progress(done, len(file_of))
     views = collect_views(file_of, looks, board)
-    return dataclasses.replace(views, warnings=_part_of_a_larger(file_of, views.names, board))
+    of_negatives = sum(negatives[name] for name in views.names)
+    notes = (
+        f"light squares on dark ground, the negative of the usual board, in {of_negatives} of "
+        f"{len(views)} photographs",
+    ) * bool(of_negatives)  # fmt: skip
+    warnings = _part_of_a_larger(file_of, views.names, board)
+    return dataclasses.replace(views, warnings=warnings, notes=notes)
 
 
 def collect_views(
@@ -184,11 +194,17 @@ def collect_views(
 def search_board(path: str | Path, board: Board) -> Look:
     """Image size (columns, rows) and image points of a board in one photograph, or the reason of a
     failure, without the path."""
+    return _search(path, board)[0]
+
+
+def _search(path, board) -> tuple[Look, bool]:
+    """The search result, and whether the board is a negative."""
     try:
         grey = read_photograph(path)
-        return (grey.shape[1], grey.shape[0]), find_board(grey, board)
+        found = find_board_points(grey, board)
+        return ((grey.shape[1], grey.shape[0]), found.xy), found.negative
     except InputError as error:
-        return str(error).removeprefix(f"{path}: ")
+        return str(error).removeprefix(f"{path}: "), False
 
 
 def search_alone(task: tuple[str | Path, Board]) -> Look:

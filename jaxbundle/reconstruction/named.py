@@ -1,6 +1,7 @@
 """Points with names in photographs: coded targets, control points, ends of scale bars."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -61,6 +62,9 @@ def find_named(
             name += one.names
             xy += list(one.xy)
             sigma += list(one.sigma)
+        left_out = Counter(why for one in found if one is not None for _, why in one.left_out)
+        notes += [f"{n} measurements of coded targets are left out: {why}"
+                  for why, n in left_out.items()]  # fmt: skip
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
     if control is not None and control.seen:
         index = {p.name: k for k, p in enumerate(photographs)}

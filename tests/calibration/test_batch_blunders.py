@@ -11,6 +11,7 @@ import jaxbundle
 from jaxbundle.batch.misfit import NORMAL, axes_remark, far_outside, misfits
 from jaxbundle.batch.normal import Calibration, Sightings, design
 from jaxbundle.batch.test_values import point_tests
+from jaxbundle.batch.weakness import weak_geometry
 from jaxbundle.cameras import get_model
 
 SIZE, VIEWS, NOISE = (1280, 960), 8, 0.2
@@ -278,3 +279,33 @@ def test_image_points_that_are_no_pixels_are_remarked():
     said = axes_remark(xy, np.array([1280.0, 960.0]), True)
     assert "of 1280 × 960 pixels: are they in pixels" in said
     assert not axes_remark(200 * xy, np.array([1280.0, 960.0]), True)
+
+
+def tilted_alike(distances, tilt):
+    """Views of the board tilted about one axis by one angle, degrees, at distances; no noise."""
+    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    found = []
+    for k, distance in enumerate(distances):
+        shift = [0.01 * np.sin(k), 0.01 * np.cos(2 * k), distance]
+        x, y, z = R @ (BOARD - BOARD.mean(0)).T + np.array(shift)[:, None]
+        found.append(np.stack([1000 * x / z + 640, 1000 * y / z + 480], 1))
+    return np.array(found)
+
+
+def test_views_that_do_not_determine_a_camera_are_weak_and_say_why(clean):
+    """All from the front, and all with one tilt: never an iteration limit with an RMS of NaN."""
+    rng = np.random.default_rng(2)
+    xy = clean[:3].copy()
+    xy[1] = tilted_alike(np.linspace(0.5, 0.52, VIEWS), 0) + rng.normal(0, NOISE, xy[1].shape)
+    xy[2] = tilted_alike(np.linspace(0.5, 0.8, VIEWS), 25) + rng.normal(0, NOISE, xy[2].shape)
+    found = jaxbundle.calibrate_batch(BOARD, xy, SIZE)
+    assert list(found.status) == ["converged", "weak", "weak"]
+    assert np.isfinite(found.rms).all()
+    seen = np.ones(xy.shape[1:3], bool)
+    assert weak_geometry(BOARD, xy[0], seen) == ""
+    assert "straight at the board" in weak_geometry(BOARD, xy[1], seen)
+    assert "tilted alike" in weak_geometry(BOARD, xy[2], seen)
+    for row in (1, 2):
+        if not found.solved[row]:
+            assert found.remark[row] == weak_geometry(BOARD, xy[row], seen)

@@ -31,6 +31,14 @@ CREATE TABLE IF NOT EXISTS boards
 """
 
 
+MEASUREMENT = 2
+"""Number of the method of measurement: corners by an earlier one are searched again."""
+
+
+def _key(board: Board) -> str:
+    return f"{board!r}, measurement {MEASUREMENT}"
+
+
 class KeptCorners:
     """The corners in such a file, and new ones; a context. Only one process at a time.
 
@@ -74,7 +82,7 @@ class KeptCorners:
         """The search result of a board in a photograph of this content; None: not searched."""
         found = self._first(
             "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
-            content, repr(board),
+            content, _key(board),
         )  # fmt: skip
         if found is None:
             return None
@@ -89,7 +97,7 @@ class KeptCorners:
         points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
         self._write(
             "INSERT OR REPLACE INTO boards VALUES (?, ?, ?, ?, ?, ?)",
-            content, repr(board), columns, rows, points, look if xy is None else None,
+            content, _key(board), columns, rows, points, look if xy is None else None,
         )  # fmt: skip
 
     def _first(self, question: str, *given) -> tuple | None:

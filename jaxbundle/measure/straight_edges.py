@@ -1,0 +1,320 @@
+r"""Nearly straight edges between two levels of grey, fitted to the grey values of the pixels beside
+them: a blurred step.
+
+With s the distance of a pixel from the chord of an edge, towards its inner side, and t its position
+along it, −1 … 1 from end to end, the edge is at s = u(t) = a + b·t + c·t², and the grey value
+
+    g = W + (B − W)·[Φ((s − u)/τ) − q·Φ((s − u − w)/τ)] + V·Φ(−(s − u + o)/τ)
+
+W and B are the outer and the inner level, linear in t; Φ the normal distribution and τ the blur,
+that of the lens and of the pixel's area (1/12 pixel²). The second term is the far side of the inner
+strip of width w, behind which q (0 … 1) is at the outer level again; the third an unknown level V +
+W beyond the outer strip of width o. Both are 0 unless the strips are narrow. All unknowns of an
+edge are estimated at once from its pixels, nothing is interpolated, so that their covariance
+follows from the noise, which is that of the residuals. The half level of the *grey values* counts
+as the edge: they are taken as proportional to light. An encoded photograph (gamma) shifts every
+edge towards its dark side (`edge_shift`).
+
+c takes up the curvature by the lens. It is bounded by a prior σ, so that short edges are
+straight. Pixels near the ends, where the blur of the adjacent edges reaches, are left out. Parts of
+an edge that contradict the others (dirt, a shadow) are left out, and if the others still scatter
+more than their σ, the covariance is increased.
+"""
+
+import dataclasses
+
+import numpy as np
+import scipy  # its parts are loaded on use
+from jaxtyping import Bool, Float
+
+COLUMNS = 32
+"""Most rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a quarter and
+take twice the time."""
+REACH = 3.5
+"""Pixels are used to this distance from the edge, in τ, and one pixel more: the step is
+complete."""
+CLEAR = 2.7
+"""Distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is left."""
+DENSITY = np.float32((2 * np.pi) ** -0.5)
+PARTS = 12
+"""Parts of an edge that are compared, and left out singly."""
+OUTLIER = 3.5
+"""Limit of a part's shift in its standard deviations."""
+SHARPEST, SOFTEST = 0.35, 4.0
+"""Limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29."""
+STEPS, CONVERGED = 8, 3e-3
+"""Most steps, and the change of nearly all edges, in pixels, after which the next is negligible."""
+UNKNOWNS = 9
+"""a, b, c, W at the middle, its change to the end, the same of B, V, ln τ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """The expected edges: what is known of `n` of them before the fit.
+
+    **Fields:** `start`, `end`, pixels, the inner side to the right of their direction as seen in
+    the image (u right, v down); `before`, `after`: a point and the direction of the adjacent edges,
+    [n, 2, 2]; `inner`, `outer`: widths of the strips at both ends, pixels, [n, 2]; `far`: positions
+    t of the boundaries of cells behind the inner strip, [n, cells + 1], and `level` of each cell, 1
+    for the outer level and 0 for the inner one, [n, cells].
+    """
+
+    start: Float[np.ndarray, "n 2"]
+    end: Float[np.ndarray, "n 2"]
+    before: Float[np.ndarray, "n 2 2"]
+    after: Float[np.ndarray, "n 2 2"]
+    inner: Float[np.ndarray, "n 2"]
+    outer: Float[np.ndarray, "n 2"]
+    far: Float[np.ndarray, "n cells+1"]
+    level: Float[np.ndarray, "n cells"]
+
+    @property
+    def half(self) -> Float[np.ndarray, " n"]:
+        """Half the length of the chord, pixels."""
+        return np.linalg.norm(self.end - self.start, axis=1) / 2
+
+    @property
+    def middle(self) -> Float[np.ndarray, "n 2"]:
+        return (self.start + self.end) / 2
+
+    @property
+    def along(self) -> Float[np.ndarray, "n 2"]:
+        return (self.end - self.start) / (2 * self.half[:, None])
+
+    @property
+    def inward(self) -> Float[np.ndarray, "n 2"]:
+        return _right_of(self.along)
+
+
+@dataclasses.dataclass(frozen=True)
+class EdgeFits:
+    """Fitted edges: a, b, c in pixels and their covariance; blur τ and its σ of ln τ; contrast
+    (inner minus outer level) and noise in grey values; `solved`: whether there is such an edge."""
+
+    curve: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+    blur: Float[np.ndarray, " n"]
+    contrast: Float[np.ndarray, " n"]
+    noise: Float[np.ndarray, " n"]
+    solved: Bool[np.ndarray, " n"]
+
+
+def take(edges: Edges, rows) -> Edges:
+    """Some of the edges."""
+    return Edges(*(getattr(edges, field.name)[rows] for field in dataclasses.fields(Edges)))
+
+
+def _right_of(along):
+    """To the right in the image, whose v points down: (1, 0) → (0, 1)."""
+    return np.stack([-along[..., 1], along[..., 0]], -1)
+
+
+def fit_edges(
+    grey: np.ndarray,
+    edges: Edges,
+    blur: Float[np.ndarray, " n"],
+    curvature: float,
+    coarse: bool = False,
+) -> EdgeFits:
+    """Edges in a photograph.
+
+    **Arguments:** `grey` [rows, columns]; `blur`: expected τ, which chooses the pixels;
+    `curvature`: prior σ of it, 1/pixels; `coarse`: the edges are only known to a few pixels.
+    """
+    pixels = _Pixels.of(grey, edges, blur)
+    theta = _start(pixels, edges, blur, coarse)
+    prior = _prior_weights(edges, curvature)
+    noise = np.full(len(theta), 1.0)
+    part = np.minimum(((pixels.t + 1) / 2 * PARTS).astype(int).clip(0), PARTS - 1)
+    weight = pixels.weight
+    for step in range(STEPS):
+        model, J = _model(theta, pixels)
+        r = pixels.grey - model
+        if step == 3:
+            weight = pixels.weight * _consistent_parts(J, r, pixels.weight, part)[0]
+        N, b = _normal(J, r, weight, prior, theta, noise)
+        d = np.linalg.solve(N, b[..., None])[..., 0]
+        limit = np.exp(theta[:, 8])[:, None]
+        d[:, :3] = np.clip(d[:, :3], -limit, limit)
+        d[:, 8] = np.clip(d[:, 8], -0.4, 0.4)
+        theta = theta + d
+        theta[:, 8] = np.clip(theta[:, 8], np.log(SHARPEST), np.log(SOFTEST))
+        freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
+        noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))
+        if step > 2 and np.quantile(np.abs(d[:, 0]), 0.9) < CONVERGED:
+            break
+    model, J = _model(theta, pixels)
+    r = pixels.grey - model
+    _, excess = _consistent_parts(J, r, pixels.weight, part)
+    N, _ = _normal(J, r, weight, prior, theta, noise)
+    Q = np.linalg.inv(N)[:, :3, :3]
+    contrast = theta[:, 5] - theta[:, 3]
+    used = weight.sum(1)
+    solved = (used > 2 * UNKNOWNS) & (noise < 0.2 * np.abs(contrast)) & np.isfinite(Q).all((1, 2))
+    solved &= (weight * pixels.weight).sum(1) > 0.6 * pixels.weight.sum(1)
+    scale = noise * excess
+    return EdgeFits(
+        theta[:, :3], scale[:, None, None] ** 2 * Q, np.exp(theta[:, 8]), contrast, noise, solved
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pixels:
+    """The pixels beside each edge [n, pixels]: s, t, grey value, weight 0 or 1; widths of the
+    strips and q there."""
+
+    s: np.ndarray
+    t: np.ndarray
+    grey: np.ndarray
+    weight: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+    level: np.ndarray
+
+    @classmethod
+    def of(cls, grey, edges, blur) -> "_Pixels":
+        along, inward, half = edges.along, edges.inward, edges.half
+        flat = np.abs(along[:, 0]) > np.abs(along[:, 1])
+        k = np.where(flat, 0, 1)  # the axis that runs along the edge
+        one = np.arange(len(k))
+        low = np.minimum(edges.start, edges.end)[one, k]
+        high = np.maximum(edges.start, edges.end)[one, k]
+        number = int(min(np.ceil(np.max(high - low)) + 1, COLUMNS))
+        step = np.maximum((high - low) / max(number - 1, 1), 1.0)
+        major = np.rint(low[:, None] + step[:, None] * np.arange(number))
+        slope = along[one, 1 - k] / along[one, k]
+        line = edges.middle[one, 1 - k, None] + slope[:, None] * (
+            major - edges.middle[one, k, None]
+        )
+        reach = REACH * np.max(blur) + 1
+        rows = int(np.ceil(reach * np.sqrt(1 + np.max(slope**2))))
+        minor = np.rint(line)[:, :, None] + np.arange(-rows, rows + 1)
+        major = np.broadcast_to(major[:, :, None], minor.shape)
+        place = np.where(flat[:, None, None, None], np.stack([major, minor], -1),
+                         np.stack([minor, major], -1)).reshape(len(k), -1, 2)  # fmt: skip
+        height, width = grey.shape
+        inside = np.all((place >= 0) & (place < [width, height]), axis=2)
+        u, v = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
+        away = place - edges.middle[:, None]
+        s = np.einsum("npk,nk->np", away, inward)
+        t = np.einsum("npk,nk->np", away, along) / half[:, None]
+        ends = np.stack([(1 - t) / 2, (1 + t) / 2], 2)
+        inner, outer = (np.einsum("npe,ne->np", ends, w) for w in (edges.inner, edges.outer))
+        weight = np.asarray(inside & (s < np.minimum(inner, REACH * blur[:, None] + 1)))
+        weight &= s > -np.minimum(outer, REACH * blur[:, None] + 1)
+        for near in (edges.before, edges.after):
+            apart = place - near[:, None, 0]
+            clear = np.einsum("npk,nk->np", apart, _right_of(near[:, 1]))
+            weight &= clear > np.maximum(CLEAR * blur, 0.5)[:, None]
+        weight &= np.abs(t) < 1
+        level = np.zeros_like(t)
+        if np.any(weight & (s > inner - REACH * blur[:, None])):
+            # the cells behind the strip, blurred along the edge
+            sharp = (half / blur)[:, None, None]
+            passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
+            level = np.einsum("npc,nc->np", passed[:, :, :-1] - passed[:, :, 1:], edges.level)
+        # single precision is faster, and exact to 1e-5 pixels
+        return cls(*(
+            x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)
+        ))
+
+
+def _start(pixels, edges, blur, coarse):
+    """Start values: levels from both sides, and for `coarse` the line from the steepest changes."""
+    theta = np.zeros((len(blur), UNKNOWNS))
+    w, s, g = pixels.weight, pixels.s, pixels.grey
+    theta[:, 8] = np.log(blur)
+    for column, side in ((3, s < 0), (5, s > 0)):
+        most = np.where(w * side > 0, np.abs(s), 0.0)
+        far = w * side * (most > 0.5 * most.max(1, keepdims=True))
+        theta[:, column] = (far * g).sum(1) / np.maximum(far.sum(1), 1)
+    if coarse:
+        # the area between the levels tells where the step is, also from far away
+        rate = (g - theta[:, 3:4]) / np.where(
+            np.abs(theta[:, 5:6] - theta[:, 3:4]) > 1, theta[:, 5:6] - theta[:, 3:4], np.inf
+        )
+        middle = w * (np.clip(rate, 0, 1) * (1 - np.clip(rate, 0, 1)))
+        for _ in range(3):
+            basis = np.stack([np.ones_like(s), pixels.t], 2)
+            N = np.einsum("npi,np,npj->nij", basis, middle, basis) + 1e-6 * np.eye(2)
+            b = np.einsum("npi,np,np->ni", basis, middle, s)
+            line = np.linalg.solve(N, b[..., None])[..., 0]
+            away = s - np.einsum("npi,ni->np", basis, line)
+            middle = middle / (1 + (away / 1.0) ** 2)
+        theta[:, :2] = line
+    return theta
+
+
+def _prior_weights(edges, curvature):
+    """Weights 1/σ² of weak pseudo-observations: c by the lens, V like any level, τ of a lens
+    in focus; they matter where the pixels say nothing."""
+    p = np.zeros((len(edges.start), UNKNOWNS))
+    p[:, 2] = (curvature * edges.half**2 / 2) ** -2.0
+    p[:, 4] = p[:, 6] = 20.0**-2
+    p[:, 7] = 100.0**-2
+    p[:, 8] = 1.0
+    return p
+
+
+def _model(theta, pixels):
+    """Grey values of the pixels, and their derivatives [n, pixels, unknowns]."""
+    a, b, c, W, W1, B, B1, V, lntau = (x[:, None] for x in theta.T.astype(np.float32))
+    tau, t = np.exp(lntau), pixels.t
+    s = pixels.s - (a + t * (b + t * c))
+    W, B = W + W1 * t, B + B1 * t
+    z, far, out = s / tau, (s - pixels.inner) / tau, (s + pixels.outer) / tau
+    ndtr, density = scipy.special.ndtr, lambda z: np.exp(-z * z / 2) * DENSITY
+    q = pixels.level
+    F, f, zf = ndtr(z), density(z), 0.0
+    zf = z * f
+    if q.any():
+        of_far = q * density(far)
+        F, f, zf = F - q * ndtr(far), f - of_far, zf - far * of_far
+    beyond = ndtr(-out)
+    of_out = density(out)
+    step = B - W
+    shift = (-step * f + V * of_out) / tau
+    J = np.stack([
+        shift, t * shift, t * t * shift, 1 - F, t * (1 - F), F, t * F, beyond,
+        -step * zf + V * out * of_out,
+    ], 2)  # fmt: skip
+    return W + step * F + V * beyond, J
+
+
+def _normal(J, r, weight, prior, theta, noise):
+    """Normal matrix and right hand side of residuals r = observed − computed, of unit weight."""
+    p = prior * noise[:, None] ** 2
+    reference = np.zeros_like(theta)
+    reference[:, 8] = np.log(0.8)
+    reference[:, [4, 6]] = 0.0
+    weighted = J * weight[:, :, None]
+    N = np.matmul(weighted.transpose(0, 2, 1), J)
+    N = N + p[:, :, None] * np.eye(UNKNOWNS)
+    N = N + 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(UNKNOWNS)
+    b = np.einsum("npi,np->ni", weighted, r) + p * (reference - theta)
+    return N, b
+
+
+def _consistent_parts(J, r, weight, part):
+    """1 for pixels of parts that agree with the edge, and by how much the parts scatter more than
+    the noise says."""
+    n = len(r)
+    of = part + PARTS * np.arange(n)[:, None]
+    add = lambda x: np.bincount(of.ravel(), x.ravel(), n * PARTS).reshape(n, PARTS)
+    information = add(weight * J[:, :, 0] ** 2)
+    known = information > 0.02 * information.max(1, keepdims=True)
+    shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
+    freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
+    noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))[:, None]
+    z = np.where(known, shift * np.sqrt(information) / noise, np.nan)
+    with np.errstate(all="ignore"):
+        spread = 1.4826 * np.nanmedian(np.abs(z), axis=1, keepdims=True)
+    good = known & (np.abs(z) < OUTLIER * np.maximum(np.nan_to_num(spread), 1.0))
+    spare = good.sum(1) - 3
+    chi2 = np.where(good, z, 0.0) ** 2
+    excess = np.sqrt(chi2.sum(1) / np.maximum(spare, 1))
+    # not where it is within the spread of χ² itself, √(2/f), twice
+    significant = excess**2 > 1 + 2 * np.sqrt(2 / np.maximum(spare, 1))
+    excess = np.where((spare > 2) & significant, excess, 1.0)
+    keep = np.take_along_axis(good | ~known, part, 1)
+    return keep.astype(float), excess
