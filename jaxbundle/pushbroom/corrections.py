@@ -108,7 +108,7 @@ def refract(
 
     The air thins out nearly exponentially; the ray is bent twice, by n₁·sin i₁ = n₂·sin i₂, at the
     two heights and with the two weights that stand for that distribution (`NODES`, `SPREAD`). The
-    displacement is that of the integrated ray within 5e-4 up to 50° off the nadir, 2e-3 at 60°
+    displacement is that of the integrated ray within 1e-3 up to 50° off the nadir, 4e-3 at 60°
     (`tests/pushbroom/test_refraction.py`); n·r·sin i is kept on a sphere.
 
     **Raises:** `ValueError` without an ellipsoid."""

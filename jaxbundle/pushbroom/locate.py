@@ -60,7 +60,8 @@ def locate_lines(
 
     def of_line(line):
         pose = pose_at(image, image.times.time(line))
-        return jax.vmap(lambda slopes: ground_point(pose, slopes, surface, image.corrections))(slopes)
+        point = lambda slopes: ground_point(pose, slopes, surface, image.corrections)
+        return jax.vmap(point)(slopes)
 
     if surface.iterative:
         # the state of a loop over 8000 pixels stays in the cache, that of many lines does not

@@ -1,4 +1,4 @@
-"""Refraction against a numerical integration of the ray equation in the U.S. Standard Atmosphere 1976.
+"""Refraction against a numerical integration of the ray equation in the standard atmosphere.
 
 On a sphere n·r·sin i is constant along a ray (Bouguer); its angle φ at the centre grows by
 
@@ -26,7 +26,9 @@ RADIUS = 6371e3
 EARTH = el.sphere(RADIUS)
 SEA_LEVEL = 2.779e-4
 """n − 1 of dry air at 15 °C, 1013.25 hPa and 0.55 µm (Ciddor, 1996)."""
-LAYERS = [(0.0, -6.5), (11.0, 0.0), (20.0, 1.0), (32.0, 2.8), (47.0, 0.0), (51.0, -2.8), (71.0, -2.0)]
+LAYERS = [
+    (0.0, -6.5), (11.0, 0.0), (20.0, 1.0), (32.0, 2.8), (47.0, 0.0), (51.0, -2.8), (71.0, -2.0),
+]  # fmt: skip
 """Geopotential kilometres and kelvin per kilometre, U.S. Standard Atmosphere 1976, table 4."""
 ANGLES = 2.0, 30.0, 50.0, 60.0
 GROUND = 0.0, 3443.0, 8848.0
@@ -105,7 +107,9 @@ def found(camera, ground, off_nadir):
 def test_refraction_against_the_integrated_ray(ground):
     for camera in (500e3, 770e3):
         expected = [deflected(camera, ground, angle) for angle in ANGLES]
-        np.testing.assert_allclose(found(camera, ground, ANGLES), expected, rtol=2e-3)
+        ratio = found(camera, ground, ANGLES) / expected
+        # 60° off the nadir from 770 km is 14° above the horizon at the ground
+        assert (np.abs(ratio - 1) < [1e-3, 1e-3, 1e-3, 4e-3]).all(), ratio
 
 
 def test_a_camera_inside_the_air():
