@@ -70,7 +70,8 @@ def refractivity(height: Scalar) -> tuple[Scalar, Scalar]:
     From −5 km on. The ellipsoid stands for mean sea level: a geoid height of 50 m changes the
     refractivity by half a percent."""
     H = EARTH_RADIUS * height / (EARTH_RADIUS + height)
-    layer = jnp.clip(jnp.searchsorted(BASES, H, side="right") - 1, 0)
+    # comparisons: half the compilation of a search in the table
+    layer = sum((H >= base).astype(int) for base in BASES[1:])
     T, p = _pressure(H, *(jnp.asarray(a)[layer] for a in (BASES, TEMPERATURES, LAPSES, PRESSURES)))
     density = p / (GAS_CONSTANT * T)
     gravity = GRAVITY * (EARTH_RADIUS / (EARTH_RADIUS + height + CENTRE)) ** 2

@@ -114,7 +114,7 @@ def refract(
     **Raises:** `ValueError` without an ellipsoid."""
     earth = require_ellipsoid(earth)
     start = geodetic(earth, o)[2]
-    (N1, above), (N2, whole) = refractivity(start), refractivity(height)
+    (N1, N2), (above, whole) = refractivity(jnp.stack(jnp.broadcast_arrays(start, height)))
     bends = (start > height) & (N2 - N1 > SMALLEST_STEP)
     step = jnp.where(bends, N2 - N1, 1.0)
     mean = (whole - above - N1 * (start - height)) / step

@@ -105,7 +105,8 @@ def by_worldview(time):
 
 
 def without_corrections(folder, name="image.xml"):
-    text = f'[scanner]\nsource = "{name}"\n[corrections]\nlight_time = false\naberration = false\n'
+    text = f'[scanner]\nsource = "{name}"\n[corrections]\n'
+    text += "light_time = false\naberration = false\nrefraction = false\n"
     (folder / "plain.toml").write_text(text)
     return read_scanner(folder / "plain.toml")
 
@@ -114,7 +115,7 @@ def test_worldview(tmp_path):
     (tmp_path / "image.xml").write_text(worldview())
     scanner = read_scanner(tmp_path / "image.xml")
     assert not scanner.warnings
-    assert scanner.image.corrections == (True, True, False)
+    assert scanner.image.corrections == (True, True, True)
     check_image(without_corrections(tmp_path), by_worldview(lambda line: PERIOD * line))
 
 

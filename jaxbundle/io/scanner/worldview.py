@@ -13,9 +13,9 @@ EPH, ATT, GEO (the camera).
   detectors (DETPITCH) in millimetres; θ (DETROTANGLE) degrees; u the pixel, l the line, here both
   from 0 at the centres of the first.
 
-The attitude is that of the arriving light: aberration and light time are switched on together
-(one without the other gives an error of a metre). Refraction is off. Optical distortion, decreasing
-times, and products resampled to a map are refused.
+The attitude is that of the arriving light: light time, aberration and refraction are switched on,
+unless the RPC of the file say otherwise (`own_rpc`). Optical distortion, decreasing times, and
+products resampled to a map are refused.
 """
 
 import jax.numpy as jnp
@@ -39,7 +39,9 @@ from jaxbundle.pushbroom.scanner import LineTimes
 LEVELS = ("basic1b", "stereo1b")
 EPHEMERIS, ATTITUDE = 7, 5
 """Numbers of a row that are used: index, position, velocity; index, quaternion."""
-CORRECTIONS = Corrections(light_time=True, aberration=True)
+CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
+"""Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
+all three, to 0.7 m without refraction."""
 
 
 def read_worldview(file: XmlFields) -> Scanner:
