@@ -8,6 +8,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
 from jaxbundle.cli.app import Control, Force, Format, Html, Input, Quiet, Settings, app, choice
+from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -84,6 +85,7 @@ def adjust(
     from jaxbundle.report.page import UNKNOWN
 
     jaxbundle.use_cores(cores)
+    print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
@@ -94,7 +96,7 @@ def adjust(
             reduction, robust, snooping, significance, eliminate, components, budget,
         )  # fmt: skip
         if not first:
-            json, out, html, save, quiet = "", None, "", "", True
+            json, out, html, save, quiet, print_report = "", None, "", "", True, False
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
@@ -127,7 +129,7 @@ def adjust(
     write_targets(result, json, out, brief, plots, force, html, origin, found)
     if save and result.converged:
         result.save(save)
-    if json != "-" and not quiet and result.converged:
+    if print_report and result.converged:
         print(report.text(result, budget=found))
         for doubt in result.doubts:
             print(f"warning: {doubt}")

@@ -8,6 +8,7 @@ import typer
 
 from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
 from jaxbundle.cli.app import Force, Html, Quiet, app, choice, model_choice
+from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -165,7 +166,8 @@ def calibrate(
         if choice is not None and json:
             document["models"] = choice.to_dict()
         text = json_text(document) if json else ""
-        report = "" if quiet or json == "-" else (choice or found).report()
+        silent = json == "-" or (quiet and is_in_file(json, out, html))
+        report = "" if silent else (choice or found).report()
         bar.update(task, description="writing")
         page = partial(compose_calibrations, found, origin, choice)
         with write_result(json, text, out, COMMAND, names, force, html, page) as new:

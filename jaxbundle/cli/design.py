@@ -8,6 +8,7 @@ import typer
 
 from jaxbundle.choices import AIMS, DESIGNED, ORDERS
 from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.habits import is_in_file
 
 SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
@@ -99,5 +100,5 @@ def design(
     with write_result(json, text, out, "design", FILES, force) as folder:
         if folder is not None:
             fill_design(folder, designed, report, text, plots and can_plot())
-    if not quiet and json != "-":
+    if json != "-" and not (quiet and is_in_file(json, out)):
         sys.stdout.write(report)
