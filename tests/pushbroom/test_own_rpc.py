@@ -121,6 +121,14 @@ def distances(name):
 
 
 @real
+def test_states_adjusted_by_another_program_are_read():
+    """Lengths of quaternions from 0.99992 to 1.00029."""
+    found = read_scanner(FOLDER / "jitter_solved_a.adjusted_state.json")
+    (said,) = found.warnings
+    assert "0.999920 to 1.000286" in said and "normalised" in said
+
+
+@real
 def test_worldview_1_agrees_with_its_rpc():
     """With all corrections to centimetres (17 m apart without them): the origin of lines and pixels
     and the refraction are those of the vendor."""

@@ -284,7 +284,7 @@ REFUSED = {
         worldview, f"{LINES} {LINES * PERIOD!r}", f"{LINES} -4.0", ["TLCLIST", "backwards"],
     ),
     "distortion": (worldview, "<ALIST>0 0", "<ALIST>0 1e-7", ["OPTICAL_DISTORTION", "ALIST"]),
-    "quaternion": (worldview, "<ATTLIST>1 ", "<ATTLIST>1 3 ", ["ATTLIST, row 1", "unit"]),
+    "quaternion": (worldview, "<ATTLIST>1 ", "<ATTLIST>1 3 ", ["ATTLIST, row 1", "length"]),
     "numbers": (worldview, "<ATTLIST>1 ", "<ATTLIST>one ", ["ATTLIST 1", "'one'"]),
     "missing": (worldview, "<CX>0.2</CX>", "", ["PERSPECTIVE_CENTER/CX is missing"]),
     "late": (

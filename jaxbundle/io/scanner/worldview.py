@@ -31,7 +31,7 @@ from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.ancillary import check_times, normalise_quaternions
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
@@ -64,15 +64,12 @@ def read_worldview(file: XmlFields) -> Scanner:
     times = _line_times(file, lines)
     t, P, _ = _table(file, "EPH", "EPHEMLIST", EPHEMERIS, epoch)
     rows, values, source = _table(file, "ATT", "ATTLIST", ATTITUDE, epoch)
-    length = np.linalg.norm(values, axis=1)
-    if (bad := ~(np.abs(length - 1) < 1e-4)).any():
-        raise InputError(f"{source(int(bad.argmax()))}: a unit quaternion is expected")
+    values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
-    lens = [file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)]
-    if not abs(np.linalg.norm(lens) - 1) < 1e-4:
-        raise InputError(f"{path}: QCS1 to QCS4 are not a unit quaternion, scalar last")
+    lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
+    (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
     x, y, warnings = _detectors(file)
     tables = Tables(
         t, P, rows, R * Rotation.from_quat(lens), Source(f"{path}, EPHEMLIST", None, "row"), source
@@ -87,7 +84,7 @@ def read_worldview(file: XmlFields) -> Scanner:
         sources=(tables.positions, tables.attitude),
     )  # fmt: skip
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return Scanner(name, image, WGS84, (*warnings, *told))
+    return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
 
 def _line_times(file, lines):
