@@ -39,6 +39,7 @@ from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.types import Progress
 
 COMMAND = "calibrate"
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
@@ -92,7 +93,10 @@ def write_calibration(
         _fill(calibration, new, plots, UNKNOWN)
 
 
-def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -> None:
+def _fill(
+    calibration, folder: Path, plots: bool, origin: Origin, choice=None,
+    progress: Progress | None = None,
+) -> None:  # fmt: skip
     name = file_name(calibration.name)
     folder.mkdir(exist_ok=True)
     write_text(folder / REPORT, calibration.report())
@@ -106,7 +110,7 @@ def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -
     text = camera_text(calibration.camera, calibration.sigma, *remark)
     write_text(folder / f"{name}.toml", text)
     if plots:
-        save_plots(calibration, folder)
+        save_plots(calibration, folder, progress)
 
 
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
@@ -141,13 +145,15 @@ def write_calibrations(
 
 
 def fill_calibrations(
-    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
-) -> None:
+    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None,
+    progress: Progress | None = None,
+) -> None:  # fmt: skip
     """Write a calibration into an existing folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
-        return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
+        one = next(iter(found.cameras.values()))
+        return _fill(one, folder, plots, origin, choice, progress)
     for name, one in found.cameras.items():
-        _fill(one, folder / file_name(name), plots, origin)
+        _fill(one, folder / file_name(name), plots, origin, progress=progress)
     write_text(folder / REPORT, found.report())
     write_text(folder / PAGE, compose_calibrations(found, origin))
     write_text(folder / RESULT, json_text(calibrations_dict(found)))
@@ -156,7 +162,7 @@ def fill_calibrations(
             text = camera_text(found.rig.camera(name), found.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
         if plots:
-            save_rig_plots(found.rig, folder)
+            save_rig_plots(found.rig, folder, progress)
 
 
 def calibrations_dict(found, brief: bool = False) -> dict:
@@ -170,7 +176,9 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     return document
 
 
-def fill_comparison(choice, folder: Path, plots: bool) -> None:
+def fill_comparison(
+    choice, folder: Path, plots: bool, progress: Progress | None = None
+) -> None:
     """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
@@ -179,10 +187,10 @@ def fill_comparison(choice, folder: Path, plots: bool) -> None:
             f"difference_{file_name(model)}": (
                 (7.5, 6), None, partial(choice.plot_difference, model))
             for model, apart in choice.differences.items() if apart is not None
-        })  # fmt: skip
+        }, progress)  # fmt: skip
 
 
-def save_plots(calibration, folder: Path) -> None:
+def save_plots(calibration, folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
     near = float(np.median(calibration.distances))
     drawings = {
@@ -194,11 +202,11 @@ def save_plots(calibration, folder: Path) -> None:
     halves = calibration.cross_validation
     if halves is not None and halves.comparison is not None:
         drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
-    write_figures(folder, drawings)
-    draw_figures(calibration.adjustment, folder)
+    write_figures(folder, drawings, progress)
+    draw_figures(calibration.adjustment, folder, progress)
 
 
-def save_rig_plots(rig, folder: Path) -> None:
+def save_rig_plots(rig, folder: Path, progress: Progress | None = None) -> None:
     """Coverage and uncertainty of every camera in the rig."""
     drawings = {}
     for name in rig.names:
@@ -209,7 +217,7 @@ def save_rig_plots(rig, folder: Path) -> None:
             f"{file}_uncertainty": ((7, 5.6), None, partial(draw, rig.distance)),
             f"{file}_uncertainty_far": ((7, 5.6), None, draw),
         }
-    write_figures(folder, drawings)
+    write_figures(folder, drawings, progress)
 
 
 def json_text(document: dict) -> str:

@@ -78,7 +78,7 @@ def adjust(
     from jaxbundle.cli.budget_option import held_of
     from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
     from jaxbundle.cli.processes import join_for_one_task
-    from jaxbundle.cli.progress import iterating
+    from jaxbundle.cli.progress import iterating, staging
     from jaxbundle.io import read_network
     from jaxbundle.io.writing.fingerprints import of_input
     from jaxbundle.leastsquares.quality.snooping import check_test
@@ -126,7 +126,8 @@ def adjust(
         write_targets(error, json, out, brief, plots, force, html, origin)
         raise
     found = sensitivity(result, held) if held and result.converged else None
-    write_targets(result, json, out, brief, plots, force, html, origin, found)
+    with staging(quiet or json == "-") as show:
+        write_targets(result, json, out, brief, plots, force, html, origin, found, show)
     if save and result.converged:
         result.save(save)
     if print_report and result.converged:

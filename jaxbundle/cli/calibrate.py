@@ -169,12 +169,15 @@ def calibrate(
         silent = json == "-" or (quiet and is_in_file(json, out, html))
         report = "" if silent else (choice or found).report()
         bar.update(task, description="writing")
+        show = lambda stage, done, total: bar.update(
+            task, description=stage, completed=done, total=total
+        )
         page = partial(compose_calibrations, found, origin, choice)
         with write_result(json, text, out, COMMAND, names, force, html, page) as new:
             if new is not None:
-                fill_calibrations(found, new, plots and can_plot(), origin, choice)
+                fill_calibrations(found, new, plots and can_plot(), origin, choice, show)
                 if choice is not None:
-                    fill_comparison(choice, new, plots and can_plot())
+                    fill_comparison(choice, new, plots and can_plot(), show)
     if report:
         print(report)
     failed = [name for name, one in found.cameras.items() if not one.converged]

@@ -125,6 +125,15 @@ def test_verbose_tells_versions_iterations_and_times(command):
     assert " s in all" in lines[-1]
 
 
+def test_a_terminal_shows_what_is_written_and_drawn(command, tmp_path, monkeypatch):
+    """A pipe shows nothing of it."""
+    call = "adjust", "examples/convergent4/project.toml", "--out"
+    assert command(*call, tmp_path / "a").err == ""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal for rich
+    shown = command(*call, tmp_path / "b").err
+    assert "writing the report" in shown and "drawing" in shown
+
+
 def test_verbose_tells_an_error_and_the_time(command):
     told = command("compare", "nowhere", f"{CAMERAS}#2-indoor", "--verbose")
     assert told.status == 2 and "nowhere" in told.err.splitlines()[-1]
