@@ -43,12 +43,12 @@ install-demo:
 	@test $(VENV)/installed -nt pyproject.toml || $(MAKE) --no-print-directory $(VENV)/installed-demo
 
 $(VENV)/installed-demo: pyproject.toml
-	@echo "Installing jaxbundle and matplotlib into $(VENV): 35 packages, 0.75 GB"
+	@echo "Installing jaxbundle with plots and tables into $(VENV): 35 packages, 0.75 GB"
 	@if command -v uv >/dev/null 2>&1; then \
 	  uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
-	  uv pip install --python $(BIN)/python -e '.[plots]'; \
+	  uv pip install --python $(BIN)/python -e '.[plots,tables]'; \
 	else \
-	  $(PYTHON) -m venv $(VENV) && $(BIN)/python -m pip install --disable-pip-version-check -e '.[plots]'; \
+	  $(PYTHON) -m venv $(VENV) && $(BIN)/python -m pip install --disable-pip-version-check -e '.[plots,tables]'; \
 	fi
 	@touch $@
 

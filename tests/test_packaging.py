@@ -93,7 +93,7 @@ def test_the_demo_installs_what_it_needs_alone(tmp_path):
         check=True,
     ).stdout  # fmt: skip
     demo, whole = call("demo"), call("install")
-    assert ".[plots]" in demo and ".[tests]" not in demo and "echo \"Installing" in demo
+    assert ".[plots,tables]" in demo and ".[tests]" not in demo and "echo \"Installing" in demo
     assert ".[tests]" in whole and "echo \"Installing" in whole
     (tmp_path / "installed").touch()
     assert "-m pip install" not in subprocess.run(

@@ -27,10 +27,13 @@ from jaxbundle.calibration.report import rig_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv
+from jaxbundle.io.formats import TARGETS
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap
+from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.networks.stereo import ROS_FILES
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
@@ -47,6 +50,12 @@ COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
 """Files of a comparison of models."""
+RIG, CONVERSIONS = "rig", "conversions.txt"
+RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "kalibr": ("camchain.yaml", ()), "mrcal": ("mrcal", MRCAL_FILES),
+    "opencv-stereo": ("stereo.yaml", ()), "ros-stereo": ("camera_info", ROS_FILES),
+}  # fmt: skip
+"""Files and folders of a rig for other programs, by their format; the last two of pairs."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -74,6 +83,11 @@ def files_of(names: Sequence[str]) -> list[str]:
             *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
         )]  # fmt: skip
         found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
+    if len(names) > 1:
+        found += [f"{RIG}/{file}" for file in (
+            CONVERSIONS, *(name for name, _ in RIG_FILES.values()),
+            *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
+        )]  # fmt: skip
     return found
 
 
@@ -161,8 +175,34 @@ def fill_calibrations(
         for name in found.rig.names:
             text = camera_text(found.rig.camera(name), found.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
+        fill_rig(found.rig.network(), folder / RIG)
         if plots:
             save_rig_plots(found.rig, folder, progress)
+
+
+def fill_rig(network: Network, folder: Path) -> None:
+    """Write a rig for other programs: Kalibr, mrcal, a pair also for OpenCV and ROS. What a program
+    cannot hold is fitted, or left out; both are said in `conversions.txt`."""
+    folder.mkdir(exist_ok=True)
+    said = [*network.warnings]
+    for kind, (name, _) in RIG_FILES.items():
+        if len(network.cameras) > 2 and kind.endswith("stereo"):
+            continue
+        target, refused = TARGETS[kind], ""
+        for model in (None, *target.models[:2]):
+            try:
+                fitted, costs = network, {}
+                if model is not None:
+                    fitted, costs = convert_cameras(network, model)
+                target.write(fitted, folder / name)
+            except InputError as error:
+                refused = refused or f"{name}: not written: {error}"
+                continue
+            said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
+            break
+        else:
+            said.append(refused)
+    write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
 
 
 def calibrations_dict(found, brief: bool = False) -> dict:

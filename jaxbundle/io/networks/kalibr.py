@@ -31,22 +31,15 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
-from jaxbundle.io.networks.assemble import (
-    all_parameters,
-    assemble,
-    entry_of,
-    foreign_document,
-    image_columns,
-)
+from jaxbundle.geometry.pose_conventions import cv_pose
+from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.io.text.yaml_text import parse_yaml
-from jaxbundle.network.columns import Columns
 from jaxbundle.network.further import Rigs
-from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
 CORE = ("fx", "fy", "cx", "cy")
@@ -64,7 +57,6 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Our model, intrinsics and coefficients; the first of a model is written."""
 OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
-RIG, MOMENT = "rig", "0"
 
 
 def is_kalibr(path: Path) -> bool:
@@ -104,16 +96,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
               if any(fields.get(key) is not None for fields in chain.values())]  # fmt: skip
     if unread:
         told.append(f"not read: {', '.join(unread)}")
-    M, X0 = exterior_from_cv(*(np.stack(part) for part in zip(*poses)))
-    source = Source(str(path), None, "camera")
-    network = assemble(
-        path, foreign_document(path.stem, map(entry_of, cameras), object_unit="m"), overrides,
-        image_columns(source, list(chain), list(chain), M, X0), warnings=told,
-    )  # fmt: skip
-    if not mounted:
-        return network
-    columns = {"rig": [RIG] * len(chain), "epoch": [MOMENT] * len(chain), "image": list(chain)}
-    return network.replace(further=(Rigs.of(Columns(columns, source), {}, 1.0),))
+    return rig_network(path, cameras, *zip(*poses), overrides, bool(mounted), told)
 
 
 def _number(id: str) -> int:
@@ -147,7 +130,7 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    mountings, lost = _mountings(network)
+    mountings, lost = mountings_of(network)
     lines = []
     for k, camera in enumerate(network.cameras):
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
@@ -187,8 +170,9 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
     raise InputError(f"camera {camera.id!r}: Kalibr has no {rest}; adjust the camera without")
 
 
-def _mountings(network: Network) -> tuple[np.ndarray | None, list[str]]:
-    """T from each camera to the next [cameras − 1, 4, 4]; else None, and what is lost."""
+def mountings_of(network: Network) -> tuple[np.ndarray | None, list[str]]:
+    """T from the frame of each camera (x right, y down, z forward) to that of the next
+    [cameras − 1, 4, 4]; else None, and what is lost."""
     images, number = network.images, len(network.cameras)
     if number == 1:
         return None, ["orientations"] if len(images) > 1 else []
