@@ -33,10 +33,12 @@ from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.networks.rig_result import IN_BOARD_UNITS
 from jaxbundle.io.networks.stereo import ROS_FILES
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
+from jaxbundle.network.further import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
@@ -184,7 +186,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     """Write a rig for other programs: Kalibr, mrcal, a pair also for OpenCV and ROS. What a program
     cannot hold is fitted, or left out; both are said in `conversions.txt`."""
     folder.mkdir(exist_ok=True)
-    said = [*network.warnings]
+    said = [IN_BOARD_UNITS]
     for kind, (name, _) in RIG_FILES.items():
         if len(network.cameras) > 2 and kind.endswith("stereo"):
             continue
@@ -194,11 +196,13 @@ def fill_rig(network: Network, folder: Path) -> None:
                 fitted, costs = network, {}
                 if model is not None:
                     fitted, costs = convert_cameras(network, model)
-                target.write(fitted, folder / name)
+                lost = target.write(fitted, folder / name)
             except InputError as error:
                 refused = refused or f"{name}: not written: {error}"
                 continue
             said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
+            # the mounting itself is in every format
+            said += [f"{name}: not kept: {what}" for what in lost if what != Rigs.TABLE]
             break
         else:
             said.append(refused)

@@ -311,11 +311,12 @@ class ScannerView:
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
         # a constant error has no structure that a few positions could miss
-        few = [v.ravel() for v in spread_positions(image.lines, image.pixels, CELLS, 1)]
+        spread = spread_positions(image.lines, image.pixels, CELLS, 1)
+        line, pixel = (v.ravel() for v in spread)
         rows = []
         for level in LEVELS:
             sigma = np.radians(level)
-            exact = propagate_accuracy(image, surface, *few, Noise(attitude_bias=sigma))
+            exact = propagate_accuracy(image, surface, line, pixel, Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
             rows.append({
                 "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,

@@ -15,6 +15,8 @@ hydrostatic equation the air above h weighs what p carries, so that
 where ḡ is gravity at the centre of that air, about `CENTRE` above h.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -43,7 +45,7 @@ TEMPERATURES = 288.15 + np.r_[0.0, np.cumsum(LAPSES[:-1] * np.diff(BASES))]
 """Temperature at the beginning of each layer, kelvin."""
 
 
-def _pressure(H, base, temperature, lapse, pressure, numbers=jnp):
+def _pressure(H, base, temperature, lapse, pressure, *, numbers: Any = jnp):
     exponent = GRAVITY / GAS_CONSTANT
     T = temperature + lapse * (H - base)
     power = -exponent / numbers.where(lapse == 0, 1.0, lapse)

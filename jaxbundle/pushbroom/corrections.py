@@ -114,7 +114,8 @@ def refract(
     **Raises:** `ValueError` without an ellipsoid."""
     earth = require_ellipsoid(earth)
     start = geodetic(earth, o)[2]
-    (N1, N2), (above, whole) = refractivity(jnp.stack(jnp.broadcast_arrays(start, height)))
+    both = jnp.stack(jnp.broadcast_arrays(start, height))
+    (N1, N2), (above, whole) = ((v[0], v[1]) for v in map(jnp.asarray, refractivity(both)))
     bends = (start > height) & (N2 - N1 > SMALLEST_STEP)
     step = jnp.where(bends, N2 - N1, 1.0)
     mean = (whole - above - N1 * (start - height)) / step

@@ -63,7 +63,7 @@ def compare_with_rpc(
     for corrections in sets:
         # without `jit`: a program of two hundred points would be compiled for each set
         point = lambda pose, slopes, h, on=corrections: (
-            ground_point(pose, slopes, Height(h, WGS84), on)
+            ground_point(pose, slopes, Height(level=h, earth=WGS84), on)
         )  # fmt: skip
         here, along, across = np.split(np.stack(jax.vmap(point)(*sights)), 3, axis=1)
         seen = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*here)

@@ -93,8 +93,8 @@ def accuracy_table(
     must not be a terrain.
     """
     size = flight.lines, flight.pixels
-    few = [v.ravel() for v in spread_positions(*size, (lines, pixels), 1)]
-    many = [v.ravel() for v in spread_positions(*size)]
+    line, pixel = (v.ravel() for v in spread_positions(*size, (lines, pixels), 1))
+    all_lines, all_pixels = (v.ravel() for v in spread_positions(*size))
     quiet = dataclasses.replace(flight, noise=Noise())
     altitude, view = altitude_and_view(true_image(quiet), surface)
     error_free, erring = [], []
@@ -104,14 +104,15 @@ def accuracy_table(
         truth = true_image(varied)
         for method in FLOORS:
             image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
-            length = np.linalg.norm(ground_errors(image, truth, surface, *many), axis=1)
+            errors = ground_errors(image, truth, surface, all_lines, all_pixels)
+            length = np.linalg.norm(errors, axis=1)
             rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
             error_free.append(ErrorFree(name, method, float(rms), float(ce90)))
         image = measured_image(varied)
         for sigma in sigmas:
             noise = Noise(**{f"attitude_{kind}": sigma})
-            counted = simulate_accuracy(image, surface, *few, noise, draws, seed)
-            exact = propagate_accuracy(image, surface, *few, noise)
+            counted = simulate_accuracy(image, surface, line, pixel, noise, draws, seed)
+            exact = propagate_accuracy(image, surface, line, pixel, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # above a plane, near the nadir, errors along and across are almost alike
             round_ = circular_error(np.eye(2) * level**2 / 2)

@@ -140,7 +140,8 @@ def _points(base, found: Sequence[_Matches], uv, rows) -> Cloud:
     if len(found) > 1:
         q, spread = (np.full(sigma.shape, np.nan) for _ in range(2))
         for k in range(len(found)):
-            only = known & (np.arange(len(found)) == k)[:, None]
+            only = np.zeros_like(known)
+            only[k] = known[k]
             q[k], spread[k] = _parameter(base, rays(only), only[k])
         known = consistent(q, spread)
     cloud = rays(known)

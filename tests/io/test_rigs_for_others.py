@@ -3,6 +3,7 @@
 of each format, and meet the pixels of the rig itself; and our readers read the rig back."""
 
 import ast
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -13,10 +14,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert_fit import images_of, rays_of
 from jaxbundle.errors import InputError
 from jaxbundle.io.exchange import convert
 from jaxbundle.io.formats import read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.kalibr import write_kalibr
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.io.networks.stereo import fill_ros_stereo, write_opencv_stereo
 from jaxbundle.network.tables import Camera
@@ -92,6 +96,28 @@ def test_kalibr(tmp_path, fisheye):
         uv = seen(X, [[fu, 0, pu], [0, fv, pv], [0, 0, 1]], numbers("distortion_coeffs"), fisheye)
         assert_allclose(uv, truth(k, bases, fisheye), atol=1e-8)
     check_back(path, net)
+
+
+def test_coefficients_that_kalibr_lacks_are_fitted_and_said(tmp_path):
+    """k3 of a mild lens: pixels of the chain are off by what the message says."""
+    net, bases = rig()
+    mild = {"k1": -0.1, "k2": 0.02, "k3": 0.03}
+    cameras = [dataclasses.replace(one, parameters={**one.parameters, **mild})
+               for one in net.cameras]  # fmt: skip
+    net = net.replace(cameras=tuple(cameras))
+    lost = write_kalibr(net, tmp_path / "camchain.yaml")
+    said = [line for line in lost if line.startswith("k3 of camera")]
+    back = read_network(tmp_path / "camchain.yaml").cameras
+    u, v = np.meshgrid(np.linspace(0, 751, 40), np.linspace(0, 479, 30))
+    for line, given, found in zip(said, cameras, back, strict=True):
+        one, other = (get_model(camera.model) for camera in (given, found))
+        rays = rays_of(one, all_parameters(given), np.stack([u, v], -1).reshape(-1, 2))
+        off = np.linalg.norm(images_of(other, all_parameters(found), rays)
+                             - np.stack([u, v], -1).reshape(-1, 2), axis=1)  # fmt: skip
+        largest, rms = (float(re.search(rf"{word} ([\d.]+)", line)[1])
+                        for word in ("difference", "RMS"))  # fmt: skip
+        assert off.max() == pytest.approx(largest, rel=0.2) and off.max() < 1.0
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(rms, rel=0.2)
 
 
 def convert_network(net, path):

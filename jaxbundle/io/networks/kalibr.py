@@ -18,18 +18,22 @@
 Camera frames have x right, y down, z forward; the centre of the first pixel is (0, 0). A chain
 becomes one image per camera, taken at one moment by a rig: the first at the origin, looking
 along Z with Y down. Uncoupled cameras (no T_cn_cnm1) form no rig.
+A camera with more coefficients than radtan is fitted, with the difference in a message.
 The written mounting is that of the first moment with an image of every camera, or of the
 images if each camera has one. T_cam_imu and time shifts are not read.
 
 Source: Kalibr's wiki, "yaml formats", "Supported models".
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert import convert_camera
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
@@ -96,7 +100,8 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
               if any(fields.get(key) is not None for fields in chain.values())]  # fmt: skip
     if unread:
         told.append(f"not read: {', '.join(unread)}")
-    return rig_network(path, cameras, *zip(*poses), overrides, bool(mounted), told)
+    turns, shifts = [R for R, _ in poses], [t for _, t in poses]
+    return rig_network(path, cameras, turns, shifts, overrides, bool(mounted), told)
 
 
 def _number(id: str) -> int:
@@ -132,7 +137,9 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     mountings, lost = mountings_of(network)
     lines = []
-    for k, camera in enumerate(network.cameras):
+    for k, given in enumerate(network.cameras):
+        camera, said = _fit(given)
+        lost += said
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
         if mountings is not None and k:
             lines += ["  T_cn_cnm1:", *(f"  - {_list(row)}" for row in mountings[k - 1])]
@@ -145,6 +152,33 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
 def _list(values) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _fit(camera: Camera) -> tuple[Camera, list[str]]:
+    """A camera with more coefficients than Kalibr's radtan as the nearest radtan or equi, and the
+    difference in words."""
+    p = all_parameters(camera)
+    more = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
+    if camera.model != "opencv" or not more:
+        return camera, []
+    size, found, refused = size_of(camera, "Kalibr"), [], ""
+    for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
+        try:
+            found.append(convert_camera(
+                get_model("opencv"), p, get_model(target), image_size=size, free=free
+            ))  # fmt: skip
+        except ValueError as error:
+            refused = refused or str(error)
+    if not found:
+        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(more)}: {refused}")
+    best = min(found, key=lambda one: one.rms)
+    message = (
+        f"{', '.join(more)} of camera {camera.id!r}, fitted as "
+        f"{'radtan' if best.model == 'opencv' else 'equi'} over the image: largest difference "
+        f"{best.largest:.3g} px, RMS {best.rms:.3g} px (none if the rig is calibrated without)"
+    )
+    made = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
+    return made, [message]
 
 
 def _camera_lines(camera: Camera, k: int) -> list[str]:
