@@ -1,7 +1,8 @@
 # `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-oldest`,
 # `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
-# installed, else venv and pip) and install the package with what the tests need; `docs` also Sphinx,
-# `bench` also what it compares with; `test-oldest` and `test-newest` have environments of their own.
+# installed, else venv and pip) and install the package: `demo` with plots, the others with what the tests
+# need; `docs` also Sphinx, `bench` also what it compares with; `test-oldest` and `test-newest` have
+# environments of their own.
 # More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
 
 PYTHON ?= python3
@@ -18,12 +19,13 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all random-problems bench docs install install-docs clean \
+.PHONY: demo test test-all random-problems bench docs install install-demo install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
+	@echo "Installing jaxbundle and what its tests need into $(VENV): 1.9 GB, some minutes the first time"
 	@if command -v uv >/dev/null 2>&1; then \
 	  uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
 	  uv pip install --quiet --python $(BIN)/python -e '.[tests]'; \
@@ -32,8 +34,23 @@ $(VENV)/installed: pyproject.toml
 	fi
 	@touch $@
 
-demo: install
+demo: install-demo
+	@echo "Adjusting examples/convergent4; report, tables, plots and a page go to out/convergent4"
 	$(BIN)/jaxbundle adjust examples/convergent4/project.toml --out out/convergent4
+
+# What `make install` has installed suffices.
+install-demo:
+	@test $(VENV)/installed -nt pyproject.toml || $(MAKE) --no-print-directory $(VENV)/installed-demo
+
+$(VENV)/installed-demo: pyproject.toml
+	@echo "Installing jaxbundle with plots and tables into $(VENV): 35 packages, 0.75 GB"
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
+	  uv pip install --python $(BIN)/python -e '.[plots,tables]'; \
+	else \
+	  $(PYTHON) -m venv $(VENV) && $(BIN)/python -m pip install --disable-pip-version-check -e '.[plots,tables]'; \
+	fi
+	@touch $@
 
 test: CASES = -m 'not further'
 test test-all: install

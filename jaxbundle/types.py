@@ -4,7 +4,7 @@ Functions of one point, ray or pose accept JAX and NumPy arrays and return JAX a
 Formulas of unpacked scalars work element by element: given arrays, they work on many at once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,6 +17,8 @@ Column = Sequence[Any] | np.ndarray
 """Cells of a table: numbers, text, or other content of a file."""
 Index = int | np.integer
 Scalar = float | Float[AnyArray, "..."]
+Progress = Callable[[str, int, int], object]
+"""`progress(stage, done, total)`: called when a stage of long work begins and as it advances."""
 T = TypeVar("T")
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -102,3 +103,22 @@ def test_examples_are_listed_and_only_new_folders_written(command, tmp_path):
     with pytest.raises(InputError, match="no example 'four'.*convergent4"):
         write_example("four", tmp_path / "four")
     assert not (tmp_path / "four").exists()
+
+
+def test_the_demo_installs_what_it_needs_alone(tmp_path):
+    """And the tests what they need; nothing where `make install` has been."""
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("make is missing")
+    call = lambda target: subprocess.run(
+        [make, "-n", target, f"VENV={tmp_path}"], cwd=ROOT, capture_output=True, text=True,
+        check=True,
+    ).stdout  # fmt: skip
+    demo, whole = call("demo"), call("install")
+    assert ".[plots,tables]" in demo and ".[tests]" not in demo and "echo \"Installing" in demo
+    assert ".[tests]" in whole and "echo \"Installing" in whole
+    (tmp_path / "installed").touch()
+    assert "-m pip install" not in subprocess.run(
+        [make, "install-demo", f"VENV={tmp_path}"], cwd=ROOT, capture_output=True, text=True,
+        check=True,
+    ).stdout  # fmt: skip

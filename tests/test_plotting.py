@@ -340,11 +340,25 @@ def renamed(adjustment, network, **changes):
     return Adjustment(network, problem, adjustment.minimum, **changes)
 
 
-def test_save_figures(convergent4, tmp_path):
+def test_save_figures(convergent4, tmp_path, monkeypatch):
+    """Each is drawn once, inside its margins, and reported."""
+    import cv2
     from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
+    drawn, told = [], []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda self, at: (drawn.append(self), draw(self, at)))
     before = pyplot.get_fignums()
-    written = plotting.save_figures(convergent4, tmp_path / "new" / "folder")
+    written = plotting.save_figures(
+        convergent4, tmp_path / "new" / "folder", progress=lambda *state: told.append(state)
+    )
+    assert told == [("drawing", k, 9) for k in range(10)]
+    assert len({*map(id, drawn)}) == 9 and len(drawn) == 10  # the plan measures its labels
+    for path in written:
+        edge = np.array(cv2.imread(str(path)))
+        edge[5:-5, 5:-5] = 255
+        assert (edge == 255).all(), path.name
     assert pyplot.get_fignums() == before
     names = ["plan", "perspective", "histogram"]
     names += [f"residuals_{image}" for image in convergent4.images["id"]]

@@ -27,18 +27,24 @@ from jaxbundle.calibration.report import rig_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv
+from jaxbundle.io.formats import TARGETS
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap
+from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.networks.rig_result import IN_BOARD_UNITS
+from jaxbundle.io.networks.stereo import ROS_FILES
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
+from jaxbundle.network.further import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.types import Progress
 
 COMMAND = "calibrate"
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
@@ -46,6 +52,12 @@ COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
 """Files of a comparison of models."""
+RIG, CONVERSIONS = "rig", "conversions.txt"
+RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "kalibr": ("camchain.yaml", ()), "mrcal": ("mrcal", MRCAL_FILES),
+    "opencv-stereo": ("stereo.yaml", ()), "ros-stereo": ("camera_info", ROS_FILES),
+}  # fmt: skip
+"""Files and folders of a rig for other programs, by their format; the last two of pairs."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -73,6 +85,11 @@ def files_of(names: Sequence[str]) -> list[str]:
             *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
         )]  # fmt: skip
         found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
+    if len(names) > 1:
+        found += [f"{RIG}/{file}" for file in (
+            CONVERSIONS, *(name for name, _ in RIG_FILES.values()),
+            *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
+        )]  # fmt: skip
     return found
 
 
@@ -92,7 +109,10 @@ def write_calibration(
         _fill(calibration, new, plots, UNKNOWN)
 
 
-def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -> None:
+def _fill(
+    calibration, folder: Path, plots: bool, origin: Origin, choice=None,
+    progress: Progress | None = None,
+) -> None:  # fmt: skip
     name = file_name(calibration.name)
     folder.mkdir(exist_ok=True)
     write_text(folder / REPORT, calibration.report())
@@ -106,7 +126,7 @@ def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -
     text = camera_text(calibration.camera, calibration.sigma, *remark)
     write_text(folder / f"{name}.toml", text)
     if plots:
-        save_plots(calibration, folder)
+        save_plots(calibration, folder, progress)
 
 
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
@@ -141,13 +161,15 @@ def write_calibrations(
 
 
 def fill_calibrations(
-    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
-) -> None:
+    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None,
+    progress: Progress | None = None,
+) -> None:  # fmt: skip
     """Write a calibration into an existing folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
-        return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
+        one = next(iter(found.cameras.values()))
+        return _fill(one, folder, plots, origin, choice, progress)
     for name, one in found.cameras.items():
-        _fill(one, folder / file_name(name), plots, origin)
+        _fill(one, folder / file_name(name), plots, origin, progress=progress)
     write_text(folder / REPORT, found.report())
     write_text(folder / PAGE, compose_calibrations(found, origin))
     write_text(folder / RESULT, json_text(calibrations_dict(found)))
@@ -155,8 +177,36 @@ def fill_calibrations(
         for name in found.rig.names:
             text = camera_text(found.rig.camera(name), found.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
+        fill_rig(found.rig.network(), folder / RIG)
         if plots:
-            save_rig_plots(found.rig, folder)
+            save_rig_plots(found.rig, folder, progress)
+
+
+def fill_rig(network: Network, folder: Path) -> None:
+    """Write a rig for other programs: Kalibr, mrcal, a pair also for OpenCV and ROS. What a program
+    cannot hold is fitted, or left out; both are said in `conversions.txt`."""
+    folder.mkdir(exist_ok=True)
+    said = [IN_BOARD_UNITS]
+    for kind, (name, _) in RIG_FILES.items():
+        if len(network.cameras) > 2 and kind.endswith("stereo"):
+            continue
+        target, refused = TARGETS[kind], ""
+        for model in (None, *target.models[:2]):
+            try:
+                fitted, costs = network, {}
+                if model is not None:
+                    fitted, costs = convert_cameras(network, model)
+                lost = target.write(fitted, folder / name)
+            except InputError as error:
+                refused = refused or f"{name}: not written: {error}"
+                continue
+            said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
+            # the mounting itself is in every format
+            said += [f"{name}: not kept: {what}" for what in lost if what != Rigs.TABLE]
+            break
+        else:
+            said.append(refused)
+    write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
 
 
 def calibrations_dict(found, brief: bool = False) -> dict:
@@ -170,7 +220,9 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     return document
 
 
-def fill_comparison(choice, folder: Path, plots: bool) -> None:
+def fill_comparison(
+    choice, folder: Path, plots: bool, progress: Progress | None = None
+) -> None:
     """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
@@ -179,10 +231,10 @@ def fill_comparison(choice, folder: Path, plots: bool) -> None:
             f"difference_{file_name(model)}": (
                 (7.5, 6), None, partial(choice.plot_difference, model))
             for model, apart in choice.differences.items() if apart is not None
-        })  # fmt: skip
+        }, progress)  # fmt: skip
 
 
-def save_plots(calibration, folder: Path) -> None:
+def save_plots(calibration, folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
     near = float(np.median(calibration.distances))
     drawings = {
@@ -194,11 +246,11 @@ def save_plots(calibration, folder: Path) -> None:
     halves = calibration.cross_validation
     if halves is not None and halves.comparison is not None:
         drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
-    write_figures(folder, drawings)
-    draw_figures(calibration.adjustment, folder)
+    write_figures(folder, drawings, progress)
+    draw_figures(calibration.adjustment, folder, progress)
 
 
-def save_rig_plots(rig, folder: Path) -> None:
+def save_rig_plots(rig, folder: Path, progress: Progress | None = None) -> None:
     """Coverage and uncertainty of every camera in the rig."""
     drawings = {}
     for name in rig.names:
@@ -209,7 +261,7 @@ def save_rig_plots(rig, folder: Path) -> None:
             f"{file}_uncertainty": ((7, 5.6), None, partial(draw, rig.distance)),
             f"{file}_uncertainty_far": ((7, 5.6), None, draw),
         }
-    write_figures(folder, drawings)
+    write_figures(folder, drawings, progress)
 
 
 def json_text(document: dict) -> str:

@@ -90,8 +90,8 @@ def convert_camera(
     - `area`: the corners of the image (low, high) in the source's coordinates; by default the whole
       image.
     - `r0`: of the target, mm, if it has one.
-    - `free`: parameters of a fit (`convert_fit.fitted_parameters` if empty); others have their
-      defaults.
+    - `free`: the only parameters that the target may have beside its defaults; by default all, and
+      `convert_fit.fitted_parameters` in a fit.
 
     **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """
@@ -115,9 +115,14 @@ def convert_camera(
         )
     try:
         found, reason = _exact(source, values, target, sizes, r0), ""
+        _check_defaults(found, target, free)
     except NotExact as why:
         reason = str(why)
         starts = start_values(source, values, target, sizes, r0)
+        if free:
+            default = default_parameters(target)
+            held = {name: default[name] for name in target.parameters if name not in free}
+            starts = [{**start, **held} for start in starts]
         found = fit_parameters(target, rays, wanted, starts, free)
     length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
     if not np.isfinite(length).all():
@@ -131,6 +136,14 @@ def convert_camera(
         float(length[worst]), float(np.sqrt(np.mean(length**2))), target.unit,
         (float(wanted[worst, 0]), float(wanted[worst, 1])), float(there.mean()), reason,
     )  # fmt: skip
+
+
+def _check_defaults(found, target, free) -> None:
+    """**Raises:** `NotExact` if a parameter that is not free has another value than its default."""
+    default = default_parameters(target)
+    more = [n for n in target.parameters if free and n not in free and found[n] != default[n]]
+    if more:
+        raise NotExact(f"{', '.join(more)} must keep the default")
 
 
 def _exact(source, values, target, sizes, r0) -> dict[str, float]:

@@ -8,6 +8,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
 from jaxbundle.cli.app import Control, Force, Format, Html, Input, Quiet, Settings, app, choice
+from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -77,13 +78,14 @@ def adjust(
     from jaxbundle.cli.budget_option import held_of
     from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
     from jaxbundle.cli.processes import join_for_one_task
-    from jaxbundle.cli.progress import iterating
+    from jaxbundle.cli.progress import iterating, staging
     from jaxbundle.io import read_network
     from jaxbundle.io.writing.fingerprints import of_input
     from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.report.page import UNKNOWN
 
     jaxbundle.use_cores(cores)
+    print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
@@ -94,7 +96,7 @@ def adjust(
             reduction, robust, snooping, significance, eliminate, components, budget,
         )  # fmt: skip
         if not first:
-            json, out, html, save, quiet = "", None, "", "", True
+            json, out, html, save, quiet, print_report = "", None, "", "", True, False
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
@@ -124,10 +126,11 @@ def adjust(
         write_targets(error, json, out, brief, plots, force, html, origin)
         raise
     found = sensitivity(result, held) if held and result.converged else None
-    write_targets(result, json, out, brief, plots, force, html, origin, found)
+    with staging(quiet or json == "-") as show:
+        write_targets(result, json, out, brief, plots, force, html, origin, found, show)
     if save and result.converged:
         result.save(save)
-    if json != "-" and not quiet and result.converged:
+    if print_report and result.converged:
         print(report.text(result, budget=found))
         for doubt in result.doubts:
             print(f"warning: {doubt}")

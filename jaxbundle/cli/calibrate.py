@@ -8,6 +8,7 @@ import typer
 
 from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
 from jaxbundle.cli.app import Force, Html, Quiet, app, choice, model_choice
+from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -165,14 +166,18 @@ def calibrate(
         if choice is not None and json:
             document["models"] = choice.to_dict()
         text = json_text(document) if json else ""
-        report = "" if quiet or json == "-" else (choice or found).report()
+        silent = json == "-" or (quiet and is_in_file(json, out, html))
+        report = "" if silent else (choice or found).report()
         bar.update(task, description="writing")
+        show = lambda stage, done, total: bar.update(
+            task, description=stage, completed=done, total=total
+        )
         page = partial(compose_calibrations, found, origin, choice)
         with write_result(json, text, out, COMMAND, names, force, html, page) as new:
             if new is not None:
-                fill_calibrations(found, new, plots and can_plot(), origin, choice)
+                fill_calibrations(found, new, plots and can_plot(), origin, choice, show)
                 if choice is not None:
-                    fill_comparison(choice, new, plots and can_plot())
+                    fill_comparison(choice, new, plots and can_plot(), show)
     if report:
         print(report)
     failed = [name for name, one in found.cameras.items() if not one.converged]

@@ -8,6 +8,7 @@ import typer
 
 from jaxbundle.choices import AIMS, DESIGNED, ORDERS
 from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.habits import is_in_file
 
 SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
@@ -70,6 +71,7 @@ def design(
     from jaxbundle.cli.design_files import FILES, fill_design
     from jaxbundle.cli.design_options import box_of, normals_of, parse_aim, sigma_of, words_of
     from jaxbundle.cli.outputs import can_plot, check_writable, network_files, write_result
+    from jaxbundle.cli.progress import staging
     from jaxbundle.io.formats import read_oriented
     from jaxbundle.io.results.design_json import design_text
     from jaxbundle.network_design.aims import Aim
@@ -98,6 +100,7 @@ def design(
     text = design_text(designed, proof)
     with write_result(json, text, out, "design", FILES, force) as folder:
         if folder is not None:
-            fill_design(folder, designed, report, text, plots and can_plot())
-    if not quiet and json != "-":
+            with staging(quiet or json == "-") as show:
+                fill_design(folder, designed, report, text, plots and can_plot(), show)
+    if json != "-" and not (quiet and is_in_file(json, out)):
         sys.stdout.write(report)

@@ -7,13 +7,16 @@ from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.networks.project import fill_project
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network_design.result import Design
+from jaxbundle.types import Progress
 
 REPORT, RESULT = "report.txt", "design.json"
 FIGURES = ("before.png", "after.png", "path.png")
 FILES = (REPORT, RESULT, *FIGURES, *NETWORK_FILES)
 
 
-def fill_design(folder: Path, designed: Design, report: str, text: str, plots: bool) -> None:
+def fill_design(
+    folder: Path, designed: Design, report: str, text: str, plots: bool, progress: Progress
+) -> None:
     """Write the designed project, report, JSON and figures into a folder."""
     fill_project(designed.network, folder)
     write_text(folder / REPORT, report)
@@ -27,4 +30,4 @@ def fill_design(folder: Path, designed: Design, report: str, text: str, plots: b
             "after": ((7.5, 6.5), "3d", partial(network_view, designed)),
             "path": ((6.5, 4.0), None, partial(aim_path, designed)),
         }
-        write_figures(folder, views)
+        write_figures(folder, views, progress)

@@ -12,7 +12,9 @@ import typer
 
 from jaxbundle.errors import InputError
 
-Quiet = Annotated[bool, typer.Option("--quiet", help="print only errors")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", help="print errors, and the result if no file is asked for")
+]
 Verbose = Annotated[
     bool, typer.Option("--verbose", help="print versions, iterations, and times of stages")
 ]
@@ -22,8 +24,8 @@ verbose: ContextVar[bool] = ContextVar("verbose", default=False)
 
 def add_habits(function: Callable) -> Callable:
     """The function of a command with the options `quiet` and `verbose`. A function without a
-    `quiet` parameter is silenced as a whole, except explicit output to standard output (`--json
-    -`)."""
+    `quiet` parameter is silenced as a whole: standard error, and standard output if its result is
+    in a file (`RESULT_FILES`)."""
     given = inspect.signature(function)
     own = "quiet" in given.parameters
     added = {"verbose": Verbose} if own else {"quiet": Quiet, "verbose": Verbose}
@@ -49,13 +51,24 @@ def add_habits(function: Callable) -> Callable:
 _nothing = contextlib.nullcontext
 
 
+RESULT_FILES = ("out", "json", "html", "save", "folder")
+"""Parameters of commands for a file or folder of the result."""
+
+
+def is_in_file(*files: object) -> bool:
+    """Whether a command was asked for a file of its result, by one of these options; `-` is
+    standard output."""
+    return any(file not in (None, "") and str(file) != "-" for file in files)
+
+
 @contextlib.contextmanager
 def _silent(values: dict) -> Iterator[None]:
-    """Discard all output; errors are printed afterwards."""
-    named = any(str(values.get(name)) == "-" for name in ("json", "csv"))
+    """Discard what is not the result; errors are printed afterwards."""
+    written = is_in_file(*(values.get(name) for name in RESULT_FILES))
+    shown = any(str(values.get(name)) == "-" for name in ("json", "csv"))
     with open(os.devnull, "w", encoding="utf-8", errors="replace") as nowhere:
-        silent = contextlib.redirect_stdout(nowhere)
-        with contextlib.redirect_stderr(nowhere), _nothing() if named else silent:
+        silent = contextlib.redirect_stdout(nowhere) if written and not shown else _nothing()
+        with contextlib.redirect_stderr(nowhere), silent:
             yield
 
 

@@ -7,6 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
+from jaxbundle.cli.habits import is_in_file
 
 
 @app.command(example="examples/convergent4/project.toml --out out/oriented", once=True)
@@ -32,7 +33,7 @@ def orient(
         check_folder(out, "orient", FILES, network_files(input, network, control), force)
     found = jaxbundle.orient(network)
     path = None if out is None else write_project(found.network, out, force=force, by="orient")
-    if not quiet:
+    if not (quiet and is_in_file(out)):
         print(found)
         if path is not None:
             print(path)

@@ -35,6 +35,7 @@ from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.budget import describe_budget
 from jaxbundle.system.terminals import write_json
+from jaxbundle.types import Progress
 
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
@@ -214,6 +215,7 @@ def write_result(
 def write_targets(
     result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
     force: bool = False, html: str = "", origin: Origin = UNKNOWN, budget: Budget | None = None,
+    progress: Progress | None = None,
 ) -> None:  # fmt: skip
     """Write JSON (`-`: standard output), page and folder of a result with its error `budget`, or
     the reason for a failure."""
@@ -234,7 +236,7 @@ def write_targets(
     with write_result(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
-                fill_results(result, new, plots, also=also, budget=budget)
+                fill_results(result, new, plots, also=also, budget=budget, progress=progress)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
@@ -242,13 +244,16 @@ def write_targets(
 
 def fill_results(
     result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING,
-    budget: Budget | None = None,
+    budget: Budget | None = None, progress: Progress | None = None,
 ) -> None:  # fmt: skip
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
     `note`: text before the report; `also`: further JSON entries; `budget`: the error budget."""
+    tell = progress or (lambda *_: None)
+    tell("writing the report", 0, 2)
     write_text(folder / REPORT, note + report.text(result, budget=budget))
     write_text(folder / RESULT, result_text(result, False, also))
+    tell("writing the report", 1, 2)
     if result.converged:
         _write_tables(result, folder)
         if budget is not None:
@@ -258,8 +263,9 @@ def fill_results(
         if (found := orientation_covariance(result)) is not None:
             unit = ANGLE_UNITS[result.network.angle_unit]
             write_orientation_covariance(found, folder / ADJUSTED / PRECISION, unit)
+    tell("writing the report", 2, 2)
     if plots:
-        draw_figures(result, folder)
+        draw_figures(result, folder, progress)
 
 
 def why_not(result: Adjustment) -> str:

@@ -78,7 +78,8 @@ def reconstruct_command(
         "--camera": camera, "--targets": targets, "--features": features, "--pairs": pairs,
         "--points": points,
     })  # fmt: skip
-    write_reconstruction(result, json, out, brief, plots, force, html, origin)
+    with staging(quiet or json == "-") as show:
+        write_reconstruction(result, json, out, brief, plots, force, html, origin, show)
     if not quiet and json != "-":
         print(result)
         print(out)

@@ -21,6 +21,7 @@ from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
 from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.types import Progress
 
 BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
 OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
@@ -39,7 +40,7 @@ def make_store(out: Path, force: bool) -> Path:
 
 def write_reconstruction(
     found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool,
-    html: str = "", origin: Origin = UNKNOWN,
+    html: str = "", origin: Origin = UNKNOWN, progress: Progress | None = None,
 ) -> None:  # fmt: skip
     """Write JSON and page, and the folder with each part, its pairs and figures."""
     first, plots = found.parts[0], plots and can_plot()
@@ -49,23 +50,25 @@ def write_reconstruction(
     with write_result(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
-        _write_part(found, first, new, plots, str(found) + "\n\n", also)
+        _write_part(found, first, new, plots, str(found) + "\n\n", also, progress)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            _write_part(found, part, folder, plots, f"{part.name}\n\n", {})
+            _write_part(found, part, folder, plots, f"{part.name}\n\n", {}, progress)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
-            draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new)
+            draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
         write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)
 
 
 def _write_part(
-    found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also
-) -> None:
-    fill_results(part.adjustment, folder, plots, note, also)
+    found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also,
+    progress: Progress | None,
+) -> None:  # fmt: skip
+    fill_results(part.adjustment, folder, plots, note, also, progress=progress)
     if plots:
-        draw_tracks(part.adjustment, lambda name: _thumbnail(found.photographs[name]), folder)
+        read = lambda name: _thumbnail(found.photographs[name])
+        draw_tracks(part.adjustment, read, folder, progress)
     network = adjusted_network(part.adjustment)
     write_ply(network, folder / CLOUD, part.colours)
     try:

@@ -58,6 +58,7 @@ from jaxbundle.pushbroom.accuracy import (
     east_north,
     ground_errors,
     propagate_accuracy,
+    spread_positions,
 )
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
@@ -76,8 +77,8 @@ from jaxbundle.report.page.markup import figure, grid, paragraph
 
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
 """The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
-PLACES = 7, 6
-"""Lines and pixels of the error map."""
+CELLS = 7, 6
+"""Parts of the image, along lines and pixels, of the error map; with irregular positions each."""
 EDGE = 9
 """Places along a side of the footprint."""
 LEVELS = (0.01, 0.1)
@@ -221,8 +222,9 @@ class ScannerView:
     # --- what the server asks ---------------------------------------------------------------
 
     def answer(self, given: Given) -> dict[str, Any]:
-        """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors` by place
-        [lines, pixels], `expected`: rows of the accuracy table; `idle`: controls without effect."""
+        """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors`: the RMS
+        of each part of the image [lines, pixels]; `expected`: rows of the accuracy table; `idle`:
+        controls without effect."""
         values = self.values(given)
         chosen = _in_pieces(self.choose(values))
         errors = self._errors(chosen)
@@ -233,7 +235,7 @@ class ScannerView:
         expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
-        field = length.reshape(PLACES)
+        field = _rms_of_cells(length)
         return {
             "parts": {
                 "ground": self._draw_ground(chosen),
@@ -295,24 +297,26 @@ class ScannerView:
 
     # --- numbers ----------------------------------------------------------------------------
 
-    def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        size = self.image.lines, self.image.pixels
-        lines, pixels = (np.linspace(0, n - 1, k) for n, k in zip(size, PLACES))
-        return np.repeat(lines, PLACES[1]), np.tile(pixels, PLACES[0])
+    @cached_property
+    def positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lines and pixels at which errors are computed, cell after cell of the error map."""
+        lines, pixels = spread_positions(self.image.lines, self.image.pixels, CELLS)
+        return lines.ravel(), pixels.ravel()
 
     def _errors(self, chosen: Chosen) -> Float[np.ndarray, "n 2"]:
-        return ground_errors(
-            chosen.image, chosen.truth, chosen.surface, *self._places()
-        )
+        return ground_errors(chosen.image, chosen.truth, chosen.surface, *self.positions)
 
     def _expected_accuracy(self, chosen: Chosen) -> list[dict[str, float]]:
         """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
+        # a constant error has no structure that a few positions could miss
+        spread = spread_positions(image.lines, image.pixels, CELLS, 1)
+        line, pixel = (v.ravel() for v in spread)
         rows = []
         for level in LEVELS:
             sigma = np.radians(level)
-            exact = propagate_accuracy(image, surface, *self._places(), Noise(attitude_bias=sigma))
+            exact = propagate_accuracy(image, surface, line, pixel, Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
             rows.append({
                 "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,
@@ -353,7 +357,7 @@ class ScannerView:
     def _draw_errors(self, field, told) -> str:
         return figure(
             draw_field(field, 3),
-            f"Error on the ground in metres over the image, line 0 at the top: RMS "
+            f"Error on the ground in metres, RMS of each part of the image, line 0 at the top: RMS "
             f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
         )
 
@@ -389,7 +393,7 @@ class ScannerView:
         return data.getvalue()
 
     def _csv(self, chosen: Chosen) -> str:
-        lines, pixels = self._places()
+        lines, pixels = self.positions
         errors = self._errors(chosen)
         rows = ["line,pixel,east,north,error"]
         rows += [
@@ -402,15 +406,20 @@ class ScannerView:
         return "\n".join(rows) + "\n"
 
     def _picture(self, chosen: Chosen) -> bytes:
-        lines, pixels = (np.unique(v) for v in self._places())
-        length = np.hypot(*self._errors(chosen).T).reshape(PLACES)
+        size = self.image.lines, self.image.pixels
+        lines, pixels = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(CELLS, size))
+        length = np.hypot(*self._errors(chosen).T)
         told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
         try:
             return png((7.5, 6), None, lambda ax: image_map(
-                lines, pixels, length, "Error on the ground", "m", told, ax
+                lines, pixels, _rms_of_cells(length), "Error on the ground", "m", told, ax
             ))  # fmt: skip
         except ImportError as error:
             raise InputError(str(error)) from None
+
+
+def _rms_of_cells(length) -> Float[np.ndarray, "rows columns"]:
+    return np.sqrt(np.mean(length.reshape(*CELLS, -1) ** 2, axis=2))
 
 
 def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:

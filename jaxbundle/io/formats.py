@@ -12,6 +12,7 @@ from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
+from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_file import YAML, write_opencv, write_ros
 from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
@@ -45,6 +46,16 @@ from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
+from jaxbundle.io.networks.rig_result import is_rig_result, read_rig_result
+from jaxbundle.io.networks.stereo import (
+    ROS_FILES,
+    fill_ros_stereo,
+    is_opencv_stereo,
+    is_ros_stereo,
+    read_opencv_stereo,
+    read_ros_stereo,
+    write_opencv_stereo,
+)
 from jaxbundle.io.networks.transforms import is_transforms, read_transforms, write_transforms
 from jaxbundle.io.results.coordinates import write_coordinates
 from jaxbundle.io.results.dxf import write_dxf
@@ -150,6 +161,13 @@ FORMATS: dict[str, Format] = {
     "micmac": Format(is_micmac, read_micmac, "a folder of MicMac with Orientation-….xml"),
     "jaicov": Format(is_jaicov, read_jaicov, "a .phc file of AICON, with .ior beside it"),
     "mrcal": Format(is_mrcal, read_mrcal, "a .cameramodel of mrcal, or a folder of them"),
+    "opencv-stereo": Format(
+        is_opencv_stereo, read_opencv_stereo, "a .yaml or .json file of OpenCV with M1, M2, R, T"
+    ),
+    "ros-stereo": Format(
+        is_ros_stereo, read_ros_stereo, "a folder with two camera_info files of ROS"
+    ),
+    "rig": Format(is_rig_result, read_rig_result, "result.json of jaxbundle calibrate --rig"),
 }
 
 
@@ -224,6 +242,14 @@ TARGETS: dict[str, Target] = {
     "mrcal": Target(
         _folder_of("mrcal"), fill_mrcal, "a folder with mrcal in its name", MRCAL_MODELS,
         MRCAL_FILES, alone=True,
+    ),
+    "opencv-stereo": Target(
+        _file_of("stereo", *OPENCV_SUFFIXES), write_opencv_stereo,
+        "NAME.yaml, .yml, .json with stereo in its name", PIXEL_MODELS,
+    ),
+    "ros-stereo": Target(
+        _folder_of("camera_info"), fill_ros_stereo, "a folder with camera_info in its name",
+        PIXEL_MODELS, ROS_FILES,
     ),
     "project": Target(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME, _write_project,

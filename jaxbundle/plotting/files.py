@@ -17,10 +17,15 @@ from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.matches import Pairs, match_graph, overlap_matrix, tracks_in_photograph
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.plotting.views import network_perspective, network_plan
+from jaxbundle.types import Progress
 
 MOST_IMAGES = 12
 MOST_CAMERAS = 6
 DOTS_PER_INCH = 150
+MARGIN = 0.15
+"""Inches around a figure."""
+DRAWING = "drawing"
+"""The stage of figures in reports of progress."""
 PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
 """Suffix of an id that is the name of a photograph; removed in names of figures."""
 FIGURES = ("plan.png", "perspective.png", "histogram.png",
@@ -30,14 +35,17 @@ PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
 """Patterns of the figures of pairs of photographs, and of the tracks in them."""
 
 
-def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:
+def save_figures(
+    adjustment, folder: str | Path, force: bool = False, progress: Progress | None = None
+) -> list[Path]:
     """Write the figures of a result into a folder, all or none.
 
     plan.png, perspective.png, histogram.png, residuals_IMAGE.png of at most 12 images (those with
     the largest RMS), distortion_CAMERA.png and correlations_CAMERA.png of at most 6 cameras;
     correlations only if two parameters are free. Ids are made safe for file names.
 
-    **Arguments:** `force`: also replace existing figures not written by this function.
+    **Arguments:** `force`: also replace existing figures not written by this function;
+    `progress(stage, done, total)`.
 
     **Returns:** the paths written.
 
@@ -46,11 +54,11 @@ def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Pa
     """
     need_matplotlib()
     with replace_folder(folder, "save_figures", FIGURES, force) as new:
-        written = draw_figures(adjustment, new)
+        written = draw_figures(adjustment, new, progress)
     return [Path(folder) / path.name for path in written]
 
 
-def draw_figures(adjustment, folder: Path) -> list[Path]:
+def draw_figures(adjustment, folder: Path, progress: Progress | None = None) -> list[Path]:
     """Write the figures of a result into an existing folder; as `save_figures`."""
     table = adjustment.images
     worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:MOST_IMAGES]
@@ -73,21 +81,24 @@ def draw_figures(adjustment, folder: Path) -> list[Path]:
     return write_figures(folder, {
         name: (size, projection, partial(draw, adjustment, *arguments))
         for name, (size, projection, draw, arguments) in drawings.items()
-    })
+    }, progress)
 
 
 def draw_pairs(
-    names: Sequence[str], pairs: Pairs, alone: Sequence[str], folder: Path
+    names: Sequence[str], pairs: Pairs, alone: Sequence[str], folder: Path,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Write the match graph and the overlap of photographs; arguments as of `match_graph`."""
     graph, overlap = (Path(name).stem for name in PAIRS)
     return write_figures(folder, {
         graph: ((7, 7), None, partial(match_graph, names, pairs, alone)),
         overlap: ((7, 6), None, partial(overlap_matrix, names, pairs)),
-    })  # fmt: skip
+    }, progress)  # fmt: skip
 
 
-def draw_tracks(adjustment, read: Callable[[str], np.ndarray], folder: Path) -> list[Path]:
+def draw_tracks(
+    adjustment, read: Callable[[str], np.ndarray], folder: Path, progress: Progress | None = None
+) -> list[Path]:
     """Write the tracks of at most 12 photographs, evenly chosen.
 
     **Arguments:** `read(image)`: its grey values, of any size.
@@ -100,14 +111,16 @@ def draw_tracks(adjustment, read: Callable[[str], np.ndarray], folder: Path) -> 
             (8, 6), None,
             lambda ax, id=images[k]: tracks_in_photograph(adjustment, id, read(id), ax),
         ) for k in chosen
-    })  # fmt: skip
+    }, progress)  # fmt: skip
 
 
-def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Path]:
+def write_figures(
+    folder: str | Path, drawings: Mapping[str, tuple], progress: Progress | None = None
+) -> list[Path]:
     """Write figures NAME.png into a folder, each file completely or not at all.
 
     **Arguments:** `drawings`: by name the size in inches, the projection (None or "3d"), and the
-    function that draws on the axes `ax`.
+    function that draws on the axes `ax`; `progress(stage, done, total)`.
 
     **Returns:** the paths written. **Raises:** as `save_figures`.
     """
@@ -117,11 +130,14 @@ def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Pat
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from error
-    written = []
+    tell = progress or (lambda *_: None)
+    written: list[Path] = []
     for name, (size, projection, draw) in drawings.items():
+        tell(DRAWING, len(written), len(drawings))
         path = folder / f"{name}.png"
         write_bytes(path, png(size, projection, draw))
         written.append(path)
+    tell(DRAWING, len(written), len(drawings))
     return written
 
 
@@ -129,15 +145,18 @@ def png(size, projection, draw) -> bytes:
     """One drawing as a PNG image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
+    # margins by the layout, and no savefig: both it and cropping draw once more
+    layout = ConstrainedLayoutEngine(w_pad=MARGIN, h_pad=MARGIN)
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout=layout)
+    canvas = FigureCanvasAgg(figure)
     draw(ax=figure.add_subplot(projection=projection))
     data = io.BytesIO()
     with warnings.catch_warnings():
         # ids in a script missing from the font: boxes in the figure, no action required
         warnings.filterwarnings("ignore", message="Glyph .* missing")
-        figure.savefig(data, format="png", bbox_inches="tight", pad_inches=0.15)
+        canvas.print_png(data)
     return data.getvalue()
 
 

@@ -17,6 +17,7 @@ from jaxbundle.pushbroom.accuracy import closed_form as closed_form
 from jaxbundle.pushbroom.accuracy import ground_errors as ground_errors
 from jaxbundle.pushbroom.accuracy import propagate_accuracy as propagate_accuracy
 from jaxbundle.pushbroom.accuracy import simulate_accuracy as simulate_accuracy
+from jaxbundle.pushbroom.accuracy import spread_positions as spread_positions
 from jaxbundle.pushbroom.ancillary import attitude_table as attitude_table
 from jaxbundle.pushbroom.ancillary import position_table as position_table
 from jaxbundle.pushbroom.corrections import Corrections as Corrections

@@ -15,8 +15,11 @@ from jaxbundle.types import Numbers
 
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
 
-UNIT = 1e-4
-"""Tolerance of the length of a quaternion: files with four decimals are accepted."""
+ROUNDED = 1e-4
+"""Deviation of the length of a quaternion from 1 that rounding explains, with four decimals."""
+NO_QUATERNION = 0.1
+"""Deviation of the length from 1 of what is no rotation but four other numbers: a column too many,
+angles, zeros. Solutions of other programs, whose components were adjusted, deviate by 1e-3."""
 
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
@@ -76,11 +79,12 @@ def attitude_table(
 ) -> Attitude:
     """Attitudes against time (seconds): quaternions (w, x, y, z), or pitch, roll, yaw in radians.
 
-    Sign changes of quaternions are corrected. Angles that jump by a full turn are made continuous.
+    Quaternions are normalised and sign changes corrected. Angles that jump by a full turn are made
+    continuous.
 
     **Arguments:** as in `position_table`; `method` also `"slerp"`, for quaternions only.
 
-    **Raises:** `InputError` naming the row, also for quaternions that are not unit.
+    **Raises:** `InputError` naming the row, also for quaternions whose length is far from 1.
     """
     values = np.array(values, float)
     quaternions = values.ndim == 2 and values.shape[1] == 4
@@ -92,18 +96,32 @@ def attitude_table(
             "'lagrange' or 'spline'"
         )
     if quaternions:
-        length = np.linalg.norm(values, axis=1)
-        if (bad := ~(np.abs(length - 1) < UNIT)).any():
-            row = int(bad.argmax())
-            raise InputError(
-                f"{source(row)}: the quaternion has the length {length[row]:.6g}; 1 is expected, "
-                "in the order w, x, y, z: give unit quaternions"
-            )
-        values = continuous(values / length[:, None])
+        values = continuous(normalise_quaternions(values, source)[0])
     else:
         values = np.unwrap(values, axis=0)
     table = _table(times, values, None, method, order, gap, extrapolate, "attitude", source)
     return Attitude(table, method == "slerp", reference)
+
+
+def normalise_quaternions(
+    values: Float[np.ndarray, "rows 4"], source: Source = ATTITUDE
+) -> tuple[Float[np.ndarray, "rows 4"], tuple[str, ...]]:
+    """Quaternions of length 1, and a message if some deviate by more than `ROUNDED`.
+
+    **Raises:** `InputError` naming the row of one that deviates by `NO_QUATERNION`."""
+    length = np.linalg.norm(values, axis=1)
+    if (bad := ~(np.abs(length - 1) < NO_QUATERNION)).any():
+        row = int(bad.argmax())
+        raise InputError(
+            f"{source(row)}: expected a quaternion, of length 1, got four numbers of length "
+            f"{length[row]:.6g}; check the columns (in tables of scanner files w, x, y, z)"
+        )
+    off = np.abs(length - 1)
+    message = (
+        f"{source.name}: lengths of quaternions from {length.min():.6f} to {length.max():.6f}; "
+        "they are normalised"
+    )
+    return values / length[:, None], (message,) * bool(len(off) and off.max() > ROUNDED)
 
 
 def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:

@@ -19,9 +19,6 @@ from jaxbundle.pushbroom.scanner import Pair, slopes_of
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
 
-PIXELS_AT_ONCE = 1000
-"""Pixels refracted together, layer by layer: with 8000 it takes 1.5 times as long."""
-
 
 def locate_point(
     image: PushbroomImage, surface: Surface, line: Scalar, pixel: Scalar
@@ -61,16 +58,12 @@ def locate_lines(
     """The points of all pixels of all lines, coordinates first."""
     slopes = slopes_of(image.optics, pixels)
 
-    layered = image.corrections.refraction
-
     def of_line(line):
         pose = pose_at(image, image.times.time(line))
         point = lambda slopes: ground_point(pose, slopes, surface, image.corrections)
-        if layered and len(pixels) > PIXELS_AT_ONCE:
-            return jax.lax.map(point, slopes, batch_size=PIXELS_AT_ONCE)
         return jax.vmap(point)(slopes)
 
-    if surface.iterative or layered:
+    if surface.iterative:
         # the state of a loop over 8000 pixels stays in the cache, that of many lines does not
         return jnp.stack(jax.lax.map(of_line, lines), axis=0)
     return jnp.stack(jax.vmap(of_line)(lines))

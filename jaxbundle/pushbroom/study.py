@@ -22,6 +22,7 @@ from jaxbundle.pushbroom.accuracy import (
     ground_errors,
     propagate_accuracy,
     simulate_accuracy,
+    spread_positions,
 )
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.locate import locate_points
@@ -87,12 +88,13 @@ def accuracy_table(
 
     **Arguments:** `sigmas` in radians; `kind` of the error: `"bias"`, one for the whole image, or
     `"white"`, another in every row of the attitude table, which interpolation averages (the closed
-    form does not); `lines` × `pixels` positions, the centres of equal parts of the image (a prime
-    number of lines avoids synchrony with the attitude samples). The surface must not be a terrain.
+    form does not); `lines` × `pixels` parts of the image with one irregular position each
+    (`spread_positions`) for the errors, a thousand positions for error-free samples. The surface
+    must not be a terrain.
     """
-    middles = lambda n, size: (np.arange(n) + 0.5) * size / n - 0.5
-    of_line, of_pixel = middles(lines, flight.lines), middles(pixels, flight.pixels)
-    places = np.repeat(of_line, pixels), np.tile(of_pixel, lines)
+    size = flight.lines, flight.pixels
+    line, pixel = (v.ravel() for v in spread_positions(*size, (lines, pixels), 1))
+    all_lines, all_pixels = (v.ravel() for v in spread_positions(*size))
     quiet = dataclasses.replace(flight, noise=Noise())
     altitude, view = altitude_and_view(true_image(quiet), surface)
     error_free, erring = [], []
@@ -102,14 +104,15 @@ def accuracy_table(
         truth = true_image(varied)
         for method in FLOORS:
             image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
-            length = np.linalg.norm(ground_errors(image, truth, surface, *places), axis=1)
+            errors = ground_errors(image, truth, surface, all_lines, all_pixels)
+            length = np.linalg.norm(errors, axis=1)
             rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
             error_free.append(ErrorFree(name, method, float(rms), float(ce90)))
         image = measured_image(varied)
         for sigma in sigmas:
             noise = Noise(**{f"attitude_{kind}": sigma})
-            counted = simulate_accuracy(image, surface, *places, noise, draws, seed)
-            exact = propagate_accuracy(image, surface, *places, noise)
+            counted = simulate_accuracy(image, surface, line, pixel, noise, draws, seed)
+            exact = propagate_accuracy(image, surface, line, pixel, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # above a plane, near the nadir, errors along and across are almost alike
             round_ = circular_error(np.eye(2) * level**2 / 2)

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from jaxbundle.surface.bounds import Bounds
@@ -164,15 +164,7 @@ def combine(
     known = np.isfinite(q) & np.isfinite(sigma)
     if len(q) == 1:
         return np.where(known[0], q[0], np.nan), sigma[0] ** 2, known[0].astype(int)
-    count = known.sum(0)
-    q, sigma = np.where(known, q, np.nan), np.where(known, sigma, np.nan)
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
-        votes = (apart < LARGEST_DIFFERENCE).sum(1)
-    best = np.where(known, votes, -1).argmax(0)
-    columns = np.arange(q.shape[1])
-    with np.errstate(invalid="ignore"):
-        use = known & (apart[best, :, columns].T < LARGEST_DIFFERENCE)
+    use = consistent(q, sigma)
     number = use.sum(0)
     weight = np.where(use, 1 / np.where(use, sigma, 1) ** 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -180,5 +172,19 @@ def combine(
         pull = np.where(use, weight * np.where(use, sigma, 0), 0) / weight.sum(0)
         cosine = np.ones((len(q), len(q))) if cosine is None else cosine
         variance = np.einsum("kn,kl,ln->n", pull, cosine, pull) / 2 + 0.5 / weight.sum(0)
-    decided = (number >= 1) & ((count < 2) | (number > 1))
-    return np.where(decided, mean, np.nan), variance, number
+    return np.where(number > 0, mean, np.nan), variance, number
+
+
+def consistent(
+    q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"]
+) -> Bool[np.ndarray, "pairs n"]:
+    """Which values agree with the one that most agree with, within `LARGEST_DIFFERENCE`; none where
+    two disagree and no third decides. NaN: no value."""
+    known = np.isfinite(q) & np.isfinite(sigma)
+    q, sigma = np.where(known, q, np.nan), np.where(known, sigma, np.nan)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
+        votes = (apart < LARGEST_DIFFERENCE).sum(1)
+        best = np.where(known, votes, -1).argmax(0)
+        use = known & (apart[best, :, np.arange(q.shape[1])].T < LARGEST_DIFFERENCE)
+    return use & ((known.sum(0) < 2) | (use.sum(0) > 1))

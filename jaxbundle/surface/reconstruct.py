@@ -197,9 +197,12 @@ def _dense(views, i, others, guide, bounds, step):
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)
     factor = float(np.mean([f for _, f in used])) if used else None
+    reason = "no disparity, or not confirmed by least squares"
+    if len(used) > 1:
+        reason += ", or pairs disagree"
     return cloud, {
         "points": number, "matched": len(cloud), "variance_factor": factor,
-        "rejected": {"no disparity, or not confirmed by least squares": number - len(cloud)},
+        "rejected": {reason: number - len(cloud)},
     }, left_out  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import render
 from test_calibrate import VIEWS
 
 from jaxbundle.calibration import BoardViews, calibrate_cameras, calibrate_rig
-from jaxbundle.calibration.files import calibrations_dict, save_rig_plots
+from jaxbundle.calibration.files import calibrations_dict, fill_rig, json_text, save_rig_plots
 from jaxbundle.calibration.report import rig_dict, rig_text
 from jaxbundle.calibration.rig.calibrate import epoch_keys, require_solved
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, declare_rig, leave_out
@@ -24,6 +24,8 @@ from jaxbundle.geometry import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
+from jaxbundle.io.exchange import convert
+from jaxbundle.io.formats import read_network
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.tables import Camera
 
@@ -90,6 +92,32 @@ def base_of(found):
 @pytest.fixture(scope="module")
 def rig():
     return calibrate_cameras(pair(), rig=True, snooping=None, cross_validation=False).rig
+
+
+def test_a_rig_leaves_the_program(rig, tmp_path):
+    """The files of `--out`, and those that `convert` makes of the JSON, are the same; the mounting
+    in them is the truth."""
+    fill_rig(rig.network(), tmp_path / "rig")
+    parts = {name: one.to_dict(True) for name, one in rig.cameras.items()}
+    document = {"converged": True, "calibrations": parts, "rig": rig_dict(rig, True)}
+    (tmp_path / "result.json").write_text(json_text(document))
+    said = (tmp_path / "rig" / "conversions.txt").read_text()
+    assert "unit of the board" in said and "not written" not in said
+    flip, mounting = np.diag([1.0, -1, -1]), rig.mountings["right"]
+    for name, file in (("stereo.yaml", ""), ("mrcal", "right.cameramodel"),
+                       ("camera_info", "right.yaml")):  # fmt: skip
+        convert(tmp_path / "result.json", tmp_path / name)
+        texts = [(place / name / file).read_text() for place in (tmp_path, tmp_path / "rig")]
+        assert texts[0] == texts[1]
+    for name in ("stereo.yaml", "mrcal", "camera_info", "camchain.yaml"):
+        images = read_network(tmp_path / "rig" / name).images
+        M = [np.asarray(matrix_from_omega_phi_kappa(angles)) for angles in images.angles]
+        R, base = M[1] @ M[0].T, M[0] @ (images.position[1] - images.position[0])
+        np.testing.assert_allclose(R, mounting.rotation, atol=1e-9)
+        np.testing.assert_allclose(base, mounting.base, atol=1e-9)
+        assert np.abs((base - BASE) / mounting.sigma[:3]).max() < 3
+    stereo = cv2.FileStorage(str(tmp_path / "stereo.yaml"), cv2.FILE_STORAGE_READ)
+    np.testing.assert_allclose(stereo.getNode("R").mat(), flip @ mounting.rotation @ flip)
 
 
 def test_mounting_and_cameras_are_the_truth(rig):

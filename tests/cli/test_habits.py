@@ -47,15 +47,64 @@ def test_a_function_keeps_its_arguments():
     assert "verbose" not in inspect.signature(plan).parameters
 
 
+LOCATE = ("pushbroom", "locate", "scanner.toml", "--grid", "2x2")
+SCANNER = """
+[scanner]
+lines = 20
+pixels = 10
+earth = "local"
+[times]
+period = 0.1
+[position]
+table = "positions.csv"
+interpolation = "linear"
+[attitude]
+table = "attitude.csv"
+[optics]
+c = 100.0
+pitch = 0.01
+[mounting]
+"""
+
+
+@pytest.fixture
+def scanner(tmp_path):
+    (tmp_path / "scanner.toml").write_text(SCANNER)
+    (tmp_path / "positions.csv").write_text("t,X,Y,Z\n-1,0,0,500\n3,0,40,500\n")
+    (tmp_path / "attitude.csv").write_text("t,pitch,roll,yaw\n-1,0,0,0\n3,0,0,0\n")
+    return tmp_path / "scanner.toml"
+
+
 @pytest.mark.parametrize("arguments", [
     PLAN, ("compare", f"{CAMERAS}#1-indoor", f"{CAMERAS}#2-indoor"),
-    ("camera", f"{CAMERAS}#1-indoor"), ("example",),
-], ids=lambda arguments: arguments[0])  # fmt: skip
-def test_quiet_prints_nothing(command, arguments):
-    loud = command(*arguments)
+    ("camera", f"{CAMERAS}#1-indoor"), ("example",), ("completion", "bash"), LOCATE,
+    ("pushbroom", "project", "scanner.toml", "--points", "points.csv"),
+    ("pushbroom", "accuracy", "scanner.toml", "--attitude-bias", "0.1", "--grid", "1x1"),
+    ("adjust", "examples/convergent4/project.toml"), ("orient", "examples/convergent4"),
+], ids=lambda arguments: "-".join(arguments[:2]))  # fmt: skip
+def test_quiet_prints_the_result_alone(command, scanner, arguments):
+    """Of commands whose result is what they print."""
+    (scanner.parent / "points.csv").write_text("X,Y,Z\n0,15,0\n")
+    at = {"scanner.toml": scanner, "points.csv": scanner.parent / "points.csv"}
+    arguments = [at.get(word, word) for word in arguments]
+    loud, told = command(*arguments), command(*arguments, "--quiet")
     assert loud.status == 0 and loud.out
-    told = command(*arguments, "--quiet")
-    assert (told.status, told.out, told.err) == (0, "", "")
+    assert (told.status, told.out, told.err) == (0, loud.out, "")
+
+
+@pytest.mark.parametrize("arguments, option, name", [
+    (LOCATE, "--csv", "points.csv"), (LOCATE, "--json", "points.json"),
+    (("adjust", "examples/convergent4/project.toml"), "--json", "result.json"),
+    (PLAN, "--out", "block"),
+    (("example", "convergent4"), None, "first"),
+], ids=lambda given: "-".join(given[:2]) if isinstance(given, tuple) else None)  # fmt: skip
+def test_quiet_prints_nothing_where_the_result_is_in_a_file(
+    command, scanner, arguments, option, name
+):
+    file = scanner.parent / name
+    arguments = [scanner if word == "scanner.toml" else word for word in arguments]
+    told = command(*arguments, *([option] if option else []), file, "--quiet")
+    assert (told.status, told.out, told.err) == (0, "", "") and file.exists()
 
 
 def test_quiet_still_tells_errors_and_what_goes_to_standard_output_by_name(command, tmp_path):
@@ -74,6 +123,15 @@ def test_verbose_tells_versions_iterations_and_times(command):
     assert lines[0].startswith("jaxbundle ") and "numpy " in lines[0]
     assert any(line.startswith("iteration 1: ") and "λ" in line for line in lines)
     assert " s in all" in lines[-1]
+
+
+def test_a_terminal_shows_what_is_written_and_drawn(command, tmp_path, monkeypatch):
+    """A pipe shows nothing of it."""
+    call = "adjust", "examples/convergent4/project.toml", "--out"
+    assert command(*call, tmp_path / "a").err == ""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal for rich
+    shown = command(*call, tmp_path / "b").err
+    assert "writing the report" in shown and "drawing" in shown
 
 
 def test_verbose_tells_an_error_and_the_time(command):

@@ -22,6 +22,7 @@ from jaxbundle.io.cameras.opencv_file import write_opencv
 from jaxbundle.io.networks.bal import write_bal
 from jaxbundle.io.networks.bundler import write_bundler
 from jaxbundle.io.networks.colmap import write_colmap
+from jaxbundle.io.networks.stereo import fill_ros_stereo, write_opencv_stereo
 from jaxbundle.network.tables import Camera, Network
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "convergent4.txt"
@@ -88,6 +89,18 @@ def made(kind: str, folder: Path) -> Path:
             from test_mrcal import model
 
             (folder / "left.cameramodel").write_text(model("OPENCV8"))
+        case "opencv-stereo":
+            from test_rigs_for_others import rig
+
+            write_opencv_stereo(rig()[0], folder / "stereo.yaml")
+        case "ros-stereo":
+            from test_rigs_for_others import rig
+
+            fill_ros_stereo(rig()[0], folder)
+        case "rig":
+            from test_rigs_for_others import result_json
+
+            result_json(folder)
         case "micmac":
             from test_micmac import folder as oriented
 
@@ -132,7 +145,7 @@ def read(kind: str, folder: Path):
             return [camera for camera, _ in read_calibrated(folder / "result.json")]
         case "colmap-text":
             return read_network(folder, format="colmap")
-        case "colmap" | "project" | "bingo" | "opensfm" | "micmac":
+        case "colmap" | "project" | "bingo" | "opensfm" | "micmac" | "ros-stereo":
             return read_network(folder, format=kind)
         case "column-map":
             return read_network(folder / "map.toml", format=kind)
@@ -147,7 +160,8 @@ def read(kind: str, folder: Path):
 
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",
          "photomodeler", "bingo", "metashape", "openmvg", "opensfm", "transforms", "kalibr",
-         "mrcal", "micmac", "jaicov", "column-map", "camera-stack", "result")  # fmt: skip
+         "mrcal", "micmac", "jaicov", "column-map", "camera-stack", "result", "opencv-stereo",
+         "ros-stereo", "rig")  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

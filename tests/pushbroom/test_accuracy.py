@@ -12,6 +12,7 @@ from jaxbundle.pushbroom.accuracy import (
     closed_form,
     propagate_accuracy,
     simulate_accuracy,
+    spread_positions,
 )
 from jaxbundle.pushbroom.noise import Noise, add_errors, zero_errors
 from jaxbundle.pushbroom.surfaces import Ground, Plane
@@ -92,3 +93,20 @@ def test_circular_error():
     mixed = np.quantile(np.r_[length, 0.1 * length], 0.9)
     both = np.diag([9.0, 1.0]), np.diag([0.09, 0.01])
     np.testing.assert_allclose(circular_error(np.array(both)), mixed, rtol=0.005)
+
+
+@pytest.mark.parametrize("cells", [(1, 1), (11, 11), (3, 4)])
+def test_positions_spread_over_the_lines_of_every_cell(cells):
+    """One position in each equal part of the lines of a row of cells, at another place in each."""
+    lines, pixels = spread_positions(4000, 2000, cells)
+    rows, columns = cells
+    assert lines.shape == pixels.shape == (*cells, -(-1000 // (rows * columns)))
+    for values, size, axis in ((lines, 4000, 0), (pixels, 2000, 1)):
+        cell = np.floor((values + 0.5) * cells[axis] / size)
+        assert (cell == np.indices(lines.shape)[axis]).all()
+    parts = np.floor((lines + 0.5) * lines.size / 4000).ravel()
+    np.testing.assert_array_equal(np.sort(parts), np.arange(lines.size))
+    within = np.sort((lines.ravel() + 0.5) * lines.size / 4000 % 1)
+    assert np.abs(within - np.arange(lines.size) / lines.size).max() < 0.06
+    across = np.sort((pixels + 0.5) * columns / 2000 % 1, axis=None)
+    assert np.abs(across - np.arange(lines.size) / lines.size).max() < 0.01

@@ -229,7 +229,7 @@ BROKEN = {
     "themisir": (changed("optical_distortion", {"themisir": {}}), ["'themisir' is not supported"]),
     "quaternion": (
         changed("body_rotation.quaternions", [[1, 0, 0, 0], [1, 1, 0, 0]]),
-        ["body_rotation", "unit"],
+        ["body_rotation", "row 2", "length 1.41421"],
     ),
     "rows": (
         changed("body_rotation.quaternions", [[1, 0, 0, 0]]), ["body_rotation", "array 2 × 4"],

@@ -229,12 +229,31 @@ def test_a_model_state_is_read_as_its_isd(tmp_path):
     )
 
 
+def test_adjusted_quaternions_are_normalised(tmp_path):
+    """The components of an adjustment are not of length 1; that of the interpolated ones is what
+    usgscsm divides by."""
+    expected = read_csm(write_state(tmp_path, model_state()))
+    q = np.reshape(model_state()["m_quaternions"], (-1, 4))
+    length = 1 + np.random.default_rng(3).uniform(-3e-4, 3e-4, (len(q), 1))
+    state = lambda q: write_state(tmp_path, model_state(m_quaternions=np.ravel(q).tolist()))
+    found = read_csm(state(length * q))
+    for a, b in zip(jax.tree.leaves(found.image), jax.tree.leaves(expected.image), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    said = [line for line in found.warnings if line not in expected.warnings]
+    assert len(said) == 1 and "state.json" in said[0] and "normalised" in said[0]
+    assert f"{length.max():.6f}" in said[0]
+    # what rounding explains is not worth a word
+    found = read_csm(state(np.round(q, 5)))
+    assert found.warnings == expected.warnings
+
+
 STATES = {
     "adjusted": ({"m_currentParameterValue": [0.0, 2.5]}, ["Value has 1 adjusted parameters"]),
     "distortion": ({"m_distortionType": 3}, ["'dawnfc' is not supported"]),
     "number": ({"m_distortionType": 12}, ["m_distortionType 12", "0 to 8"]),
     "frame camera": ({"m_modelName": "USGS_ASTRO_FRAME_SENSOR_MODEL"}, ["m_modelName", "FRAME"]),
     "rows": ({"m_quaternions": [0, 0, 0, 1, 0]}, ["m_quaternions has 5", "4 a row"]),
+    "no quaternion": ({"m_quaternions": [0, 0, 0.3, 0.4] * 70}, ["row 1", "length 0.5"]),
     "missing": ({"m_positions": None}, ["m_positions is missing"]),
     "rates": ({"m_intTimes": [1.0, 1.0]}, ["m_intTimes have 1, 1, 2"]),
 }

@@ -27,13 +27,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.corrections import (
-    BORDERS,
-    INDICES,
     Corrections,
     apparent_direction,
     apparent_point,
     earlier_earth,
-    refract,
     true_direction,
 )
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
@@ -163,21 +160,6 @@ def test_light_time_turns_the_earth():
     np.testing.assert_allclose(earlier_earth(tuple(v), 5e5), turn.apply(v), atol=1e-9)
 
 
-through_air = jax.jit(refract)
-
-
-def test_refraction_keeps_the_invariant_of_bouguer():
-    """On a sphere n·r·sin z is the same above the air and at the ground."""
-    earth = el.sphere(6371e3)
-    o = (6371e3 + 6e5, 0.0, 0.0)
-    for tangent in (0.03, 0.5, 1.2):
-        d = np.array([-1, tangent, 0]) / np.hypot(1, tangent)
-        start, bent = (np.array(v) for v in through_air(earth, 0.0, o, tuple(d)))
-        before = np.linalg.norm(np.cross(o, d))
-        after = np.linalg.norm(np.cross(start, bent)) * INDICES[-2]
-        np.testing.assert_allclose(after, before, rtol=1e-12)
-
-
 @partial(jax.jit, static_argnums=1)
 def sight(pose, corrections, slopes=(0.3, 0.1)):
     return ground_point(pose, slopes, Ground(), corrections)
@@ -205,13 +187,14 @@ def test_size_and_inverse_of_corrections(name, least, most):
 
 
 @pytest.mark.parametrize("off_nadir, light, aberration, refraction", [
-    (5, (0.78, 1.25), (12.7, 20.0), (0.26, 0.27)), (30, (0.91, 1.47), (14.8, 23.5), (2.4, 2.8)),
-    (50, (1.28, 2.15), (21.0, 34.5), (12.5, 17.9)),
+    (5, (0.78, 1.25), (12.7, 20.0), (0.22, 0.23)), (30, (0.91, 1.47), (14.8, 23.5), (2.1, 2.4)),
+    (50, (1.28, 2.15), (21.0, 34.5), (10.7, 15.3)),
 ])  # fmt: skip
 def test_sizes_off_the_nadir(off_nadir, light, aberration, refraction):
     """The table of docs/pushbroom.md, from 500 and 800 km above the equator, looking east.
 
-    In layers over a plane refraction moves the ground by Σ(n − 1)·Δh·tan z/cos² z.
+    Over a plane refraction moves the ground by ∫(n − 1) dh·tan z/cos² z; the integral of air that
+    weighs 101325 N/m² and has 1.225 kg/m³ and n − 1 = 2.779e-4 at the ground is 2.34 m.
     """
     slopes = np.tan(np.radians(off_nadir)), 0.0
     for k, h in enumerate((500e3, 800e3)):
@@ -222,8 +205,7 @@ def test_sizes_off_the_nadir(off_nadir, light, aberration, refraction):
         plain = at(0, 0, 0)
         d = (plain - P) / np.linalg.norm(plain - P)
         cosine = -d @ plain / np.linalg.norm(plain)
-        air = np.sum((INDICES[1:-1] - 1) * -np.diff(BORDERS))
-        expected = air * np.sqrt(1 - cosine**2) / cosine**3
+        expected = 2.779e-4 / 1.225 * 101325 / 9.78 * np.sqrt(1 - cosine**2) / cosine**3
         sizes = [np.linalg.norm(at(*c) - plain) for c in np.eye(3)]
         np.testing.assert_allclose(sizes[2], expected, rtol=0.02)
         told = light[k], aberration[k], refraction[k]

@@ -20,10 +20,11 @@ POLYNOMIALS = [(f"{short}_{part[:3].upper()}", f"{axis}_{part}")
                for short, axis in PARTS[:2] for part in ("numerator", "denominator")]  # fmt: skip
 
 
-def dimap(rpc, first="1", inverse="Inverse_Model", domain="Direct_Model_Validity_Domain"):
-    """As in the Pléiades User Guide: coefficients one by one, offsets from the first pixel."""
+def dimap(rpc, profile="PHR_SENSOR", origin=1.0, domain=(1, 1), inverse="Inverse_Model"):
+    """As in the Pléiades User Guide: coefficients one by one; `origin` is the row and column of
+    the centre of the first pixel, `domain` where the coefficients begin to hold."""
     value = lambda name: float(getattr(rpc, name))
-    shift = {"line": float(first or 1), "sample": float(first or 1)}
+    shift = {"line": origin, "sample": origin}
     scales = "".join(
         f"<{short}_OFF>{value(f'{axis}_offset') + shift.get(axis, 0)!r}</{short}_OFF>"
         f"<{short}_SCALE>{value(f'{axis}_scale')!r}</{short}_SCALE>" for short, axis in PARTS
@@ -32,9 +33,14 @@ def dimap(rpc, first="1", inverse="Inverse_Model", domain="Direct_Model_Validity
         f"<{short}_COEFF_{k}>{float(c)!r}</{short}_COEFF_{k}>"
         for short, name in POLYNOMIALS for k, c in enumerate(getattr(rpc, name), 1)
     )  # fmt: skip
-    limits = f"<FIRST_ROW>{first}</FIRST_ROW><FIRST_COL>{first}</FIRST_COL>" if first else ""
+    row, column = domain or (0, 0)
+    limits = f"<FIRST_ROW>{row}</FIRST_ROW><FIRST_COL>{column}</FIRST_COL>" if domain else ""
+    kind = "ImagetoGround" if inverse == "GroundtoImage_Values" else "Direct_Model"
+    domain = f"{kind}_Validity_Domain"
+    head = f"<METADATA_PROFILE>{profile}</METADATA_PROFILE>" if profile else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
-<Dimap_Document xmlns="http://example.org/dimap"><Rational_Function_Model><Global_RFM>
+<Dimap_Document xmlns="http://example.org/dimap">
+<Metadata_Identification>{head}</Metadata_Identification><Rational_Function_Model><Global_RFM>
 <Direct_Model><SAMP_NUM_COEFF_1>7</SAMP_NUM_COEFF_1></Direct_Model>
 <{inverse}>{coefficients}</{inverse}><RFM_Validity><{domain}>{limits}</{domain}>{scales}
 </RFM_Validity></Global_RFM></Rational_Function_Model></Dimap_Document>"""
@@ -68,11 +74,14 @@ def geom(rpc):
 
 PRODUCTS = {
     "Pleiades": ("RPC_PHR.XML", dimap(RPC)),
-    "SPOT 6": ("RPC_SPOT6.XML", dimap(RPC, first="0")),
+    "Pleiades, domain beyond the image": ("RPC_PHR.XML", dimap(RPC, domain=(-27, -791))),
+    "SPOT 6": ("RPC_SPOT6.XML", dimap(RPC, "S6_SENSOR", 0.0, (0, 0))),
+    "SPOT 7, domain within the image": ("RPC_SPOT7.XML", dimap(RPC, "S7_SENSOR", 0.0, (40, 9))),
     "Pleiades Neo": ("RPC_PNEO.XML", dimap(
-        RPC, "0.5", "GroundtoImage_Values", "ImagetoGround_Validity_Domain"
+        RPC, "PNEO_SENSOR", 0.0, (-12, -3), "GroundtoImage_Values"
     )),
-    "no limits": ("rpc.xml", dimap(RPC, first="")),
+    "DIMAP 2 of another": ("rpc.xml", dimap(RPC, "", 1.0, None)),
+    "DIMAP 3 of another": ("rpc.xml", dimap(RPC, "X_SENSOR", 0.0, None, "GroundtoImage_Values")),
     "WorldView": ("image.XML", digitalglobe(RPC)),
     "OSSIM": ("image.geom", geom(RPC)),
     "OSSIM, prefix": ("rpc.txt", geom(RPC).replace("line_", "image0.geometry.projection.line_")),

@@ -105,7 +105,8 @@ def by_worldview(time):
 
 
 def without_corrections(folder, name="image.xml"):
-    text = f'[scanner]\nsource = "{name}"\n[corrections]\nlight_time = false\naberration = false\n'
+    text = f'[scanner]\nsource = "{name}"\n[corrections]\n'
+    text += "light_time = false\naberration = false\nrefraction = false\n"
     (folder / "plain.toml").write_text(text)
     return read_scanner(folder / "plain.toml")
 
@@ -114,7 +115,7 @@ def test_worldview(tmp_path):
     (tmp_path / "image.xml").write_text(worldview())
     scanner = read_scanner(tmp_path / "image.xml")
     assert not scanner.warnings
-    assert scanner.image.corrections == (True, True, False)
+    assert scanner.image.corrections == (True, True, True)
     check_image(without_corrections(tmp_path), by_worldview(lambda line: PERIOD * line))
 
 
@@ -283,7 +284,7 @@ REFUSED = {
         worldview, f"{LINES} {LINES * PERIOD!r}", f"{LINES} -4.0", ["TLCLIST", "backwards"],
     ),
     "distortion": (worldview, "<ALIST>0 0", "<ALIST>0 1e-7", ["OPTICAL_DISTORTION", "ALIST"]),
-    "quaternion": (worldview, "<ATTLIST>1 ", "<ATTLIST>1 3 ", ["ATTLIST, row 1", "unit"]),
+    "quaternion": (worldview, "<ATTLIST>1 ", "<ATTLIST>1 3 ", ["ATTLIST, row 1", "length"]),
     "numbers": (worldview, "<ATTLIST>1 ", "<ATTLIST>one ", ["ATTLIST 1", "'one'"]),
     "missing": (worldview, "<CX>0.2</CX>", "", ["PERSPECTIVE_CENTER/CX is missing"]),
     "late": (

@@ -165,6 +165,55 @@ def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command,
     assert 0.7 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
 
 
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """Three RPC images, looking ahead, down and back along the track and a little aside."""
+    folder = tmp_path_factory.mktemp("three")
+    around = neighbourhood(np.radians(10.0), np.radians(45.0))
+    scene = Scene((HeightField(ground, (-600, -600, 600, 600)),), (Texture(1.0, 2, 512),))
+    blank = np.zeros((LINES, SAMPLES), np.float32)
+    for k, by_height in enumerate((0.0, 0.6, -0.6)):
+        view = RpcView("", blank, coefficients(by_height), around)
+        v, u = np.indices((LINES + 1, SAMPLES + 1)).reshape(2, -1)
+        uv = np.stack([u, v], 1).astype(float)
+        top, bottom = (view.points(uv, np.full(len(uv), h)) for h in (400.0, 0.0))
+        d = (bottom - top) / np.linalg.norm(bottom - top, axis=1, keepdims=True)
+        o, d = (a.reshape(LINES + 1, SAMPLES + 1, 3) for a in (top, d))
+        shot = render_rays(scene, o, d, Sensor(noise=1.5, seed=k))
+        cv2.imwrite(str(folder / f"{k}.tif"), shot.grey.astype(np.uint16) * 9 + 100)
+        write_rpc(folder / f"{k}_RPC.TXT", coefficients(by_height))
+    return folder, around
+
+
+def test_three_images_give_one_point_a_pixel_by_all_rays(three, tmp_path, command):
+    """The rays of both pairs are intersected together: σ is smaller than that of a pair, and true.
+    No base has more points than pixels."""
+    folder, around = three
+    files = [folder / f"{k}.tif" for k in range(3)]
+    found = {}
+    for name, pairs in (("pair", "0.tif,1.tif"), ("three", "0.tif,1.tif,2.tif")):
+        told = command(
+            "surface", *files, "--out", tmp_path / name, "--zmin", 170, "--zmax", 230, "--dense",
+            "--pairs", pairs, "--json", "-",
+        )  # fmt: skip
+        assert told.status == 0, told.err
+        (base,) = json.loads(told.out)["images"]
+        found[name] = cloud = read_cloud(tmp_path / name / "cloud.csv")
+        assert base["points"] == LINES * SAMPLES and base["matched"] == len(cloud)
+        assert list(base["rejected"].values()) == [LINES * SAMPLES - len(cloud)]
+        assert len(np.unique(cloud.uv, axis=0)) == len(cloud) > 0.5 * LINES * SAMPLES
+        X = from_map(*cloud.X.T, around, "EPSG:32632")
+        w = (cloud.X[:, 2] - ground(X[:, 0], X[:, 1])) / cloud.sigma[:, 2]
+        assert (np.abs(w) > 5).mean() < 0.02
+        assert 0.7 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
+    assert set(found["pair"].rays) == {2} and set(found["three"].rays) == {2, 3}
+    seen = found["three"].rays == 3
+    assert seen.sum() > 0.8 * LINES * SAMPLES
+    # one looks ahead, one back: twice the base, and the noise of the middle image cancels
+    sigma = [np.median(found["pair"].sigma[:, 2]), np.median(found["three"].sigma[seen, 2])]
+    assert 0.45 < sigma[1] / sigma[0] < 0.6
+
+
 def test_map_coordinates_go_both_ways(satellite):
     _, around = satellite
     X = np.array([[100.0, -50, 200], [0, 0, 0]])

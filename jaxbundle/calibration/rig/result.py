@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +21,10 @@ from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_unce
 from jaxbundle.cameras import get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
-from jaxbundle.network.tables import Camera, units_of
+from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
 from jaxbundle.statistics.inspection import OfNetwork
 from jaxbundle.system.programs import compile_once
@@ -225,6 +227,16 @@ class RigCalibration:
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
         return dataclasses.replace(self.cameras[name].camera, parameters=self.parameters[name])
+
+    def network(self) -> Network:
+        """The cameras on their mountings as a network of one image each, the reference at the
+        origin, looking along Z with Y down: to write for other programs (`jaxbundle.io`)."""
+        cameras = [dataclasses.replace(self.camera(name), id=name) for name in self.names]
+        mountings = self.mountings.values()
+        return network_of_rig(
+            Path("rig"), cameras, [np.eye(3), *(one.rotation for one in mountings)],
+            [np.zeros(3), *(one.base for one in mountings)],
+        )  # fmt: skip
 
     @property
     def distance(self) -> float:

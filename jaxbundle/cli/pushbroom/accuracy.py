@@ -31,7 +31,9 @@ def accuracy(
         int, typer.Option(min=0, help="Monte Carlo draws, in addition to propagation")
     ] = 0,
     seed: int = 0,
-    grid: Annotated[str, typer.Option(help="LINESxPIXELS positions over the image")] = "11x11",
+    grid: Annotated[
+        str, typer.Option(help="LINESxPIXELS parts of the image, a row of the table each")
+    ] = "11x11",
     table: Annotated[
         str | None, choice(ATTITUDE_ERRORS, "tabulate a flight file, given as SCANNER")
     ] = None,
@@ -46,13 +48,21 @@ def accuracy(
     csv: Csv = None,
     json: Json = "",
 ) -> None:
-    """Ground RMS and CE90 for given σ of the ancillary data, or errors against a known truth."""
+    """Ground RMS and CE90 for given σ of the ancillary data, or errors against a known truth.
+
+    Of about a thousand irregular positions, so that none of them falls in step with the records.
+    """
     import numpy as np
 
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
-    from jaxbundle.cli.pushbroom.places import places
+    from jaxbundle.cli.pushbroom.places import grid_of
     from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, surface_of, write_rows
-    from jaxbundle.pushbroom.accuracy import ground_errors, propagate_accuracy, simulate_accuracy
+    from jaxbundle.pushbroom.accuracy import (
+        ground_errors,
+        propagate_accuracy,
+        simulate_accuracy,
+        spread_positions,
+    )
     from jaxbundle.pushbroom.noise import Noise
     from jaxbundle.pushbroom.terrain import Terrain
 
@@ -72,12 +82,26 @@ def accuracy(
         return
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
-    _, line, pixel, _ = places(file.image, None, grid)
-    columns = {"line": line, "pixel": pixel}
+    cells = grid_of(grid)
+    size = file.image.lines, file.image.pixels
+    spread = spread_positions(*size, cells)
+    line, pixel = (v.ravel() for v in spread)
+    row, column = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(cells, size))
+    columns = {"line": np.repeat(row, len(column)), "pixel": np.tile(column, len(row))}
+    by_cell = lambda values: np.asarray(values).reshape(len(row) * len(column), -1)
+    known = lambda values: np.isfinite(values).sum(1)
+    # a cell where every ray misses the surface has no mean
+    mean = lambda values: np.nansum(values, 1) / np.where(known(values) > 0, known(values), np.nan)
+    rms = lambda values: np.sqrt(mean(values**2))
     if truth is not None:
         errors = ground_errors(file.image, open_scanner(truth).image, surface, line, pixel)
         length = np.hypot(*errors.T)
-        columns |= {"east": errors[:, 0], "north": errors[:, 1], "error": length}
+        columns |= {
+            "east": mean(by_cell(errors[:, 0])), "north": mean(by_cell(errors[:, 1])),
+            "error": rms(by_cell(length)),
+        }  # fmt: skip
+        if not np.isfinite(length).any():
+            raise InputError("no ray meets the surface: check attitude, mounting and height")
         head = {"rms": float(np.sqrt(np.nanmean(length**2))),
                 "ce90": float(np.nanquantile(length, 0.9))}  # fmt: skip
     else:
@@ -91,14 +115,18 @@ def accuracy(
         if isinstance(surface, Terrain):
             raise InputError("--dem: use --height with σ; terrain has no reverse mode")
         found = propagate_accuracy(file.image, surface, line, pixel, noise)
-        columns |= {"rms": found.rms, "ce90": found.ce90}
+        columns |= {"rms": rms(by_cell(found.rms)), "ce90": mean(by_cell(found.ce90))}
         head = {"rms": found.overall, "ce90": found.overall_ce90}
         if draws:
             counted = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
-            columns |= {"drawn_rms": counted.rms, "drawn_ce90": counted.ce90}
+            columns |= {
+                "drawn_rms": rms(by_cell(counted.rms)),
+                "drawn_ce90": mean(by_cell(counted.ce90)),
+            }  # fmt: skip
             head |= {
                 "drawn_rms": counted.overall, "drawn_ce90": counted.overall_ce90, "draws": draws
             }  # fmt: skip
+    head["positions"] = len(line)
     if map_ is not None:
         _write_map(map_, columns, head)
     write_rows(columns, csv, json, {"scanner": file.name, **head})

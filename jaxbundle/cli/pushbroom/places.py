@@ -21,12 +21,7 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
     **Raises:** `InputError`.
     """
     if points is None:
-        try:
-            rows, columns = (int(n) for n in grid.lower().split("x"))
-            if min(rows, columns) < 1:
-                raise ValueError
-        except ValueError:
-            raise InputError(f"--grid {grid!r}: two numbers are expected, such as 11x11") from None
+        rows, columns = grid_of(grid)
         lines = np.repeat(np.linspace(0, image.lines - 1, rows), columns)
         pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
         return (), lines, pixels, Source("grid", None, "place")
@@ -35,6 +30,20 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
     line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
     ids = table.ids("id") if "id" in table.values else ()
     return ids, line, pixel, table.source
+
+
+def grid_of(grid: str) -> tuple[int, int]:
+    """The two numbers of LINESxPIXELS.
+
+    **Raises:** `InputError`.
+    """
+    try:
+        rows, columns = (int(n) for n in grid.lower().split("x"))
+        if min(rows, columns) < 1:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"--grid {grid!r}: two numbers are expected, such as 11x11") from None
+    return rows, columns
 
 
 def off_image(

@@ -39,6 +39,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import project
@@ -71,15 +72,32 @@ def is_opencv(path: Path) -> bool:
     return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in names)
 
 
-def read_opencv(path: str | Path) -> Camera:
-    """The camera of a file; its id is the name of the file.
+def read_entries(path: Path) -> dict[str, Any]:
+    """The entries of a YAML or JSON file."""
+    text = read_text(path)
+    is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
+    return _from_json(path, text) if is_json else parse_yaml(path, text, lenient=True)
+
+
+def matrix_in(
+    path: Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int]
+) -> Float[np.ndarray, "rows columns"]:
+    """A matrix by the first of these names.
+
+    **Raises:** `InputError` naming file and entry: missing, or of another shape."""
+    return _matrix(path, entries, names, shape)[1]
+
+
+def read_opencv(
+    path: str | Path, entries: Mapping[str, Any] | None = None, id: str | None = None
+) -> Camera:
+    """The camera of a file, or of some of its `entries`; its id is the name of the file, if none
+    is given.
 
     **Raises:** `InputError` naming the entry.
     """
     path = Path(path)
-    text = read_text(path)
-    is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
-    entries = _from_json(path, text) if is_json else parse_yaml(path, text, lenient=True)
+    entries = read_entries(path) if entries is None else entries
     name, K = _matrix(path, entries, MATRIX, (3, 3))
     for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
         if K[row, column] != wanted:
@@ -99,7 +117,7 @@ def read_opencv(path: str | Path) -> Camera:
     else:
         names = ORDER
     camera = Camera(
-        id=path.stem,
+        id=path.stem if id is None else id,
         model="kannala-brandt" if fisheye else "opencv",
         parameters={k: float(v) for k, v in parameters.items()} | dict(zip(names, coefficients)),
         image_size=_image_size(path, entries),
@@ -149,6 +167,19 @@ def opencv_text(camera: Camera, as_json: bool = False) -> str:
 
     **Raises:** `InputError` for another model.
     """
+    return file_text(opencv_entries(camera), as_json)
+
+
+def file_text(entries: Mapping[str, Any], as_json: bool = False) -> str:
+    """Entries as YAML or JSON of OpenCV's FileStorage; matrices are (rows, columns, numbers)."""
+    return _as_json(entries) if as_json else _as_yaml(entries)
+
+
+def opencv_entries(camera: Camera) -> dict[str, Any]:
+    """The entries of a camera of model `opencv` or `kannala-brandt`, as of `file_text`.
+
+    **Raises:** `InputError` for another model.
+    """
     if camera.model not in ("opencv", "kannala-brandt"):
         raise InputError(
             f"camera {camera.id!r}: OpenCV has no model {str(camera.model)!r}; convert it with "
@@ -166,7 +197,7 @@ def opencv_text(camera: Camera, as_json: bool = False) -> str:
     if fisheye:
         entries |= {"fisheye_model": 1, "distortion_model": "equidistant"}
     entries |= {"camera_matrix": (3, 3, K), "distortion_coefficients": (len(values), 1, values)}
-    return _as_json(entries) if as_json else _as_yaml(entries)
+    return entries
 
 
 def write_opencv(camera: Camera, path: str | Path) -> None:
@@ -175,8 +206,12 @@ def write_opencv(camera: Camera, path: str | Path) -> None:
     write_text(path, opencv_text(camera, path.suffix.lower() == ".json"))
 
 
-def ros_text(camera: Camera) -> str:
-    """The text of a camera_info file of ROS for a camera of model `opencv` or `kannala-brandt`.
+def ros_text(
+    camera: Camera, R: Float[np.ndarray, "3 3"] | None = None,
+    P: Float[np.ndarray, "3 4"] | None = None,
+) -> str:  # fmt: skip
+    """The text of a camera_info file of ROS for a camera of model `opencv` or `kannala-brandt`;
+    with the rectification R and projection P of a pair.
 
     **Raises:** `InputError` for another model, a thin prism, and without image size.
     """
@@ -187,11 +222,13 @@ def ros_text(camera: Camera) -> str:
     kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
     values = [p[name] for name in (names if fisheye or rational else names[:5])]
     K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
-    P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
+    turn = np.eye(3) if R is None else R
+    projection = np.c_[np.reshape(K, (3, 3)), np.zeros(3)] if P is None else P
     return _as_yaml({
         "image_width": w, "image_height": h, "camera_name": camera.id, "camera_matrix": (3, 3, K),
         "distortion_model": kind, "distortion_coefficients": (1, len(values), values),
-        "rectification_matrix": (3, 3, np.eye(3).ravel()), "projection_matrix": (3, 4, P),
+        "rectification_matrix": (3, 3, turn.ravel()),
+        "projection_matrix": (3, 4, projection.ravel()),
     }, ros=True)  # fmt: skip
 
 

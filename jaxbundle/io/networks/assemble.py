@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.geometry.pose_conventions import exterior_from_cv
 from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
+from jaxbundle.network.further import Rigs
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import (
     EXTERIOR,
@@ -26,6 +28,9 @@ from jaxbundle.network.tables import (
     Points,
     Source,
 )
+
+RIG, MOMENT = "rig", "0"
+"""The rig of a file of calibrated cameras, and its only epoch."""
 
 
 def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
@@ -91,6 +96,34 @@ def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
     )
     project = {"datum": "inner", "residuals": "measured", "object_unit": "model"}
     return _without_points(cameras, images, project).replace(warnings=())
+
+
+def rig_network(
+    path: Path,
+    cameras: Sequence[Camera],
+    R: Sequence[Float[np.ndarray, "3 3"]],
+    t: Sequence[Float[np.ndarray, "3"]],
+    overrides: Sequence[str] = (),
+    mounted: bool = True,
+    warnings: Iterable[str] = (),
+    unit: str = "m",
+) -> Network:
+    """Cameras with one image each, of the same names, taken at one moment by a rig (`mounted`).
+
+    `R`, `t`: x = R·X + t, the frame of a camera with x right, y down, z forward. Nothing can be
+    adjusted.
+    """
+    names = [camera.id for camera in cameras]
+    M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
+    source = Source(str(path), None, "camera")
+    network = assemble(
+        path, foreign_document(path.stem, map(entry_of, cameras), object_unit=unit), overrides,
+        image_columns(source, names, names, M, X0), warnings=warnings,
+    )  # fmt: skip
+    if not mounted:
+        return network
+    columns = {"rig": [RIG] * len(names), "epoch": [MOMENT] * len(names), "image": names}
+    return network.replace(further=(Rigs.of(Columns(columns, source), {}, 1.0),))
 
 
 def unique_labels(labels: Sequence[str], ids: Sequence) -> list[str]:

@@ -18,35 +18,32 @@
 Camera frames have x right, y down, z forward; the centre of the first pixel is (0, 0). A chain
 becomes one image per camera, taken at one moment by a rig: the first at the origin, looking
 along Z with Y down. Uncoupled cameras (no T_cn_cnm1) form no rig.
+A camera with more coefficients than radtan is fitted, with the difference in a message.
 The written mounting is that of the first moment with an image of every camera, or of the
 images if each camera has one. T_cam_imu and time shifts are not read.
 
 Source: Kalibr's wiki, "yaml formats", "Supported models".
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert import convert_camera
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
-from jaxbundle.io.networks.assemble import (
-    all_parameters,
-    assemble,
-    entry_of,
-    foreign_document,
-    image_columns,
-)
+from jaxbundle.geometry.pose_conventions import cv_pose
+from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.io.text.yaml_text import parse_yaml
-from jaxbundle.network.columns import Columns
 from jaxbundle.network.further import Rigs
-from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
 CORE = ("fx", "fy", "cx", "cy")
@@ -64,7 +61,6 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Our model, intrinsics and coefficients; the first of a model is written."""
 OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
-RIG, MOMENT = "rig", "0"
 
 
 def is_kalibr(path: Path) -> bool:
@@ -104,16 +100,8 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
               if any(fields.get(key) is not None for fields in chain.values())]  # fmt: skip
     if unread:
         told.append(f"not read: {', '.join(unread)}")
-    M, X0 = exterior_from_cv(*(np.stack(part) for part in zip(*poses)))
-    source = Source(str(path), None, "camera")
-    network = assemble(
-        path, foreign_document(path.stem, map(entry_of, cameras), object_unit="m"), overrides,
-        image_columns(source, list(chain), list(chain), M, X0), warnings=told,
-    )  # fmt: skip
-    if not mounted:
-        return network
-    columns = {"rig": [RIG] * len(chain), "epoch": [MOMENT] * len(chain), "image": list(chain)}
-    return network.replace(further=(Rigs.of(Columns(columns, source), {}, 1.0),))
+    turns, shifts = [R for R, _ in poses], [t for _, t in poses]
+    return rig_network(path, cameras, turns, shifts, overrides, bool(mounted), told)
 
 
 def _number(id: str) -> int:
@@ -147,9 +135,11 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    mountings, lost = _mountings(network)
+    mountings, lost = mountings_of(network)
     lines = []
-    for k, camera in enumerate(network.cameras):
+    for k, given in enumerate(network.cameras):
+        camera, said = _fit(given)
+        lost += said
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
         if mountings is not None and k:
             lines += ["  T_cn_cnm1:", *(f"  - {_list(row)}" for row in mountings[k - 1])]
@@ -162,6 +152,33 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
 def _list(values) -> str:
     return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _fit(camera: Camera) -> tuple[Camera, list[str]]:
+    """A camera with more coefficients than Kalibr's radtan as the nearest radtan or equi, and the
+    difference in words."""
+    p = all_parameters(camera)
+    more = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
+    if camera.model != "opencv" or not more:
+        return camera, []
+    size, found, refused = size_of(camera, "Kalibr"), [], ""
+    for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
+        try:
+            found.append(convert_camera(
+                get_model("opencv"), p, get_model(target), image_size=size, free=free
+            ))  # fmt: skip
+        except ValueError as error:
+            refused = refused or str(error)
+    if not found:
+        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(more)}: {refused}")
+    best = min(found, key=lambda one: one.rms)
+    message = (
+        f"{', '.join(more)} of camera {camera.id!r}, fitted as "
+        f"{'radtan' if best.model == 'opencv' else 'equi'} over the image: largest difference "
+        f"{best.largest:.3g} px, RMS {best.rms:.3g} px (none if the rig is calibrated without)"
+    )
+    made = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
+    return made, [message]
 
 
 def _camera_lines(camera: Camera, k: int) -> list[str]:
@@ -187,8 +204,9 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
     raise InputError(f"camera {camera.id!r}: Kalibr has no {rest}; adjust the camera without")
 
 
-def _mountings(network: Network) -> tuple[np.ndarray | None, list[str]]:
-    """T from each camera to the next [cameras − 1, 4, 4]; else None, and what is lost."""
+def mountings_of(network: Network) -> tuple[np.ndarray | None, list[str]]:
+    """T from the frame of each camera (x right, y down, z forward) to that of the next
+    [cameras − 1, 4, 4]; else None, and what is lost."""
     images, number = network.images, len(network.cameras)
     if number == 1:
         return None, ["orientations"] if len(images) > 1 else []

@@ -32,6 +32,7 @@ from jaxbundle.pushbroom.ancillary import (
     attitude_table,
     check_times,
     extrapolation_limit,
+    normalise_quaternions,
     position_table,
     warn_of_extrapolation,
 )
@@ -116,16 +117,16 @@ def _read_even_table(isd, lines):
         tables.append((t, isd.source(f"sensor_{key}")))
     warnings = [w for t, source in tables for w in warn_of_extrapolation(t, lines, source)]
     (t, rows), sources = zip(*tables)
-    R = _rotations(isd, "sensor_orientation", q)
+    R, lengths = _rotations(isd, "sensor_orientation", q)
     limits = extrapolation_limit(t), extrapolation_limit(rows)
-    return States(t, P, rows, R, limits, sources, tuple(warnings))
+    return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
 def _resample(isd, lines, interpolation):
     given = _times(isd, "instrument_position")
     _check_rows(isd, "instrument_position", given)
-    body_times, body = _turns(isd, "body_rotation")
-    pointing_times, pointing = _turns(isd, "instrument_pointing")
+    body_times, body, body_lengths = _turns(isd, "body_rotation")
+    pointing_times, pointing, pointing_lengths = _turns(isd, "instrument_pointing")
     tables = {"instrument_position": given, "instrument_pointing": pointing_times,
               "body_rotation": body_times}  # fmt: skip
     warnings = [
@@ -146,7 +147,8 @@ def _resample(isd, lines, interpolation):
         R = body(rows) * pointing(rows).inv()
     limits = extrapolation_limit(given), extrapolation_limit(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
-    return States(t, P, rows, R, limits, sources, tuple(warnings))
+    lengths = *body_lengths, *pointing_lengths
+    return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
 def _check_rows(isd, key, t):
@@ -174,9 +176,9 @@ def _times(isd, key):
 
 
 def _turns(isd, key):
-    """Times, and the rotation from J2000 into a frame as a function of times."""
+    """Times, the rotation from J2000 into a frame as a function of times, and warnings."""
     t = _times(isd, key)
-    R = _rotations(isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]])
+    R, lengths = _rotations(isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]])
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
     if not np.abs(fixed @ fixed.T - np.eye(3)).max() < ORTHOGONAL or np.linalg.det(fixed) < 0:
         raise InputError(
@@ -186,11 +188,13 @@ def _turns(isd, key):
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
         rate = isd.array(f"{key}.angular_velocities", (1, 3), np.zeros((1, 3)))[0]
-        return t, lambda at: constant * Rotation.from_rotvec(np.outer(at - t[0], rate)) * R[0]
-    return t, lambda at: constant * slerp(t, R, at)
+        turned = lambda at: constant * Rotation.from_rotvec(np.outer(at - t[0], rate)) * R[0]
+        return t, turned, lengths
+    return t, lambda at: constant * slerp(t, R, at), lengths
 
 
 def _rotations(isd, key, scalar_last):
-    if not len(scalar_last) or (np.abs(np.linalg.norm(scalar_last, axis=1) - 1) > 1e-4).any():
-        raise InputError(f"{isd.path}: {key}.quaternions must be unit quaternions")
-    return Rotation.from_quat(scalar_last)
+    if not len(scalar_last):
+        raise InputError(f"{isd.path}: {key}.quaternions is empty; a row for each time is expected")
+    values, lengths = normalise_quaternions(scalar_last, isd.source(f"{key}.quaternions"))
+    return Rotation.from_quat(values), lengths

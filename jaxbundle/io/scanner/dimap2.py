@@ -26,7 +26,7 @@ from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.ancillary import check_times, normalise_quaternions
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
@@ -60,7 +60,7 @@ def read_dimap2(file: XmlFields) -> Scanner:
     positions = Source(f"{path}, Point_List", None, "point")
     attitude = Source(f"{path}, Attitudes", None, "quaternion")
     last = period * (lines - 1)
-    rows, R = _attitudes(file, epoch, last, attitude)
+    rows, R, lengths = _attitudes(file, epoch, last, attitude)
     for times_of, source in ((t, positions), (rows, attitude)):
         if len(times_of) < 2:
             raise InputError(f"{source.name}: {len(times_of)} row; 2 at least")
@@ -77,7 +77,7 @@ def read_dimap2(file: XmlFields) -> Scanner:
         sources=(positions, attitude),
     )  # fmt: skip
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
-    return Scanner(name, image, WGS84, (*warnings, *told))
+    return Scanner(name, image, WGS84, (*lengths, *warnings, *told))
 
 
 def _period(file, lines, epoch):
@@ -113,7 +113,7 @@ def _attitudes(file, epoch, last, source):
         return _polynomial(file, epoch, last, source)
     key = f"{MODEL}/Attitudes/Quaternion_List/Quaternion"
     values = file.columns(key, ("Q0", "Q1", "Q2", "Q3"))
-    return file.times(key, epoch), _rotations(values, source)
+    return file.times(key, epoch), *_rotations(values, source)
 
 
 def _polynomial(file, epoch, last, source):
@@ -127,15 +127,12 @@ def _polynomial(file, epoch, last, source):
     rows = np.linspace(-MARGIN, last + MARGIN, ROWS)
     parts = [file.numbers(f"{key}/Q{k}/COEFFICIENTS") for k in range(4)]
     values = np.stack([np.polyval(c[::-1], (rows - offset) / scale) for c in parts], 1)
-    return rows, _rotations(values, source)
+    return rows, *_rotations(values, source)
 
 
 def _rotations(values, source):
-    length = np.linalg.norm(values, axis=1)
-    if (bad := ~(np.abs(length - 1) < 1e-2)).any():
-        row = int(bad.argmax())
-        raise InputError(f"{source(row)} has the length {length[row]:.6g}; 1 is expected")
-    return Rotation.from_quat(np.roll(values, -1, axis=1))
+    values, lengths = normalise_quaternions(values, source)
+    return Rotation.from_quat(np.roll(values, -1, axis=1)), lengths
 
 
 def _look_angles(file):

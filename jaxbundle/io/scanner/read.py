@@ -7,6 +7,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.dimap import read_dimap
 from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
+from jaxbundle.io.scanner.own_rpc import check_against_rpc
 from jaxbundle.io.scanner.pvl import read_support_data
 from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
@@ -20,14 +21,15 @@ WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 
 def read_scanner(path: str | Path) -> Scanner:
-    """The pushbroom image of a scanner file, `.toml`, or of a product.
+    """The pushbroom image of a scanner file, `.toml`, or of a product; one that has RPC too is
+    compared with them (`own_rpc`).
 
     **Raises:** `InputError` naming file, section and key, or table and line; also for unknown
     formats.
     """
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
-        return _read_product(path)
+        return check_against_rpc(_read_product(path), path)
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
     return _of_product(file, scanner) if "source" in scanner else scanner_of(file)
@@ -43,14 +45,14 @@ def _of_product(file: TomlFile, scanner: Section) -> Scanner:
                 "[corrections] can stand beside it"
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
-    found = _read_product(file.path.parent / scanner.text("source"), choice)
+    source = file.path.parent / scanner.text("source")
+    found = _read_product(source, choice)
     switches = file.section("corrections")
     corrections = {name: switches.switch(name) for name in switches.values}
-    corrections = found.image.corrections._replace(**corrections)
-    return dataclasses.replace(
-        found, name=scanner.text("name", found.name),
-        image=dataclasses.replace(found.image, corrections=corrections),
-    )  # fmt: skip
+    given = found.image.corrections._replace(**corrections)
+    image = dataclasses.replace(found.image, corrections=given)
+    found = dataclasses.replace(found, image=image, name=scanner.text("name", found.name))
+    return check_against_rpc(found, source, choose=not corrections)
 
 
 def _read_product(path: Path, interpolation: str | None = None) -> Scanner:

@@ -2,13 +2,12 @@
 
 | file | coefficients | centre of the first pixel |
 |---|---|---|
-| DIMAP 2 and 3, `.XML` | `Inverse_Model`, `GroundtoImage_Values` | `FIRST_ROW`, `FIRST_COL` |
+| DIMAP 2 and 3, `.XML` | `Inverse_Model`, `GroundtoImage_Values` | by product: `DIMAP_ORIGIN` |
 | DigitalGlobe, `.XML` | `RPB/IMAGE`, of RPC00B | (0, 0) |
 | OSSIM keyword list, `….geom` | `line_num_coeff_00`, …, of `polynomial_format` B | (0, 0) |
 
-The validity domain of a DIMAP file has the indices of the first pixel: 1 for Pléiades, 0 or 1
-for SPOT 6 and 7, 0.5 for Pléiades Neo (its coordinates begin at the corner of the pixel). The
-default is 1 (Pléiades User Guide, appendix C; GDAL takes FIRST_COL for both).
+The validity domain of a DIMAP file (FIRST_ROW, FIRST_COL) says where the coefficients hold. It may
+begin outside the image, at negative rows and columns, and does not number the pixels.
 """
 
 from pathlib import Path
@@ -24,7 +23,14 @@ AXES = {"line": "line", "sample": "samp", "longitude": "long", "latitude": "lat"
 FIELDS = {f"{axis}_{part}": (AXES[axis], part[:3]) for axis in ("line", "sample")
           for part in ("numerator", "denominator")}  # fmt: skip
 """Names of the four polynomials in the files: line, num."""
-VALIDITY = ("ImagetoGround_Validity_Domain", "Direct_Model_Validity_Domain")
+DIMAP_ORIGIN = {"PHR": 1.0, "PNEO": 0.0, "S6": 0.0, "S7": 0.0}
+"""Row and column of the centre of the first pixel in DIMAP's RPC, by the beginning of
+METADATA_PROFILE: Pléiades counts from 1 (Pléiades Imagery User Guide, appendix C), SPOT 6 and 7
+from 0 (SPOT 6 & SPOT 7 User Guide, appendix C.2.1; with it Ames Stereo Pipeline finds the rigorous
+model and the RPC of a SPOT product equal to 0.002 pixel, GDAL subtracts 1), Pléiades Neo from 0
+(support of the vendor, GDAL issue 5716)."""
+DIMAP_OTHER = {"Inverse_Model": 1.0, "GroundtoImage_Values": 0.0}
+"""The same for other profiles, by the name that DIMAP 2 and DIMAP 3 give the coefficients."""
 DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 
 
@@ -96,7 +102,7 @@ def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float
 
 def _from_dimap(file):
     inverse = next(
-        (n for n in ("GroundtoImage_Values", "Inverse_Model") if file.find(n) is not None), None
+        (n for n in DIMAP_OTHER if file.find(n) is not None), None
     )
     if inverse is None:
         raise file.missing("Inverse_Model")
@@ -104,9 +110,9 @@ def _from_dimap(file):
     for axis, name in AXES.items():
         for part, short in (("offset", "OFF"), ("scale", "SCALE")):
             values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
-    domain = next((n for n in VALIDITY if file.find(n) is not None), VALIDITY[0])
-    for axis, first in (("line", "FIRST_ROW"), ("sample", "FIRST_COL")):
-        values[f"{axis}_offset"] -= file.number(f"{domain}/{first}", 1.0)
+    profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
+    for axis in ("line", "sample"):
+        values[f"{axis}_offset"] -= DIMAP_ORIGIN.get(profile, DIMAP_OTHER[inverse])
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]
         values[field] = [file.number(f"{inverse}/{name}") for name in names]

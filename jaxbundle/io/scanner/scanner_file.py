@@ -67,7 +67,12 @@ from jaxbundle.io.text.sections import Section, TomlFile
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
-from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
+from jaxbundle.pushbroom.ancillary import (
+    attitude_table,
+    check_times,
+    normalise_quaternions,
+    position_table,
+)
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.interpolation import Table
@@ -106,7 +111,7 @@ def scanner_of(file: TomlFile) -> Scanner:
     check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
     position, positions = _position(file, earth)
-    attitude, attitudes = _attitude(file, earth)
+    attitude, attitudes, lengths = _attitude(file, earth)
     mounting = mounting_of(file)
     switches = file.section("corrections")
     corrections = Corrections(*(switches.switch(name) for name in Corrections._fields))
@@ -116,7 +121,7 @@ def scanner_of(file: TomlFile) -> Scanner:
         Trajectory(position, attitude), _times(file, lines), optics_of(file, pixels), lines, pixels,
         mounting, corrections, (positions, attitudes),
     )  # fmt: skip
-    return Scanner(scanner.text("name", file.path.stem), image, earth)
+    return Scanner(scanner.text("name", file.path.stem), image, earth, lengths)
 
 
 def _orientation(file: TomlFile) -> frames.EarthOrientation:
@@ -267,7 +272,10 @@ def _orbit(
     return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
 
 
-def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source]:
+def _attitude(
+    file: TomlFile, earth: Ellipsoid | None
+) -> tuple[Attitude, Source, tuple[str, ...]]:
+    """The attitudes, the source of their rows, warnings."""
     section = file.section("attitude")
     frame = _frame(section, earth, (*FRAMES, "orbit"))
     columns = section.table()
@@ -276,20 +284,22 @@ def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source
     columns.check_names(("t", *names))
     t = columns.numbers("t", required=True)
     values = np.stack([columns.numbers(n, required=True) for n in names], 1)
-    values = values if quaternions else file.radians * values
+    lengths: tuple[str, ...] = ()
+    if quaternions:
+        values, lengths = normalise_quaternions(values, columns.source)
+    else:
+        values = file.radians * values
     if frame in ("GCRF", "J2000", "TEME"):
         if not quaternions:
             raise InputError(f"{section.where}frame {frame} needs quaternions; give q0, q1, q2, q3")
         check_times(t, columns.source)
-        # other than unit quaternions are refused below, with their row
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
-        lengths = np.linalg.norm(values, axis=1, keepdims=True)
-        values = lengths * frames.turn_quaternions(R, values)
+        values = frames.turn_quaternions(R, values)
     attitude = attitude_table(
         t, values, **_options(section, "slerp" if quaternions else "linear"),
         reference="orbit" if frame == "orbit" else "earth", source=columns.source,
     )  # fmt: skip
-    return attitude, columns.source
+    return attitude, columns.source, lengths
 
 
 def optics_of(file: TomlFile, pixels: int) -> Optics:

@@ -13,9 +13,9 @@ EPH, ATT, GEO (the camera).
   detectors (DETPITCH) in millimetres; θ (DETROTANGLE) degrees; u the pixel, l the line, here both
   from 0 at the centres of the first.
 
-The attitude is that of the arriving light: aberration and light time are switched on together
-(one without the other gives an error of a metre). Refraction is off. Optical distortion, decreasing
-times, and products resampled to a map are refused.
+The attitude is that of the arriving light: light time, aberration and refraction are switched on,
+unless the RPC of the file say otherwise (`own_rpc`). Optical distortion, decreasing times, and
+products resampled to a map are refused.
 """
 
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.columns import show
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.ancillary import check_times, normalise_quaternions
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
@@ -39,7 +39,9 @@ from jaxbundle.pushbroom.scanner import LineTimes
 LEVELS = ("basic1b", "stereo1b")
 EPHEMERIS, ATTITUDE = 7, 5
 """Numbers of a row that are used: index, position, velocity; index, quaternion."""
-CORRECTIONS = Corrections(light_time=True, aberration=True)
+CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
+"""Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
+all three, to 0.7 m without refraction."""
 
 
 def read_worldview(file: XmlFields) -> Scanner:
@@ -62,15 +64,12 @@ def read_worldview(file: XmlFields) -> Scanner:
     times = _line_times(file, lines)
     t, P, _ = _table(file, "EPH", "EPHEMLIST", EPHEMERIS, epoch)
     rows, values, source = _table(file, "ATT", "ATTLIST", ATTITUDE, epoch)
-    length = np.linalg.norm(values, axis=1)
-    if (bad := ~(np.abs(length - 1) < 1e-4)).any():
-        raise InputError(f"{source(int(bad.argmax()))}: a unit quaternion is expected")
+    values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
-    lens = [file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)]
-    if not abs(np.linalg.norm(lens) - 1) < 1e-4:
-        raise InputError(f"{path}: QCS1 to QCS4 are not a unit quaternion, scalar last")
+    lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
+    (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
     x, y, warnings = _detectors(file)
     tables = Tables(
         t, P, rows, R * Rotation.from_quat(lens), Source(f"{path}, EPHEMLIST", None, "row"), source
@@ -85,7 +84,7 @@ def read_worldview(file: XmlFields) -> Scanner:
         sources=(tables.positions, tables.attitude),
     )  # fmt: skip
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return Scanner(name, image, WGS84, (*warnings, *told))
+    return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
 
 def _line_times(file, lines):

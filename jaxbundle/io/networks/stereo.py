@@ -1,0 +1,235 @@
+"""Two cameras on one mounting, in the forms of OpenCV and of ROS.
+
+    X₂ = R·X₁ + T        frames with x right, y down, z forward; a first pixel with its centre at 0
+
+**OpenCV** (`stereoCalibrate`, and its sample `stereo_calib`): one YAML or JSON file with M1, D1,
+M2, D2, R, T, and of the rectification R1, R2, P1, P2, Q.
+
+**ROS**: one `camera_info` file a camera. Its rectification_matrix Rₖ turns the camera into a frame
+common to both, and projection_matrix Pₖ projects from the frame of the first,
+
+    Xₖ' = Rₖ·Xₖ,    X₂' = X₁' + [P₁₄/P₁₁, P₂₄/P₂₂, 0]ᵀ of P₂,
+
+from which R and T follow: R = R₂ᵀ·R₁, T = R₂ᵀ·[P₁₄/P₁₁, P₂₄/P₂₂, 0]ᵀ.
+
+The rectified frame has one axis along the base, x, or y if the cameras are one above the other,
+and z as near as possible to the mean of both axes (Fusiello, Trucco and Verri, 2000, Machine Vision
+and Applications 12, 16–22). Both rectified cameras have the mean principal distance and the
+mean principal point.
+
+Source: OpenCV 4 documentation, calib3d; ROS, sensor_msgs/CameraInfo.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.opencv_file import (
+    SUFFIXES,
+    YAML,
+    file_text,
+    matrix_in,
+    opencv_entries,
+    read_entries,
+    read_opencv,
+    ros_text,
+)
+from jaxbundle.io.networks.assemble import all_parameters, rig_network
+from jaxbundle.io.networks.kalibr import mountings_of
+from jaxbundle.io.networks.losses import describe_losses, size_of
+from jaxbundle.io.networks.poses import check_rotations
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.network.further import Rigs
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.system.file_content import beginning
+
+ROS_FILES = ("*.yaml",)
+OF_A_FISHEYE = "fisheye_model", "distortion_model"
+NAMES = (("M1", "D1", "M2", "D2"), ("K1", "D1", "K2", "D2"),
+         ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
+         ("camera_matrix_1", "dist_coeffs_1", "camera_matrix_2", "dist_coeffs_2"))  # fmt: skip
+"""Names of matrices and coefficients; the first are written."""
+
+
+class Rectification(NamedTuple):
+    """Rotations of both cameras into the rectified frame, and their 3 × 4 projections."""
+
+    R1: Float[np.ndarray, "3 3"]
+    R2: Float[np.ndarray, "3 3"]
+    P1: Float[np.ndarray, "3 4"]
+    P2: Float[np.ndarray, "3 4"]
+
+    @property
+    def Q(self) -> Float[np.ndarray, "4 4"]:
+        """Of [x, y, disparity, 1] the homogeneous point in the first rectified frame."""
+        f, cx, cy = self.P1[0, 0], self.P1[0, 2], self.P1[1, 2]
+        base = np.abs(self.P2[:2, 3]).argmax()
+        return np.array([
+            [1, 0, 0, -cx], [0, 1, 0, -cy], [0, 0, 0, f], [0, 0, -f / self.P2[base, 3], 0],
+        ])  # fmt: skip
+
+
+def rectify(
+    cameras: Sequence[Camera], R: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "3"]
+) -> Rectification:
+    """The rectification of two cameras.
+
+    **Raises:** `InputError` for cameras at one position."""
+    length = float(np.linalg.norm(T))
+    if length == 0:
+        raise InputError("both cameras are at one position; expected a base between them")
+    base = -R.T @ T / length  # from the first to the second, in the first's frame
+    k = int(np.abs(base[:2]).argmax())  # the axis along the base, pointing as the camera's own
+    first = base * np.sign(base[k])
+    z = np.array([0, 0, 1.0]) + R[2]  # both optical axes, in the first's frame
+    z = z - (z @ first) * first
+    z = z / np.linalg.norm(z)
+    axes = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
+    R1 = np.stack([*axes, z])
+    R2 = R1 @ R.T
+    p = [all_parameters(camera) for camera in cameras]
+    f = np.mean([one[name] for one in p for name in ("fx", "fy")])
+    c = [np.mean([one[name] for one in p]) for name in ("cx", "cy")]
+    P1 = np.array([[f, 0, c[0], 0], [0, f, c[1], 0], [0, 0, 1, 0]])
+    P2 = P1.copy()
+    P2[:, 3] = P1[:, :3] @ np.where(np.arange(3) == k, R2 @ T, 0)
+    # the shift along z is zero, so that P[:, 3] has no part of the principal point
+    return Rectification(R1, R2, P1, P2)
+
+
+def _pair(network: Network, what: str):
+    """Both cameras, R, T, and what is lost."""
+    if len(network.cameras) != 2:
+        raise InputError(f"{what} holds two cameras, got {len(network.cameras)}")
+    mountings, lost = mountings_of(network)
+    if mountings is None:
+        raise InputError(
+            f"{what} holds the mounting of two cameras; a rig, or one image of each, is expected"
+        )
+    lost += [one for one in describe_losses(network, rays=True) if one != Rigs.TABLE]
+    lost += ["points"] if len(network.points) else []
+    return network.cameras, mountings[0, :3, :3], mountings[0, :3, 3], lost
+
+
+def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write two cameras and their mounting as OpenCV's stereo calibration.
+
+    **Returns:** messages about what the format cannot hold.
+
+    **Raises:** `InputError` for a network of other than two cameras, or without a mounting.
+    """
+    path = Path(path)
+    cameras, R, T, lost = _pair(network, "a stereo file of OpenCV")
+    kinds = {str(camera.model) for camera in cameras}
+    if len(kinds) > 1:
+        raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")
+    entries: dict = {}
+    for k, camera in enumerate(cameras, 1):
+        own = opencv_entries(camera)
+        names = NAMES[0][2 * k - 2 : 2 * k]
+        w, h = size_of(camera, "OpenCV")
+        entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
+        entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
+        entries |= {name: own[name] for name in OF_A_FISHEYE if name in own}
+    found = rectify(cameras, R, T)
+    entries |= {"R": (3, 3, R.ravel()), "T": (3, 1, T)}
+    entries |= {name: (*M.shape, M.ravel()) for name, M in found._asdict().items()}
+    entries |= {"Q": (4, 4, found.Q.ravel())}
+    write_text(path, file_text(entries, path.suffix.lower() == ".json"))
+    return tuple(lost)
+
+
+def is_opencv_stereo(path: Path) -> bool:
+    """Whether a YAML or JSON file has R, T and two camera matrices."""
+    text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
+    has = lambda name: re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) is not None
+    return has("R") and has("T") and any(has(row[0]) and has(row[2]) for row in NAMES)
+
+
+def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """Both cameras of a stereo file, on one mounting; nothing can be adjusted.
+
+    **Raises:** `InputError` naming file and entry.
+    """
+    path = Path(path)
+    entries = read_entries(path)
+    names = next((row for row in NAMES if row[0] in entries and row[2] in entries), NAMES[0])
+    cameras = []
+    for k in (1, 2):
+        matrix, coefficients = names[2 * k - 2 : 2 * k]
+        own = {name: entries[name] for name in OF_A_FISHEYE if name in entries}
+        for size in ("image_width", "image_height"):
+            if (value := entries.get(f"{size}_{k}", entries.get(size))) is not None:
+                own[size] = value
+        own |= {"camera_matrix": entries.get(matrix)}
+        if coefficients in entries:
+            own["distortion_coefficients"] = entries[coefficients]
+        id = entries.get(f"camera_name_{k}", ("left", "right")[k - 1])
+        cameras.append(read_opencv(path, own, str(id)))
+    R = matrix_in(path, entries, ("R",), (3, 3))
+    T = matrix_in(path, entries, ("T",), (3, 1))[:, 0]
+    check_rotations(R, f"{path}: R")
+    return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), T], overrides)
+
+
+def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
+    """Write two cameras as ROS's camera_info, NAME.yaml each, rectified with each other.
+
+    **Returns, raises:** as `write_opencv_stereo`.
+    """
+    cameras, R, T, lost = _pair(network, "a pair of ROS")
+    found = rectify(cameras, R, T)
+    texts = [ros_text(camera, *parts) for camera, parts in zip(
+        cameras, ((found.R1, found.P1), (found.R2, found.P2)))]  # fmt: skip
+    names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
+    if len({name.casefold() for name in names}) < 2:
+        raise InputError(f"{folder}: the names of the cameras give the same file {names[0]}.yaml")
+    folder.mkdir(exist_ok=True)
+    for name, text in zip(names, texts):
+        write_text(folder / f"{name}.yaml", text)
+    return tuple(lost)
+
+
+def is_ros_stereo(path: Path) -> bool:
+    """Whether a folder has two YAML files, each with a projection_matrix."""
+    files = _yaml_files(path) if path.is_dir() else []
+    return len(files) == 2 and all(b"projection_matrix" in beginning(p, 100_000) for p in files)
+
+
+def _yaml_files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in YAML)
+
+
+def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """Both cameras of a folder of camera_info files; the first is the one whose projection has no
+    shift. Nothing can be adjusted.
+
+    **Raises:** `InputError` naming file and entry.
+    """
+    path = Path(path)
+    parts = []
+    for file in _yaml_files(path):
+        entries = read_entries(file)
+        R = matrix_in(file, entries, ("rectification_matrix", "R"), (3, 3))
+        P = matrix_in(file, entries, ("projection_matrix", "P"), (3, 4))
+        check_rotations(R, f"{file}: rectification_matrix")
+        if P[0, 0] == 0 or P[1, 1] == 0:
+            raise InputError(f"{file}: projection_matrix has no focal length")
+        shift = np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0])
+        name = entries.get("camera_name")
+        parts.append((read_opencv(file, entries, str(name or file.stem)), R, shift))
+    parts.sort(key=lambda part: bool(part[2].any()))
+    (left, R1, none), (right, R2, shift) = parts
+    if none.any() or not shift.any():
+        raise InputError(
+            f"{path}: expected the projection_matrix of one camera with and of the other without "
+            f"a shift in its last column, got {'two' if none.any() else 'none'} with"
+        )
+    return rig_network(
+        path, [left, right], [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift], overrides
+    )

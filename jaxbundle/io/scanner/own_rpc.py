@@ -1,0 +1,119 @@
+"""The RPC that belong to a product with a rigorous model, and whether both agree.
+
+| product | RPC |
+|---|---|
+| DigitalGlobe XML | `RPB` in the same file |
+| DigitalGlobe `NAME.IMD` | `NAME.RPB` beside it |
+| DIMAP 2 and 3, `DIM_NAME.XML` | `RPC_NAME.XML` beside it |
+
+Which corrections the attitudes leave to the reader differs between products of one vendor (a later
+processing may contain them). So those usual for the product are used if they agree with the RPC
+within half a pixel, or within the random error that the file states (ERRRAND, metres per axis);
+else those that do. The difference is reported whenever none agree, or others than usual are used.
+"""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.rpc import read_rpc
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.rpc_agreement import (
+    CORRECTION_SETS,
+    SUBPIXEL,
+    Agreement,
+    compare_with_rpc,
+)
+
+RANDOM_ERROR = re.compile(r"(?i)<ERRRAND>\s*([-+.\de]+)|\berrRand\s*=\s*([-+.\de]+)")
+
+
+def check_against_rpc(scanner: Scanner, path: Path, choose: bool = True) -> Scanner:
+    """The image of a product, compared with its RPC if there are any: with corrections that agree
+    and a warning if they are not the usual ones (`choose`), and a warning if none agree."""
+    file = _rpc_file(path)
+    if file is None:
+        return scanner
+    try:
+        rpc, random_error = read_rpc(file), _random_error(file)
+    except InputError as error:
+        return _warn(scanner, f"not compared with its RPC: {error}")
+    image = scanner.image
+    usual = _compare(image, rpc, (image.corrections,))[0]
+    if _agree(usual, random_error):
+        return scanner
+    if not np.isfinite(usual.rms):
+        return _warn(scanner, f"{path}: no position could be compared with the RPC of {file.name}")
+    if choose:
+        found = _compare(image, rpc, CORRECTION_SETS)
+        best = min(range(len(found)), key=lambda k: np.nan_to_num(found[k].rms, nan=np.inf))
+        if _agree(found[best], random_error):
+            chosen = CORRECTION_SETS[best]
+            message = (
+                f"{path}: {_names(chosen)} applied, with which the rigorous model agrees with the "
+                f"RPC of {file.name} ({_size(found[best])}); with those usual for this product, "
+                f"{_names(image.corrections)}, it does not ({_size(usual)}). [corrections] in a "
+                "scanner file sets others"
+            )
+            image = dataclasses.replace(image, corrections=chosen)
+            return _warn(dataclasses.replace(scanner, image=image), message)
+    return _warn(
+        scanner,
+        f"{path}: the rigorous model, with {_names(image.corrections)}, and the RPC of {file.name} "
+        f"differ by more than their accuracy explains: {_size(usual)}. Check [corrections] and the "
+        "origin of lines and pixels, or use the RPC",
+    )
+
+
+def _rpc_file(path: Path) -> Path | None:
+    suffix, stem = path.suffix.lower(), path.stem
+    if suffix == ".imd":
+        return next((p for p in path.parent.glob(f"{_plain(stem)}.*")
+                     if p.suffix.lower() == ".rpb" and p.stem == stem), None)  # fmt: skip
+    if stem.upper().startswith("DIM_"):
+        file = path.with_name(f"RPC_{path.name[4:]}")
+        return file if file.is_file() else None
+    if suffix == ".xml" and "<RPB>" in read_text(path, fallback="latin-1"):
+        return path
+    return None
+
+
+def _plain(name):
+    """A name without the signs that a pattern of file names has."""
+    return re.sub(r"([\[*?])", r"[\1]", name)
+
+
+def _random_error(file):
+    """σ of the positions per axis, metres; 0 if the file has none (DigitalGlobe writes −1)."""
+    match = RANDOM_ERROR.search(read_text(file, fallback="latin-1"))
+    return max(float(match[1] or match[2]), 0.0) if match else 0.0
+
+
+def _compare(image, rpc, sets) -> list[Agreement]:
+    with np.errstate(invalid="ignore"):
+        return compare_with_rpc(image, rpc, sets)
+
+
+def _agree(found: Agreement, random_error: float) -> bool:
+    # two axes
+    return found.rms_pixels <= SUBPIXEL or found.rms <= np.sqrt(2) * random_error
+
+
+def _size(found: Agreement) -> str:
+    return f"{found.rms:.2g} m RMS, {found.rms_pixels:.2g} pixel; {found.largest:.2g} m at most"
+
+
+def _names(corrections: Corrections) -> str:
+    on = [name.replace("_", " ") for name, is_on in corrections._asdict().items() if is_on]
+    if not on:
+        return "no correction"
+    return on[0] if len(on) == 1 else f"{', '.join(on[:-1])} and {on[-1]}"
+
+
+def _warn(scanner: Scanner, message: str) -> Scanner:
+    return dataclasses.replace(scanner, warnings=(*scanner.warnings, message))

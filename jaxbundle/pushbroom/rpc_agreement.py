@@ -1,0 +1,84 @@
+"""How well a line scanner image agrees with rational polynomials of the same image.
+
+A product that has both is a check of its reader: the polynomials were fitted to the vendor's own
+rigorous model, corrections included, and follow it to a fraction of a pixel.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.pushbroom.locate import ground_point
+from jaxbundle.pushbroom.rpc import Rpc, project
+from jaxbundle.pushbroom.scanner import slopes_of
+from jaxbundle.pushbroom.surfaces import Height
+
+SIDE = 5
+"""Positions along the lines and along the pixels of an image."""
+LEVELS = -0.5, 0.0, 0.5
+"""Heights, in height scales from the height offset: well inside the domain of the polynomials."""
+SUBPIXEL = 0.5
+"""Polynomials fitted to a smooth model follow it within this many pixels; with pixels counted from
+another origin they differ by at least as much."""
+CORRECTION_SETS = tuple(
+    Corrections(motion, motion, refraction)
+    for motion, refraction in product((True, False), repeat=2)
+)
+"""What attitudes and polynomials of products leave to the reader. Light time and aberration go
+together: both come from the motion of camera and ground."""
+
+
+class Agreement(NamedTuple):
+    """Distances of the positions of the rigorous model and of the polynomials, over image and
+    heights: RMS and the largest on the ground, metres, RMS in the image, pixels."""
+
+    rms: float
+    largest: float
+    rms_pixels: float
+
+
+def compare_with_rpc(
+    image: PushbroomImage, rpc: Rpc, sets: tuple[Corrections, ...]
+) -> list[Agreement]:
+    """Compare an image with polynomials at 5 × 5 positions and three heights, for several sets of
+    corrections instead of its own.
+
+    The image is in an Earth-fixed frame of WGS84. Each point of the rigorous model is projected by
+    the polynomials; its misclosure in lines and pixels, times the ground between neighbouring
+    lines and pixels, is the distance on the ground. NaN if no position has a point.
+    """
+    corner = (np.linspace(0, max(n - 2, 0), SIDE) for n in (image.lines, image.pixels))
+    height = float(rpc.height_offset) + float(rpc.height_scale) * np.array(LEVELS)
+    line, pixel, h = (v.ravel() for v in np.meshgrid(*corner, height, indexing="ij"))
+    # each position, the next line, the next pixel
+    lines = np.concatenate([line, line + 1, line])
+    pixels = np.concatenate([pixel, pixel, pixel + 1])
+    sights = _poses(image, lines), slopes_of(image.optics, pixels), np.tile(h, 3)
+    found = []
+    for corrections in sets:
+        # without `jit`: a program of two hundred points would be compiled for each set
+        point = lambda pose, slopes, h, on=corrections: (
+            ground_point(pose, slopes, Height(level=h, earth=WGS84), on)
+        )  # fmt: skip
+        here, along, across = np.split(np.stack(jax.vmap(point)(*sights)), 3, axis=1)
+        seen = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*here)
+        off = np.stack([np.asarray(seen[0]) - line, np.asarray(seen[1]) - pixel])
+        ground = np.linalg.norm(off[0] * (along - here) + off[1] * (across - here), axis=0)
+        off = np.hypot(*off)
+        known = np.isfinite(ground)
+        rms = lambda values, known=known: float(np.sqrt(np.mean(values[known] ** 2)))
+        found.append(
+            Agreement(rms(ground), float(ground[known].max()), rms(off))
+            if known.any() else Agreement(np.nan, np.nan, np.nan)
+        )  # fmt: skip
+    return found
+
+
+@jax.jit
+def _poses(image, lines):
+    return jax.vmap(lambda line: pose_at(image, image.times.time(line)))(lines)

@@ -1,0 +1,145 @@
+"""Products with a rigorous model and RPC: both are compared when they are read."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from pushbroom_scenes import LINES, PERIOD
+from test_rpc_products import digitalglobe
+from test_rpc_products import dimap as dimap_rpc
+from test_xml_products import dimap, worldview
+
+from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.pushbroom import rpc as polynomials
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.rpc_fit import fit_rpc, image_table
+from jaxbundle.pushbroom.surfaces import Height
+
+FOLDER = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "satellite"
+real = pytest.mark.skipif(not FOLDER.is_dir(), reason="../shared/data/real/satellite is not here")
+HEIGHTS = np.linspace(0.0, 1000.0, 4)
+locate = jax.jit(locate_points)
+ground = jax.jit(jax.vmap(polynomials.locate, (None, 0, 0, None)))
+
+
+def scene():
+    """Lines of 1 m: 0.1 s in all, smooth enough for polynomials."""
+    last = f"{LINES} {LINES * PERIOD / 40!r}"
+    return worldview(tlc=f"<TLCLIST>0 0</TLCLIST><TLCLIST>{last}</TLCLIST>")
+
+
+def moved(rpc, lines):
+    return eqx.tree_at(lambda r: r.line_offset, rpc, rpc.line_offset + lines)
+
+
+@pytest.fixture(scope="module")
+def uncorrected(tmp_path_factory):
+    """RPC fitted to the rigorous model of a WorldView file without corrections."""
+    folder = tmp_path_factory.mktemp("worldview")
+    (folder / "image.xml").write_text(scene())
+    (folder / "plain.toml").write_text(
+        '[scanner]\nsource = "image.xml"\n[corrections]\nlight_time = false\naberration = false\n'
+        "refraction = false\n"
+    )
+    image = read_scanner(folder / "plain.toml").image
+    return fit_rpc(image_table(image, WGS84, HEIGHTS, (9, 9))).rpc
+
+
+def with_rpc(folder, rpc, error=0.1):
+    inner = digitalglobe(rpc).removeprefix("<isd>").removesuffix("</isd>")
+    inner = inner.replace("<IMAGE>", f"<IMAGE><ERRBIAS>3.0</ERRBIAS><ERRRAND>{error}</ERRRAND>")
+    path = folder / "image.xml"
+    path.write_text(scene().replace("</isd>", f"{inner}</isd>"))
+    return path
+
+
+def test_corrections_are_those_that_agree_with_the_rpc(tmp_path, uncorrected):
+    found = read_scanner(with_rpc(tmp_path, uncorrected))
+    assert found.image.corrections == Corrections()
+    (said,) = found.warnings
+    assert "image.xml: no correction applied" in said and "light time, aberration and refr" in said
+
+
+def test_corrections_that_are_given_are_kept_and_the_difference_is_said(tmp_path, uncorrected):
+    """Aberration moves the ground by ρ·v/c: 600 km, 7.5 km/s."""
+    with_rpc(tmp_path, uncorrected)
+    path = tmp_path / "given.toml"
+    path.write_text('[scanner]\nsource = "image.xml"\n[corrections]\nrefraction = false\n')
+    found = read_scanner(path)
+    assert found.image.corrections == (True, True, False)
+    (said,) = found.warnings
+    assert "differ by more than their accuracy explains" in said and "[corrections]" in said
+    assert 12 < float(said.partition("explains: ")[2].split()[0]) < 18
+    assert read_scanner(with_rpc(tmp_path, uncorrected, 20.0)).warnings == ()
+
+
+@pytest.mark.parametrize("shift, expected", [(0.0, None), (1.0, "origin of lines and pixels")])
+def test_files_beside_each_other(tmp_path, shift, expected):
+    """DIM_….XML with RPC_….XML, whose pixels may be counted from another origin."""
+    path = tmp_path / "DIM_PHR.XML"
+    path.write_text(dimap(), encoding="latin-1")
+    image = read_scanner(path).image
+    rpc = fit_rpc(image_table(image, WGS84, HEIGHTS, (9, 9))).rpc
+    (tmp_path / "RPC_PHR.XML").write_text(dimap_rpc(moved(rpc, shift), domain=(-30, 5)))
+    found = read_scanner(path)
+    assert found.image.corrections == Corrections()
+    if expected is None:
+        assert found.warnings == ()
+    else:
+        (said,) = found.warnings
+        assert expected in said and "RPC_PHR.XML" in said and " 1 pixel" in said
+
+
+def test_damaged_rpc_do_not_prevent_reading(tmp_path, uncorrected):
+    path = with_rpc(tmp_path, uncorrected)
+    path.write_text(path.read_text().replace("<LATSCALE>", "<LATSCALE>x"))
+    found = read_scanner(path)
+    (said,) = found.warnings
+    assert "not compared with its RPC" in said and "LATSCALE" in said
+    write_rpc(tmp_path / "image_RPC.TXT", uncorrected)  # of another name: not looked for
+    path.write_text(scene())
+    assert read_scanner(path).warnings == ()
+
+
+def distances(name):
+    """Metres on the ground between the model as it is read and the RPC of a file, at the height of
+    the latter, and the warnings."""
+    found, rpc = read_scanner(FOLDER / name), read_rpc(FOLDER / name)
+    line, pixel = (np.linspace(0, n - 1, 9) for n in (found.image.lines, found.image.pixels))
+    places = [v.ravel() for v in np.meshgrid(line, pixel)]
+    height = float(rpc.height_offset)
+    X = locate(found.image, Height(height, WGS84), *places)
+    longitude, latitude, _ = ground(rpc, *places, height)
+    here = geodetic(WGS84, tuple(np.asarray(X)))
+    east = (np.asarray(here[0]) - longitude) * np.cos(latitude) * WGS84.a
+    return np.hypot(east, (np.asarray(here[1]) - latitude) * WGS84.a), found
+
+
+@real
+def test_states_adjusted_by_another_program_are_read():
+    """Lengths of quaternions from 0.99992 to 1.00029."""
+    found = read_scanner(FOLDER / "jitter_solved_a.adjusted_state.json")
+    (said,) = found.warnings
+    assert "0.999920 to 1.000286" in said and "normalised" in said
+
+
+@real
+def test_worldview_1_agrees_with_its_rpc():
+    """With all corrections to centimetres (17 m apart without them): the origin of lines and pixels
+    and the refraction are those of the vendor."""
+    off, found = distances("wv01.xml")
+    assert found.image.corrections == (True, True, True) and found.warnings == ()
+    assert off.max() < 0.1
+
+
+@real
+def test_worldview_3_agrees_with_its_rpc():
+    """Its attitudes contain the corrections; 18 m apart with those of WorldView-1."""
+    off, found = distances("wv03_a.xml")
+    assert found.image.corrections == Corrections() and len(found.warnings) == 1
+    assert np.sqrt(np.mean(off**2)) < 0.4
