@@ -137,9 +137,8 @@ def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]
     """The points, with those at any distance that drifted to or beyond infinity put at infinity."""
     network, X = problem.network, np.asarray(values.point)
     seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
-    in_camera = np.column_stack([seen.xy, -np.ones(len(seen.xy))])
     M = matrices_of_quaternions(np.asarray(values.rotation))[seen.image]
-    ray = np.einsum("nij,ni->nj", M, in_camera)
+    ray = np.einsum("nij,ni->nj", M, seen.ray)
     depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)

@@ -15,6 +15,7 @@ from which little grows is replaced by the next.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -42,7 +43,7 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
-from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
+from jaxbundle.orientation.sights import TOLERANCE, Sights, in_plane, sights
 from jaxbundle.types import Index
 
 FEWEST_COMMON = 6
@@ -266,10 +267,10 @@ def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
     new, linked = ~model.placed, bool(model.placed.any())
     old = _neighbours(seen, new) & model.placed
     best, most = None, 0
-    for image, other, M, b in _good_pairs(seen, new | old, old, linked):
+    for image, other, first, second, b in _good_pairs(seen, new | old, old, linked):
         part = Model.empty(seen)
-        part.place(image, np.zeros(3), np.eye(3))
-        part.place(other, b, M)
+        part.place(image, np.zeros(3), first)
+        part.place(other, b, second)
         grow(seen, part, new | old, improve)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
@@ -288,18 +289,23 @@ def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.nd
 
 
 def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
-    """Pairs and their relative orientations, the most promising first; `linked`: of an old image
-    and another."""
+    """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
+    of an old image and another."""
     pairs, common = _pairs_in_common(seen, among, old, linked)
     if not len(pairs):
         return
-    xy = [_common_points(seen, *pair) for pair in pairs]
+    turned = [_common_points(seen, *pair) for pair in pairs]
+    enough = [len(xy) >= FEWEST_COMMON for *_, xy, _ in turned]
+    turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
+    if not turned:
+        return
+    R, Q, xy, other_xy = zip(*turned)
     tolerance = seen.tolerance[pairs].mean(1)
-    M, b, part, angle = many.orient_pairs([a for a, _ in xy], [b for _, b in xy], tolerance)
+    M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
     worth = np.sqrt(common) * part * np.minimum(angle, WIDE_ANGLE)
     usable = (part >= AGREEING_SHARE) & (angle > FOR_OTHERS.angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
-        yield *pairs[k], M[k], b[k]
+        yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
 
 
 def _pairs_in_common(seen: Sights, among, old, linked):
@@ -329,9 +335,12 @@ def _all_pairs(seen: Sights, among):
 
 
 def _common_points(seen: Sights, image: Index, other: Index):
+    """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
     one, two = seen.of(image), seen.of(other)
     _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
-    return seen.xy[one][k], seen.xy[two][l]
+    (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
+    there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
+    return R, Q, xy[there], other_xy[there]
 
 
 def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriented:

@@ -103,9 +103,10 @@ def _blunders(adjustment) -> Finding:
     limit = critical_value(adjustment)
     over = int((tau > limit).sum())
     expected = 0.001 * len(tau)
+    largest = significant(np.fmax.reduce(tau, initial=np.nan))
     words = (
         f"{over} of {count(len(tau), 'observation')} over the critical value {significant(limit)} "
-        f"of |τ| at 0.1 % (by chance about {expected:.2g}); largest {significant(np.fmax.reduce(tau, initial=np.nan))}"
+        f"of |τ| at 0.1 % (by chance about {expected:.2g}); largest {largest}"
     )
     removed, suspects = len(adjustment.removed), len(adjustment.suspects)
     if removed or suspects:
