@@ -3,18 +3,30 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
-from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_infinity
+from jaxbundle.bundle.exclusions import (
+    Undetermined,
+    carry,
+    find_undetermined,
+    may_be_undetermined,
+    take_back,
+)
+from jaxbundle.bundle.far_points import (
+    join_legs,
+    minimise_at_any_distance,
+    minimise_with_infinity,
+    noise_of_rays,
+)
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
     inspect_solution,
     is_misjudged,
+    minimise,
     name_inseparable,
     names_of_defects,
     start_with,
@@ -35,12 +47,14 @@ from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.quality.snooping import check_test
+from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import Camera, Network, require_network
-from jaxbundle.network.unit_mistakes import name_pixels
+from jaxbundle.network.tables import Network, require_network
+from jaxbundle.network.unit_mistakes import name_pixels, name_sigma_unit
 from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
@@ -49,10 +63,17 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_robust
 from jaxbundle.types import present
 
+LARGEST_START_MISFIT = 0.1
+"""Radians, RMS: no start values in the right convention predict image points so badly that an
+adjustment from them settles by itself."""
 MISFIT = 5.0
 """For a larger σ0, likely causes are searched for."""
-Begun = tuple[Problem, Minimum, tuple]
-"""A problem, where its iterations ended, check points and their image points."""
+EVALUATIONS_BEFORE_A_LOOK = 6
+"""Evaluations before points that rays may not determine are looked for: the images are then nearly
+where they end, and such points have not yet slowed them."""
+MOST_RETRIES = 5
+"""Repeated adjustments with what start values excluded: each brings back what agrees with a better
+orientation, most of it the first."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
 """Name of the undetermined if no single unknown dominates."""
 
@@ -114,10 +135,10 @@ def adjust(
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
     given = require_network(network)
-    network, finding = _with_start_values(given)
+    oriented = _place(orient(given)) if lacks_start_values(given) else None
     options = {"search": SEARCHES[method], "max_steps": max_iterations + 1, "progress": progress}
-    first = _First(reduction, also, finding, options)
-    problem, minimum, check = first.find(given, network, outliers=bool(robust or snooping))
+    first = _First(reduction, also, oriented, options)
+    problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **options)
     found = _Found(problem.network, problem.with_factor(), minimum, method, problem.reduction)
     if robust:
@@ -134,16 +155,17 @@ def adjust(
 
 @dataclasses.dataclass(frozen=True)
 class _First:
-    """How the first minimum is found; `finding`: the message about computed start values."""
+    """How the first minimum is found; `oriented`: computed start values, if they were needed."""
 
     reduction: str | None
     also: Sequence[Table | Observations]
-    finding: str
+    oriented: Oriented | None
     options: Mapping[str, Any]
 
-    def find(self, given: Network, network: Network, outliers: bool) -> Begun:
-        """Adjust from the start values of `network`, a part of `given` that may contain
-        `outliers`."""
+    def find(self, given: Network, outliers: bool) -> tuple[Problem, Minimum, tuple]:
+        """Adjust from the start values of `given`, which may contain `outliers`, or those computed
+        for it: the problem, where its iterations ended, check points and their image points."""
+        network = given if self.oriented is None else self.oriented.network
         found = self._minimise(network)
         while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
             # Observations excluded by a wrong principal distance may agree with the adjusted one.
@@ -151,24 +173,98 @@ class _First:
             network = orient_again(given, fewer, cameras)
             if network is fewer:
                 break
-            found = self._minimise(network, cameras)
+            found = self._minimise(network, partial(start_with, cameras=cameras))
         if outliers and not inspect_solution(found[0].with_factor(), found[1]):
             screened = screen(network)
             if len(screened.observations) < len(network.observations):
-                found = self._minimise(screened)
-        return found
+                found, network = self._minimise(screened), screened
+        left_out = network is not given and network.left_out[len(given.left_out) :]
+        return self._try_again(given, found) if left_out or found[3] else found[:3]
+
+    def _try_again(self, given: Network, found) -> tuple[Problem, Minimum, tuple]:
+        """Adjust again, with everything left out because of start values that agrees with the
+        adjusted orientation, until nothing more does."""
+        if self.oriented is not None:
+            said = (f"start values found, {self.oriented.frame}", self.oriented.finding)
+            given = given.warn(*filter(None, said))
+        rounds, final = 0, Undetermined()
+        while inspect_solution(found[0].with_factor(), found[1]):
+            problem, minimum, check, gone, current = found
+            if rounds:  # Here they were left out at the end of an adjustment with them.
+                final += gone
+            part, factor = final.leave_out(given), _noise_factor(problem, minimum)
+            try:
+                whole = take_back(part, current, problem, minimum.values, factor)
+                whole = check_network(whole)
+                gained = len(whole.observations) - len(current.observations)
+                if gained <= 0 or rounds == MOST_RETRIES:
+                    if gained > 0:
+                        whole = whole.warn(
+                            f"{count(gained, 'image point')} left out because of start values "
+                            f"would still come back after {rounds} repeated adjustments"
+                        )
+                    network = problem.network.replace(
+                        warnings=whole.warnings, left_out=whole.left_out
+                    )
+                    return dataclasses.replace(problem, network=network), minimum, check
+                carried = partial(carry, before=problem, values=minimum.values)
+                again = self._minimise(whole, carried, look=False)
+                solved = inspect_solution(again[0].with_factor(), again[1])
+            except (InputError, NotSolvedError):
+                solved = None
+            if not solved:
+                network = problem.network.warn(
+                    "what start values excluded was tried again with the adjusted orientation, "
+                    "but with it there is no solution"
+                )
+                return dataclasses.replace(problem, network=network), minimum, check
+            found, rounds = again, rounds + 1
+        return found[:3]
 
     def _minimise(
-        self, network: Network, cameras: Mapping[str, Camera] = MappingProxyType({})
-    ) -> Begun:
-        network, *check = split_check_points(check_network(network))
-        make = partial(make_problem, network, reduction=self.reduction, also=self.also)
-        try:
-            problem = make()
-        except InputError as error:  # The datum, if control points were excluded.
-            raise InputError(f"{error} {self.finding}".strip()) from None
-        start = start_with(problem, cameras)
-        return *minimise_at_any_distance(problem, start, make, **self.options), tuple(check)
+        self, network: Network, begin: Callable[[Problem], Values] | None = None, look: bool = True
+    ) -> tuple[Problem, Minimum, tuple, Undetermined, Network]:
+        """The minimum of a network without what its rays do not determine, the check points, what
+        was left out, and the network with its check points; `look`: also before the minimum."""
+        gone, factor = Undetermined(), None
+        while True:
+            current = check_network(gone.leave_out(network))
+            used, *check = split_check_points(current)
+            make = partial(make_problem, used, reduction=self.reduction, also=self.also)
+            try:
+                problem = make()
+            except InputError as error:  # The datum, if control points were excluded.
+                finding = "" if self.oriented is None else self.oriented.finding
+                raise InputError(f"{error} {finding}".strip()) from None
+            start = problem.data.start if begin is None else begin(problem)
+            legs, left = [], self.options["max_steps"]
+            find = partial(self._find_more, network, gone)
+            more = find(problem, start, factor) if look else Undetermined()
+            if not more and look and may_be_undetermined(problem, start):
+                options = {**self.options, "max_steps": min(EVALUATIONS_BEFORE_A_LOOK, left)}
+                legs, look = [minimise(problem, start, **options)], False
+                left -= int(legs[0].iterations)
+                factor, start = _noise_factor(problem, legs[0]), legs[0].values
+                more = find(problem, start, factor)
+                begin = partial(carry, before=problem, values=start)
+            if not more:
+                found = problem
+                if left > 0:
+                    options = {**self.options, "max_steps": left}
+                    found, last = minimise_at_any_distance(problem, start, make, **options)
+                    legs.append(last)
+                minimum = join_legs(legs)
+                factor = _noise_factor(found, minimum)
+                more = find(found, minimum.values, factor)
+                begin = partial(carry, before=found, values=minimum.values)
+                if not more:
+                    return found, minimum, tuple(check), gone, current
+            gone += more
+
+    @staticmethod
+    def _find_more(network: Network, gone: Undetermined, *where) -> Undetermined:
+        more = find_undetermined(*where)
+        return more if (gone + more).spares_most_of(network) else Undetermined()
 
 
 @dataclasses.dataclass
@@ -272,10 +368,17 @@ def _likely_causes(
     accepted = np.asarray(minimum.history.accepted)[:tried]
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
-        return ()
+        # Settled far from its start, it may be a mirror image; or σ is in a larger unit.
+        start = np.sqrt(2 * np.asarray(minimum.history.cost)[0] / problem.counts.observations)
+        far = start * noise_of_rays(problem) > LARGEST_START_MISFIT
+        sigma0 = _sigma0(problem, minimum)
+        causes = name_image_convention(network) if far else "", name_sigma_unit(network, sigma0)
+        return tuple(filter(None, causes))
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     causes = (
-        name_pixels(network), name_angle_unit(network),
+        name_pixels(network), name_angle_unit(network), name_image_convention(network),
+        name_image_extent(network),
+        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
         "" if told else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
@@ -283,16 +386,23 @@ def _likely_causes(
     return tuple(filter(None, causes))
 
 
-def _with_start_values(network: Network) -> tuple[Network, str]:
-    """The network with missing start values computed, and the message about them."""
-    if not lacks_start_values(network):
-        return network, ""
-    found = orient(network)
-    return _place(found), found.finding
+def _noise_factor(problem: Problem, minimum: Minimum) -> float:
+    """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
+    of the rays."""
+    return min(_sigma0(problem, minimum), MISFIT)
 
 
-def _place(found: Oriented) -> Network:
-    """The network with start values; refused if half or more is excluded.
+def _sigma0(problem: Problem, minimum: Minimum) -> float:
+    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
+    cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
+    accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
+    vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy
+    known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
+    return float(np.sqrt(vtpv[0] / redundancy)) if known else 1.0
+
+
+def _place(found: Oriented) -> Oriented:
+    """Found start values; refused if half or more is excluded.
 
     **Raises:** `NotSolvedError`."""
     network = found.network
@@ -301,11 +411,12 @@ def _place(found: Oriented) -> Network:
     ):  # fmt: skip
         if len(reasons) >= left:
             said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
-            cause = name_pixels(network)
+            causes = filter(None, (name_pixels(network), name_image_extent(network)))
+            cause = "; ".join(causes)
             raise NotSolvedError(
                 f"not solved: no start values for {len(reasons)} of "
                 f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"
                 + (f"; {cause}" if cause else ""),
                 [f"{thing} {id}" for id in reasons],
             )
-    return network
+    return found

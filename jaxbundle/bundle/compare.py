@@ -44,6 +44,7 @@ from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, data_frame, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
+from jaxbundle.report.layout import fixed
 from jaxbundle.system.programs import compile_once
 
 MOST_TOGETHER = 1500
@@ -138,14 +139,14 @@ class AdjustmentComparison:
             lines.append(f"{int(self.differs.sum())} of {len(self)} differ significantly "
                          f"({self.significance:g} for all together)")  # fmt: skip
         sigma = np.where(self.sigma > 0, self.sigma, np.nan)
-        ratio = np.nan_to_num(np.abs(self.difference / sigma))
-        rows = np.argsort(-ratio, kind="stable")[:SHOWN_ROWS]
+        ratio = np.abs(self.difference / sigma)
+        rows = np.argsort(-ratio, kind="stable")[:SHOWN_ROWS]  # NaN last: σ is not known
         lines.append(f"{'':24}{'a':>16}{'b':>16}{'b − a':>12}{'σ':>11}{'b − a in σ':>11}")
         for k in rows:
             name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"
             lines.append(
                 f"{name[:24]:24}{self.a[k]:16.8g}{self.b[k]:16.8g}{self.difference[k]:12.4g}"
-                f"{self.sigma[k]:11.3g}{ratio[k]:11.2f}{' *' * bool(self.differs[k])}"
+                f"{self.sigma[k]:11.3g}{fixed(ratio[k], 2):>11}{' *' * bool(self.differs[k])}"
             )
         if len(self) > len(rows):
             lines.append(f"and {count(len(self) - len(rows), 'unknown')} that differ by less of "

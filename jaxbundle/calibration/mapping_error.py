@@ -11,6 +11,10 @@ C^½·H·C^½, and the **expected mapping error** is
 
     EME = E(K) = trace(C^½·H·C^½) = Σ λᵢ
 
+Image points without a ray do not count. Beyond the farthest measured point the camera is
+extrapolated; in the black corners of a fisheye photograph, where nothing can be measured, this
+extrapolation means nothing and may be large. So the error is also given for the measured part.
+
 Source: Hagemann, Knorr, Janssen, Stiller (2022), Inferring bias and uncertainty in camera
 calibration, International Journal of Computer Vision 130.
 """
@@ -26,18 +30,25 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.statistics.projection import slopes_of_images
+from jaxbundle.statistics.projection import have_rays, slopes_of_images
+from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 
 DRAWS = 20_000
 """Samples of K for its quantile, accurate to 1 %."""
+FEWEST = 2
+"""Grid points that determine the rotation: three angles from two coordinates each."""
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class MappingError:
-    """`weights`: λ, pixels²; their sum `expected` is the expected mapping error."""
+    """`weights`: λ, pixels²; their sum `expected` is the expected mapping error. `share`: the
+    part of the image it is the mean of. `measured`: that of the image within the farthest
+    measured point of the principal point; None if this is all of the image that has rays."""
 
     weights: Float[np.ndarray, " k"]
+    share: float = 1.0
+    measured: "MappingError | None" = None
 
     @property
     def expected(self) -> float:
@@ -60,17 +71,32 @@ def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> Mapp
 
     **Arguments:** `grid`: columns and rows of the grid for the mean.
     """
-    (given,) = (one for one in adjustment.problem.network.cameras if one.id == camera)
+    problem = adjustment.problem
+    column = [one.id for one in problem.network.cameras].index(camera)
+    given = problem.network.cameras[column]
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
-    H = mapping_form(given, p, names, grid)
-    # By a root of H, in units of σ: C may be numerically singular, as for tied parameters.
+    model = get_model(given.model)
+    uv = grid_of(given.image_size, *grid).reshape(-1, 2)
+    xy = in_model_units(uv, model, given.image_size, given.pixel_size)
+    xy = xy[have_rays(model, p, xy)]
+    whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
+    farthest = farthest_measurements(problem, adjustment.values)[column]
+    away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
+    near = xy[away <= farthest]
+    if len(near) < FEWEST or len(near) == len(xy):
+        return whole
+    part = _weights(_form(given, p, names, near, "rotation"), C)
+    return dataclasses.replace(whole, measured=MappingError(part, len(near) / len(uv)))
+
+
+def _weights(H, C) -> Float[np.ndarray, " k"]:
+    """λ, by a root of H, in units of σ: C may be numerically singular, as for tied parameters."""
     sigma = np.sqrt(np.diagonal(C))
     unit = np.where(sigma > 0, sigma, 1.0)
     size, V = np.linalg.eigh(H * np.outer(unit, unit))
     root = V * np.sqrt(np.clip(size, 0, None))
-    weights = np.linalg.eigvalsh(root.T @ (C / np.outer(unit, unit)) @ root)
-    return MappingError(np.clip(weights, 0, None))
+    return np.clip(np.linalg.eigvalsh(root.T @ (C / np.outer(unit, unit)) @ root), 0, None)
 
 
 def mapping_form(
@@ -81,6 +107,11 @@ def mapping_form(
     model = get_model(camera.model)
     uv = grid_of(camera.image_size, *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, camera.image_size, camera.pixel_size)
+    return _form(camera, p, names, xy, frame)
+
+
+def _form(camera, p, names, xy, frame):
+    model = get_model(camera.model)
     columns = tuple(model.parameters.index(name) for name in names)
     A = slopes_of_images(model, p, columns, xy, frame)
     A = A / np.array(unit_size(model, camera.pixel_size))[:, None]

@@ -17,6 +17,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.projection import (
     FRAMES,
+    have_rays,
     images_through_scene,
     interior_covariance_of_images,
 )
@@ -69,8 +70,8 @@ class UncertaintyMap:
 
     @property
     def corners(self) -> float:
-        """The largest σ in the four corners."""
-        return float(np.nanmax(self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]], initial=0.0))
+        """The largest σ in those of the four corners that have a ray; NaN if none has."""
+        return float(np.fmax.reduce(_in_corners(self.sigma)))
 
 
 def grid_of(image_size, columns: int = GRID[0], rows: int = GRID[1]):
@@ -107,10 +108,13 @@ def uncertainty_map(
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
     if frame == "scene":
         views = np.flatnonzero(network.images.camera == c)
-        function = images_through_scene(model, c, views, adjustment.values, xy, distance)
-        Q = adjustment.covariance_of(function).reshape(len(xy), 2, len(xy), 2)
-        n = np.arange(len(xy))
-        C = Q[n, :, n]
+        p = np.array(list(adjustment.camera_parameters(camera).values()))
+        there = np.flatnonzero(have_rays(model, p, xy))
+        function = images_through_scene(model, c, views, adjustment.values, xy[there], distance)
+        Q = adjustment.covariance_of(function).reshape(len(there), 2, len(there), 2)
+        n = np.arange(len(there))
+        C = np.full((len(xy), 2, 2), np.nan)
+        C[there] = Q[n, :, n]
     else:
         names, Q = adjustment.camera_covariance(camera)
         columns = tuple(model.parameters.index(name) for name in names)
@@ -119,6 +123,10 @@ def uncertainty_map(
     per_unit = 1 / np.array(unit_size(model, given.pixel_size))
     C = C * per_unit[:, None] * per_unit
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
+
+
+def _in_corners(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "4"]:
+    return values[[0, 0, -1, -1], [0, -1, 0, -1]]
 
 
 def over_distance(
@@ -131,7 +139,7 @@ def over_distance(
     `maps` at three distances.
     """
     near = np.array([1 / m.distance for m in maps])
-    variance = np.array([m.sigma**2 for m in maps])[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
     t = 1 / np.asarray(distances, float)
     weight = np.array([
@@ -139,7 +147,7 @@ def over_distance(
         for own in near
     ])
     of = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
-    return of(middle), np.nanmax(of(variance.T), axis=0, initial=0.0)
+    return of(middle), np.fmax.reduce(of(variance.T))
 
 
 @print_in_one_screen

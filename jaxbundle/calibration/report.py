@@ -87,9 +87,17 @@ def _quality(calibration):
 
 def mapping_error_in_words(error) -> str:
     """The expected mapping error."""
+    percent = lambda share: f"{100 * share:.0f} % of the image"
+    whole = "the whole image" if error.share == 1 else f"the {percent(error.share)} with rays"
+    if error.measured is None:
+        where, stated, more = whole, error, ""
+    else:
+        stated = error.measured
+        where = f"the {percent(stated.share)} within the farthest measured point"
+        more = f"; over {whole}, partly extrapolated, {error.rms:.3f} px"
     return (
-        f"Expected mapping error over the whole image, rotation removed: {error.rms:.3f} px (RMS), "
-        f"below {error.quantile():.3f} px with 95 %."
+        f"Expected mapping error over {where}, rotation removed: {stated.rms:.3f} px (RMS), "
+        f"below {stated.quantile():.3f} px with 95 %{more}."
     )
 
 
@@ -172,10 +180,7 @@ def _quality_dict(calibration) -> dict:
         "distances": calibration.distances.tolist(),
         "coverage": _coverage_dict(covered),
         "uncertainty": _maps_dict(calibration.reported_maps),
-        "mapping_error": {
-            "expected": calibration.mapping_error.expected, "rms": calibration.mapping_error.rms,
-            "quantile_95": calibration.mapping_error.quantile(),
-        },
+        "mapping_error": _mapping_error_dict(calibration.mapping_error),
         "bias": None if bias is None else {
             "cells": bias.cells, "corner_sigma": bias.corner_sigma,
             "residual_sigma": bias.residual_sigma, "ratio": bias.ratio, "found": list(bias.found),
@@ -272,6 +277,13 @@ def _maps_dict(maps) -> list[dict]:
          "corners": number(m.corners)}
         for m in maps
     ]  # fmt: skip
+
+
+def _mapping_error_dict(error) -> dict | None:
+    return None if error is None else {
+        "expected": error.expected, "rms": error.rms, "quantile_95": error.quantile(),
+        "share": error.share, "measured": _mapping_error_dict(error.measured),
+    }  # fmt: skip
 
 
 def _rig_quality(rig, name: str) -> dict:

@@ -122,7 +122,8 @@ class Calibration:
 
     @functools.cached_property
     def mapping_error(self) -> MappingError:
-        """The expected mapping error over the whole image, comparable between camera models."""
+        """The expected mapping error over the image, comparable between camera models, and over
+        its measured part."""
         return mapping_error(self.adjustment, self.name)
 
     @functools.cached_property

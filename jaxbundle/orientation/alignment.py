@@ -48,9 +48,7 @@ def _by_rays(network: Network, sights: Sights, model: Model):
     if len(rows) < LEAST_RAYS or len(np.unique(sights.point[rows])) < 3 or not model.known.any():
         return None
     image, point = sights.image[rows], sights.point[rows]
-    rays = np.pad(sights.xy[rows], ((0, 0), (0, 1)), constant_values=-1.0)
-    rays = np.einsum("nij,ni->nj", model.M[image], rays)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
     seen = model.known[sights.point] & model.placed[sights.image]
     off = model.X[sights.point[seen]] - model.X0[sights.image[seen]]
     usual = np.median(np.linalg.norm(off, axis=1))

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.network.tables import Points
 from jaxbundle.orientation import many
-from jaxbundle.orientation.sights import Sights
+from jaxbundle.orientation.sights import Sights, in_plane
 from jaxbundle.orientation.status import Status
 
 FEWEST_POINTS = 4
@@ -142,9 +142,7 @@ def place_far_points(sights: Sights, model: Model) -> None:
         None if there are many: then the images have one common projection centre."""
     rows = np.flatnonzero(model.placed[sights.image] & ~model.known[sights.point])
     point, image = sights.point[rows], sights.image[rows]
-    xy1 = np.pad(sights.xy[rows], ((0, 0), (0, 1)), constant_values=-1.0)
-    ray = np.einsum("nij,ni->nj", model.M[image], xy1)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
     direction = np.zeros((sights.points, 3))
     np.add.at(direction, point, ray)
     number = np.bincount(point, minlength=sights.points)
@@ -163,47 +161,62 @@ def place_far_points(sights: Sights, model: Model) -> None:
 
 def place_images(sights: Sights, model: Model, images) -> int:
     """Resect images from their known points; returns the number of oriented images."""
-    rows = [_known_rows(sights, model, image) for image in images]
+    images, rows, R, xy = _turned(sights, model, images)
+    if not len(images):
+        return 0
     X0, M, part = many.resect(
-        [sights.xy[r] for r in rows], [model.X[sights.point[r]] for r in rows],
-        sights.tolerance[images],
-    )  # fmt: skip
+        xy, [model.X[sights.point[r]] for r in rows], sights.tolerance[images]
+    )
     number = np.minimum([len(r) for r in rows], many.SLOTS)
     good = (part >= AGREEING_SHARE) & (part * number >= FEWEST_POINTS)
     for i, image in enumerate(images):
         if good[i]:
-            model.place(image, X0[i], M[i])
+            model.place(image, X0[i], R[i].T @ M[i])
     return int(good.sum())
 
 
-def _known_rows(sights, model, image):
-    rows = np.arange(sights.image.size)[sights.of(image)]
-    return rows[model.known[sights.point[rows]]]
+def _turned(sights, model, images):
+    """For each of the images with enough known points: their rows, and their coordinates in a
+    camera turned by R (`sights.in_plane`)."""
+    usable, chosen, R, xy = [], [], [], []
+    for image in images:
+        rows = np.arange(sights.image.size)[sights.of(image)]
+        rows = rows[model.known[sights.point[rows]]]
+        turn, at = in_plane(sights.ray[rows])
+        there = np.isfinite(at).all(1)
+        if there.sum() >= FEWEST_POINTS:
+            usable.append(image)
+            chosen.append(rows[there])
+            R.append(turn)
+            xy.append(at[there])
+    return np.array(usable, int), chosen, np.reshape(R, (-1, 3, 3)), xy
 
 
 def _refine(sights: Sights, model: Model) -> None:
     """All oriented images improved by consistent points."""
-    images = np.flatnonzero(model.placed)
     error = misclosures(sights, model)
-    rows = [_known_rows(sights, model, image) for image in images]
+    images, rows, R, xy = _turned(sights, model, np.flatnonzero(model.placed))
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
     use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= FEWEST_POINTS]
     if not use:
         return
-    images, rows = images[use], [rows[k] for k in use]
-    model.X0[images], model.M[images] = many.refine(
-        (model.X0[images], model.M[images]), [sights.xy[r] for r in rows],
+    images, rows, R = images[use], [rows[k] for k in use], R[use]
+    model.X0[images], M = many.refine(
+        (model.X0[images], R @ model.M[images]), [xy[k] for k in use],
         [model.X[sights.point[r]] for r in rows], [weights[k] for k in use],
     )  # fmt: skip
+    model.M[images] = R.swapaxes(1, 2) @ M
 
 
 def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
-    """|computed − measured| of every sight, c = 1; infinite behind a camera, NaN if not placed."""
-    ray = model.X[sights.point] - model.X0[sights.image]
-    r, s, q = np.einsum("nij,nj->in", model.M[sights.image], ray)
+    """Tangent of the angle between every ray and the direction to its point; infinite if that is
+    behind the ray, NaN if not placed."""
+    to_point = model.X[sights.point] - model.X0[sights.image]
+    ray = np.einsum("nij,ni->nj", model.M[sights.image], sights.ray)
+    along = (to_point * ray).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.hypot(-r / q - sights.xy[:, 0], -s / q - sights.xy[:, 1])
-    return np.where(q >= 0, np.inf, error)
+        error = np.linalg.norm(np.cross(to_point, ray), axis=1) / along
+    return np.where(along <= 0, np.inf, error)
 
 
 def intersect(sights: Sights, model: Model, demands: Demands, again: bool = False) -> None:
@@ -224,9 +237,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     row = rows[first[wanted, None] + (place * scale).astype(int)]
     weights = (np.arange(many.RAYS) < number[wanted, None]).astype(float)
     X0 = model.X0[sights.image[row]]
-    xy1 = np.pad(sights.xy[row], ((0, 0), (0, 0), (0, 1)), constant_values=-1.0)
-    rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], xy1)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], sights.ray[row])
     tolerance = demands.miss * sights.tolerance[sights.image[row]]
 
     X, good = np.full((len(wanted), 3), np.nan), np.zeros(len(wanted), bool)

@@ -15,7 +15,8 @@ from which little grows is replaced by the next.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -25,11 +26,12 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.sightings import keep_images, keep_points
-from jaxbundle.network.tables import Network
+from jaxbundle.network.sightings import keep_images, keep_points, leave_out
+from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
+from jaxbundle.orientation.conventions import name_image_extent
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
     AGREEING_SHARE,
@@ -42,7 +44,7 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
-from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
+from jaxbundle.orientation.sights import TOLERANCE, Sights, in_plane, sights
 from jaxbundle.types import Index
 
 FEWEST_COMMON = 6
@@ -90,7 +92,9 @@ class Oriented:
         for thing, reasons in (("image", self.images), ("point", self.points)):
             lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
         if self.left_out:
-            lines.append(_in_contradiction(self.left_out))
+            names = list_some(self.left_out, 5, str)
+            number = count(len(self.left_out), "image point")
+            lines.append(f"left out {number} {CONTRADICTION}: {names}")
         if self.finding:
             lines.append(self.finding)
         return "\n".join(lines)
@@ -141,7 +145,8 @@ def find_start_values(
 
 
 def _no_start_values(network: Network, why: str) -> NotSolvedError:
-    causes = "; ".join(filter(None, (why, name_pixels(network))))
+    extent = name_image_extent(network)
+    causes = "; ".join(filter(None, (why, name_pixels(network), extent)))
     return NotSolvedError(f"no start values found: {causes}", _names(network))
 
 
@@ -266,10 +271,10 @@ def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
     new, linked = ~model.placed, bool(model.placed.any())
     old = _neighbours(seen, new) & model.placed
     best, most = None, 0
-    for image, other, M, b in _good_pairs(seen, new | old, old, linked):
+    for image, other, first, second, b in _good_pairs(seen, new | old, old, linked):
         part = Model.empty(seen)
-        part.place(image, np.zeros(3), np.eye(3))
-        part.place(other, b, M)
+        part.place(image, np.zeros(3), first)
+        part.place(other, b, second)
         grow(seen, part, new | old, improve)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
@@ -288,18 +293,23 @@ def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.nd
 
 
 def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
-    """Pairs and their relative orientations, the most promising first; `linked`: of an old image
-    and another."""
+    """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
+    of an old image and another."""
     pairs, common = _pairs_in_common(seen, among, old, linked)
     if not len(pairs):
         return
-    xy = [_common_points(seen, *pair) for pair in pairs]
+    turned = [_common_points(seen, *pair) for pair in pairs]
+    enough = [len(xy) >= FEWEST_COMMON for *_, xy, _ in turned]
+    turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
+    if not turned:
+        return
+    R, Q, xy, other_xy = zip(*turned)
     tolerance = seen.tolerance[pairs].mean(1)
-    M, b, part, angle = many.orient_pairs([a for a, _ in xy], [b for _, b in xy], tolerance)
+    M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
     worth = np.sqrt(common) * part * np.minimum(angle, WIDE_ANGLE)
     usable = (part >= AGREEING_SHARE) & (angle > FOR_OTHERS.angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
-        yield *pairs[k], M[k], b[k]
+        yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
 
 
 def _pairs_in_common(seen: Sights, among, old, linked):
@@ -329,9 +339,12 @@ def _all_pairs(seen: Sights, among):
 
 
 def _common_points(seen: Sights, image: Index, other: Index):
+    """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
     one, two = seen.of(image), seen.of(other)
     _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
-    return seen.xy[one][k], seen.xy[two][l]
+    (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
+    there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
+    return R, Q, xy[there], other_xy[there]
 
 
 def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriented:
@@ -349,7 +362,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     wrong = seen.row[_out_of_the_question(seen, model)]
     keep = model.placed
     known = np.all(np.isfinite(X), axis=1)
-    reasons = _reasons(network, seen, model, known)
+    reasons = explain_missing(network, seen, model, known)
     rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
@@ -357,22 +370,27 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
         observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
     )
     network = keep_points(keep_images(network, keep), known)
-    said = [
-        f"left out {count(len(found), thing)} for which no start values were found: "
-        + list_some((f"{id} ({why})" for id, why in found.items()), 5, str)
-        for thing, found in zip(("image", "point"), reasons) if found
-    ]  # fmt: skip
+    network = network.warn(f"start values found, {frame}")
+    for thing, found in zip(("image", "point"), reasons):
+        network = note_missing(network, thing, found, "for which no start values were found")
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
-    if names:
-        said.append(_in_contradiction(names))
-    return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons, names)
+    network = leave_out(network, "image point", names, CONTRADICTION)
+    return Oriented(network, frame, *reasons, names)
 
 
-def _in_contradiction(names: Sequence[str]) -> str:
-    return (
-        f"left out {count(len(names), 'image point')} that contradict the start values: "
-        f"{list_some(names, 5, str)}"
-    )
+CONTRADICTION = "that contradict the start values"
+
+
+def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
+    """The network with notes that images or points were left out, by name with the reasons."""
+    if not reasons:
+        return network
+    names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
+    groups = {why: tuple(id for id, one in reasons.items() if one == why)
+              for why in dict.fromkeys(reasons.values())}  # fmt: skip
+    network = network.warn(f"left out {count(len(reasons), thing)} {what}: {names}")
+    notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
+    return network.replace(left_out=(*network.left_out, *notes))
 
 
 def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
@@ -387,7 +405,8 @@ def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
     return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
 
 
-def _reasons(network: Network, seen: Sights, model: Model, known):
+def explain_missing(network: Network, seen: Sights, model: Model, known):
+    """By id, why images are not placed, and why points are not `known`."""
     rays = np.bincount(seen.image, minlength=seen.images)
     of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
     images = {}
@@ -405,9 +424,15 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]
     by_point = np.bincount(seen.point[placed], minlength=seen.points)
+    outside = np.ones(len(network.observations), bool)
+    outside[seen.row] = False
+    no_ray = np.bincount(network.observations.point[outside], minlength=seen.points)
     points = {}
     for point in np.flatnonzero(~known):
-        if by_point[point] < 2:
+        if by_point[point] < 2 and no_ray[point]:
+            number = count(no_ray[point], "image point")
+            why = f"{number} of it outside the range of the camera model, where there are no rays"
+        elif by_point[point] < 2:
             why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
         else:
             why = f"its {by_point[point]} rays do not intersect, or are parallel"

@@ -45,10 +45,9 @@ def residual_vectors(adjustment, image: str, ax=None):
     low = np.minimum(low, xy.min(0, initial=np.inf))
     high = np.maximum(high, xy.max(0, initial=-np.inf))
     diagonal = float(np.hypot(*(high - low)))
-    v = np.nan_to_num(v)
-    longest = np.hypot(*v.T).max(initial=0.0)
+    longest = np.fmax.reduce(np.hypot(*v.T), initial=0.0)  # Removed points have no arrow.
     factor = round_number(0.1 * diagonal / longest) if longest > 0 else 1.0
-    large = (np.abs(np.nan_to_num(tau)) > LARGE_TAU).any(1)
+    large = (np.abs(tau) > LARGE_TAU).any(1)
     arrows = ax.quiver(
         *xy.T, *v.T, angles="xy", scale_units="xy", scale=1 / factor, width=0.0028,
         headwidth=3.5, headlength=4.5, headaxislength=4, minlength=0,

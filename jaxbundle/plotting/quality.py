@@ -134,16 +134,17 @@ def uncertainty_curve(
     if range_ is not None:
         ax.axvspan(*range_, color=GREY, alpha=0.2, linewidth=0, label="distances of the board")
     ax.loglog(distances, middle, color=BLUE, linewidth=1.5, label="middle of the image")
-    ax.loglog(distances, corners, color=RUST, linewidth=1.5, label="worst corner")
+    if np.isfinite(corners).any():  # A wide lens may have no rays there.
+        ax.loglog(distances, corners, color=RUST, linewidth=1.5, label="worst corner")
     if reported is not None:
         away, *both = reported
         for values, colour in zip(both, (BLUE, RUST)):
-            there = np.isfinite(away)
-            ax.plot(away[there], values[there], "o", color=colour, markersize=5)
-            for x, y in zip(away[there], values[there]):
+            known, there = np.isfinite(values), np.isfinite(away)
+            ax.plot(away[there & known], values[there & known], "o", color=colour, markersize=5)
+            for x, y in zip(away[there & known], values[there & known]):
                 ax.annotate(f"{y:.3g}", (x, y), xytext=(5, 5), textcoords="offset points",
                             fontsize=7, color=colour)  # fmt: skip
-            for y in values[~there]:
+            for y in values[known & ~there]:
                 ax.axhline(y, color=colour, linewidth=0.8, linestyle=":")
                 ax.annotate(f"{y:.3g} at infinity", (1, y), xycoords=("axes fraction", "data"),
                             xytext=(-4, 3), textcoords="offset points", ha="right", fontsize=7,

@@ -123,8 +123,10 @@ def _tests(rows):
     worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
     for row in sorted(rows, key=worst, reverse=True)[:MOST_LISTED]:
-        pair = lambda values, form: " ".join(format(x, form) for x in values)
-        mdb = pair(minimal_detectable(1.0, np.nan_to_num(row["r"])), "6.1f")
+        pair = lambda values, form: " ".join(
+            format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
+        )
+        mdb = pair(minimal_detectable(1.0, row["r"]), "6.1f")
         yield (
             f"  {row['image']:12s} {row['point']:12s} {pair(row['v'], '8.3f')} "
             f"{pair(row['r'], '5.2f')} {pair(row['w'], '7.2f')} {mdb}"

@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.cameras import CameraModel, image_ray, project
 from jaxbundle.geometry import matrix_from_quaternion
@@ -66,12 +66,24 @@ def slopes_of_images(
     A, B = (np.asarray(x) for x in _slopes(model, jnp.asarray(p, float), jnp.asarray(xy, float)))
     A = A[:, :, list(free)]
     if frame == "rotation":
-        good = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
+        good = _are_finite(A, B)
         turn = np.linalg.lstsq(
             B[good].reshape(-1, 3), A[good].reshape(-1, A.shape[2]), rcond=None
         )[0]
         A = A - B @ turn
     return A
+
+
+def have_rays(
+    model: CameraModel, p: Float[np.ndarray, " parameters"], xy: Float[np.ndarray, "n 2"]
+) -> Bool[np.ndarray, " n"]:
+    """Which image points have a ray whose image depends smoothly on ray and parameters `p`."""
+    slopes = _slopes(model, jnp.asarray(p, float), jnp.asarray(xy, float))
+    return _are_finite(*map(np.asarray, slopes))
+
+
+def _are_finite(A, B) -> Bool[np.ndarray, " n"]:
+    return np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
 
 
 def interior_covariance_of_images(
@@ -98,7 +110,8 @@ def images_through_scene(
 ):
     """A function of the adjusted unknowns: the images [2n] of points held in the scene.
 
-    Their covariance is that of the frame "scene". At the estimate itself they are `xy`.
+    Their covariance is that of the frame "scene". At the estimate itself they are `xy`, which must
+    have rays (`have_rays`): one without would make the derivatives of all NaN.
 
     **Arguments:** `column`: the camera among those of the network; `views`: indices of its images;
     `distance` from the projection centre in the object unit; infinity as well.

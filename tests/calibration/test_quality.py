@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from test_calibrate import NOISE, simulated
 
+import jaxbundle
 from jaxbundle import cli
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import calibrate_rigs
@@ -19,6 +20,7 @@ from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.advice import advice
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
+from jaxbundle.calibration.simulate import simulate_views
 from jaxbundle.cameras import compare_cameras, get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
@@ -27,6 +29,7 @@ from jaxbundle.io import read_cameras, read_network, read_opencv
 from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
 from jaxbundle.statistics.difference import expected_difference
+from jaxbundle.statistics.projection import images_through_scene
 
 DRAWS = 416
 GRID = (3, 3)
@@ -158,6 +161,65 @@ def test_the_expected_mapping_error_is_that_of_a_sample(sample):
     of_map = calibration.uncertainty(frame="rotation", grid=(33, 25)).covariance
     trace = np.trace(of_map, axis1=2, axis2=3).mean()
     assert stated.expected == pytest.approx(trace, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def without_corners():
+    """A calibration of a wide lens whose polynomial turns back before the image corners."""
+    rng = np.random.default_rng(4)
+    board = jaxbundle.Board(9, 6, 0.08)
+    camera = jaxbundle.Camera(
+        "cam", "opencv",
+        {"fx": 470, "fy": 471, "cx": 372, "cy": 238, "k1": -0.32, "k2": 0.153, "k3": -0.045},
+        image_size=(752, 480),
+    )  # fmt: skip
+    middle = board.points.mean(0)
+    stations = jaxbundle.stations_looking_at(
+        middle + rng.uniform([-0.5, -0.4, 0.5], [0.5, 0.4, 0.9], (12, 3)),
+        middle + rng.uniform([-0.2, -0.1, 0], [0.2, 0.1, 0], (12, 3)), up=(0, 1, 0),
+    )  # fmt: skip
+    views = simulate_views(board, camera, stations, noise=0.1)
+    return calibrate(views, cross_validation=False)
+
+
+def test_image_points_without_rays_have_no_uncertainty_and_the_others_have_theirs(without_corners):
+    """One point without a ray made the whole map NaN, and its corners 0."""
+    found = without_corners
+    for one in (*found.reported_maps, found.uncertainty(1.0)):
+        outside = np.isnan(one.sigma)
+        assert outside[[0, 0, -1, -1], [0, -1, 0, -1]].all() and np.isnan(one.corners)
+        assert outside.mean() < 0.5 and one.middle > 0
+    # the middle is that of the same function asked for nothing else
+    model = get_model("opencv")
+    xy = np.array([[375.5, 239.5]])
+    adjustment = found.adjustment
+    function = images_through_scene(model, 0, np.arange(12), adjustment.values, xy, 1.0)
+    Q = adjustment.covariance_of(function)
+    assert found.uncertainty(1.0).middle == pytest.approx(np.sqrt(np.trace(Q) / 2), rel=1e-9)
+    middle, corners = found.uncertainty_over_distance(np.array([1.0, 3.0]))
+    assert (middle > 0).all() and np.isnan(corners).all()
+
+
+def test_what_is_not_there_is_a_dash_in_the_report_and_null_in_json(without_corners, tmp_path):
+    text, data = without_corners.report(), without_corners.to_dict()
+    table = text.split("Uncertainty of a projected point")[1].split("Expected")[0].split("\n\n")[0]
+    rows = [line.split() for line in table.splitlines()[2:]]
+    assert len(rows) == 5 and all(row[-1] == "–" and float(row[-2]) > 0 for row in rows)
+    json.loads(json.dumps(data, allow_nan=False))
+    maps = data["calibration"]["uncertainty"]
+    assert all(one["corners"] is None and one["middle"] > 0 for one in maps)
+
+
+def test_the_mapping_error_of_the_measured_part_is_that_of_its_map(without_corners):
+    found, error = without_corners, without_corners.mapping_error
+    assert 0.5 < error.measured.share < error.share < 1
+    assert error.measured.rms < error.rms
+    of_map = found.uncertainty(frame="rotation", grid=(33, 25))
+    C = np.trace(of_map.covariance, axis1=2, axis2=3)
+    assert np.isfinite(C).mean() == pytest.approx(error.share)
+    assert error.expected == pytest.approx(np.nanmean(C), rel=1e-6)
+    words = found.report().split("Expected mapping error")[1].split(".  ")[0]
+    assert f"{error.measured.rms:.3f}" in words and f"{error.rms:.3f}" in words
 
 
 def test_maps_that_cannot_be(sample):

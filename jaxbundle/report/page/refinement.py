@@ -89,11 +89,11 @@ def _judge(result, used, w) -> list[Finding]:
     check = result.check
     if check is not None:
         ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
-        largest = np.nan_to_num(ratio).max(initial=0.0)
+        largest = np.fmax.reduce(ratio, initial=np.nan)
         rms = ", ".join(significant(value) for value in check.rms)
         words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
                  f"difference {significant(largest)} times its σ")  # fmt: skip
-        findings.append(Finding("Check points", GOOD if largest <= CRITICAL_W else DOUBTFUL, words))
+        findings.append(Finding("Check points", DOUBTFUL if largest > CRITICAL_W else GOOD, words))
     return findings
 
 

@@ -80,12 +80,12 @@ def _checks(adjustment) -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table, limit = adjustment.table("checks"), critical_value(adjustment)
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    largest = (np.abs(d[s > 0]) / s[s > 0]).max(initial=0.0)
+    largest = np.fmax.reduce(np.abs(d[s > 0]) / s[s > 0], initial=np.nan)
     words = (
         f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
         f"difference {significant(largest)} times the σ of its intersection"
     )
-    return [Finding("Check points", GOOD if largest <= limit else DOUBTFUL, words)]
+    return [Finding("Check points", DOUBTFUL if largest > limit else GOOD, words)]
 
 
 def _reliability(adjustment) -> Finding:
@@ -99,13 +99,14 @@ def _reliability(adjustment) -> Finding:
 
 
 def _blunders(adjustment) -> Finding:
-    tau = np.abs(np.nan_to_num(adjustment.residuals["tau"]))
+    tau = np.abs(adjustment.residuals["tau"])
     limit = critical_value(adjustment)
     over = int((tau > limit).sum())
     expected = 0.001 * len(tau)
+    largest = significant(np.fmax.reduce(tau, initial=np.nan))
     words = (
         f"{over} of {count(len(tau), 'observation')} over the critical value {significant(limit)} "
-        f"of |τ| at 0.1 % (by chance about {expected:.2g}); largest {significant(tau.max())}"
+        f"of |τ| at 0.1 % (by chance about {expected:.2g}); largest {largest}"
     )
     removed, suspects = len(adjustment.removed), len(adjustment.suspects)
     if removed or suspects:

@@ -1,0 +1,113 @@
+"""What the rays of a network determine, within their noise: points, and the images of points.
+
+**Points.** The rays of a point determine it unless they are one line. With their unit directions dᵢ
+in the object frame, p = 1/σᵢ² of these (radians), u the common direction, the first eigenvector of
+Σ pᵢ·dᵢ·dᵢᵀ, and rᵢ the distance, across u, of projection centre i from their mean, a point at the
+distance sᵢ misses the rays by the angles of
+
+    T(s) = Σ pᵢ·|rᵢ/sᵢ + dᵢ⊥|²,        dᵢ⊥ = dᵢ − (dᵢ·u)·u,
+
+which is χ² of 2n − 2 if the point is there. sᵢ is the median distance from image i to its points.
+If half of it, all of it and twice of it pass the test, the rays say nothing about the distance: the
+images were taken from one place, or the point lies on the line through their projection centres.
+Parallel rays from places apart fail it: such a point is far away, its direction determined, and a
+least distance.
+
+Orientations have errors too. At the distances of its n points those of an image have, on average,
+3/n of the variance of a ray (six unknowns from 2n coordinates), which is added; at infinity they
+would have much more, if rotation and position compensate each other.
+
+**Images.** Points on a line leave a rotation of their image about this line open. They are on it if
+their distances eᵢ from it are seen at angles within the noise, Σ pᵢ·(|eᵢ|/sᵢ)² below the quantile
+for 2n − 4; two points always are.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile
+from jaxbundle.orientation.growth import Model
+from jaxbundle.orientation.sights import Sights
+
+SIGNIFICANCE = 0.001
+"""Probability that parallel rays are taken for converging ones: the level of the tests of
+single observations."""
+
+
+def have_one_line(
+    seen: Sights, model: Model, points: Bool[np.ndarray, " points"], factor: float = 1.0
+) -> tuple[Bool[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
+    """Which of these points have two or more rays from placed images that are one line, and which
+    of them because the images were taken from one place.
+
+    **Arguments:** `factor`: of the a priori σ of the rays, such as σ0."""
+    none = np.zeros(seen.points, bool)
+    rows = np.flatnonzero(model.placed[seen.image] & points[seen.point] & (seen.sigma > 0))
+    image, point = seen.image[rows], seen.point[rows]
+    number = np.bincount(point, minlength=seen.points)
+    if not (number > 1).any() or not factor > 0:
+        return none, none
+    total = lambda values: np.stack(
+        [np.bincount(point, v, seen.points) for v in values.reshape(len(rows), -1).T], 1
+    )
+    d = np.einsum("nij,ni->nj", model.M[image], seen.ray[rows])
+    measured = np.bincount(seen.image[seen.sigma > 0], minlength=seen.images)[image]
+    p = 1 / ((factor * seen.sigma[rows]) ** 2 * (1 + 3 / measured))
+    S = total(p[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(-1, 3, 3)
+    u = np.linalg.eigh(S)[1][:, :, 2]
+    weight = np.maximum(np.bincount(point, p, seen.points), 1e-300)[:, None]
+    away = model.X0[image] - (total(p[:, None] * model.X0[image]) / weight)[point]
+    u = u[point]
+    across = lambda v: v - (v * u).sum(1, keepdims=True) * u
+    r, off = across(away), across(d) * np.sign((d * u).sum(1, keepdims=True))
+    usual = usual_distances(seen, model)[image, None]
+    misses = lambda v: np.bincount(point, p * np.square(v).sum(1), seen.points)
+    limit = _quantiles(2 * number - 2)
+    one_line = number > 1
+    for distance in (0.5 * usual, usual, 2 * usual):
+        one_line &= misses(r / distance + off) < limit
+    return one_line, one_line & (misses(away / usual) < limit)
+
+
+def see_a_line(
+    seen: Sights, model: Model, factor: float = 1.0
+) -> Bool[np.ndarray, " images"]:
+    """Which images see known points on a line only, or fewer than three. Images that are not placed
+    count as at the usual distance."""
+    rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
+    image = seen.image[rows]
+    number = np.bincount(image, minlength=seen.images)
+    X, placed = model.X[seen.point[rows]], model.placed[image]
+    away = np.linalg.norm(X - model.X0[image], axis=1)
+    away = np.where(placed, away, usual_distances(seen, model)[image])
+    # Distances of the points from the image weigh their offsets; the line is that of least squares.
+    root = 1 / (factor * seen.sigma[rows] * away)
+    total = lambda values: np.stack(
+        [np.bincount(image, v, seen.images) for v in values.reshape(len(rows), -1).T], 1
+    )
+    weight = np.maximum(np.bincount(image, root**2, seen.images), 1e-300)[:, None]
+    away = X - (total(root[:, None] ** 2 * X) / weight)[image]
+    scaled = root[:, None] * away
+    C = total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3)
+    off = np.linalg.eigvalsh(C)[:, :2].sum(1)
+    return (number > 0) & (off < _quantiles(2 * number - 4))
+
+
+def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
+    """The median distance from every image to its known points; where it has none, that of all."""
+    rows = np.flatnonzero(model.placed[seen.image] & model.known[seen.point])
+    image = seen.image[rows]
+    s = np.linalg.norm(model.X[seen.point[rows]] - model.X0[image], axis=1)
+    found = np.full(seen.images, np.median(s) if len(s) else np.inf)
+    order = np.lexsort((s, image))
+    first, number = np.unique(image[order], return_index=True, return_counts=True)[1:]
+    found[image[order][first]] = s[order][first + number // 2]
+    return found
+
+
+def _quantiles(degrees) -> np.ndarray:
+    """χ² quantiles of whole degrees of freedom; infinite for none."""
+    values, index = np.unique(degrees, return_inverse=True)
+    return np.array([
+        chi2_quantile(1 - SIGNIFICANCE, int(k)) if k > 0 else np.inf for k in values
+    ])[index]  # fmt: skip
