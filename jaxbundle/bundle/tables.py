@@ -212,7 +212,7 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
     rows."""
     v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
     unit = np.ones(weight.shape[1])
-    if kind in OF_ANGLES or (kind == "prior" and axes == EXTERIOR):
+    if kind in OF_ANGLES or tuple(axes) == EXTERIOR:
         unit[-3:] = adjustment.angle_scale
     used = weight > 0
     sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)

@@ -10,6 +10,8 @@ from jaxbundle.network.further.differences import Differences as Differences
 from jaxbundle.network.further.figures import Figures as Figures
 from jaxbundle.network.further.figures import Shapes as Shapes
 from jaxbundle.network.further.lines import Edges as Edges
+from jaxbundle.network.further.priors import CameraPriors as CameraPriors
+from jaxbundle.network.further.priors import ExteriorPriors as ExteriorPriors
 from jaxbundle.network.further.rigs import Rigs as Rigs
 from jaxbundle.network.further.rolling_shutter import RollingShutter as RollingShutter
 from jaxbundle.network.further.ties import Ties as Ties
@@ -18,7 +20,7 @@ KINDS = {
     kind.TABLE: kind
     for kind in (
         Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
-        Ties,
+        Ties, ExteriorPriors, CameraPriors,
     )  # fmt: skip
 }
 """By the name of their table."""
