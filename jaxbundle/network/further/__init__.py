@@ -5,6 +5,7 @@ from jaxbundle.network.further import attitudes, differences
 from jaxbundle.network.further.antennas import Antennas as Antennas
 from jaxbundle.network.further.attitudes import Attitudes as Attitudes
 from jaxbundle.network.further.base import Further as Further
+from jaxbundle.network.further.camera_parameters import CameraParameters as CameraParameters
 from jaxbundle.network.further.differences import Angles as Angles
 from jaxbundle.network.further.differences import Differences as Differences
 from jaxbundle.network.further.figures import Figures as Figures
@@ -18,7 +19,7 @@ KINDS = {
     kind.TABLE: kind
     for kind in (
         Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
-        Ties,
+        Ties, CameraParameters,
     )  # fmt: skip
 }
 """By the name of their table."""
