@@ -1,5 +1,7 @@
 """`jaxbundle reconstruct`: photographs to an adjusted network."""
 
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +35,9 @@ def reconstruct_command(
     features: Annotated[str, choice(FEATURES)] = "sift",
     pairs: Annotated[str, choice(MATCHED_PAIRS, "matched")] = "auto",
     points: Annotated[int, typer.Option(min=20, help="desired tie points per photograph")] = 1500,
+    square_pixels: Annotated[
+        bool, typer.Option(help="observe fy/fx as 1; otherwise both focal lengths are unknown")
+    ] = True,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     html: Html = "",
     brief: Annotated[
@@ -63,6 +68,8 @@ def reconstruct_command(
     if targets is not None:
         check_kind(targets)
     settings = Settings(Detection(features), pairs, points, targets=targets)
+    if not square_pixels:
+        settings = replace(settings, aspect_sigma=inf)
     given = None if camera is None else camera_given(camera)
     known = None if control is None else read_control_measurements(control)
     bars = () if distances is None else read_distances(distances)
@@ -76,7 +83,7 @@ def reconstruct_command(
         result = reconstruct(photos, given, settings, store, tell, known, bars)
     origin = trace_files([*files, *(p.path for p in found)], {
         "--camera": camera, "--targets": targets, "--features": features, "--pairs": pairs,
-        "--points": points,
+        "--points": points, "--no-square-pixels": True if not square_pixels else None,
     })  # fmt: skip
     write_reconstruction(result, json, out, brief, plots, force, html, origin)
     if not quiet and json != "-":

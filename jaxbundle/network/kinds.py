@@ -23,8 +23,7 @@ from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Kind, Local
 from jaxbundle.leastsquares.spaces import Posed, turn_by
 from jaxbundle.network.further.base import less
-from jaxbundle.network.further.priors import EXTERIOR_PRIOR
-from jaxbundle.network.further.priors import interior_orientation as interior_orientation
+from jaxbundle.network.further.exterior_priors import EXTERIOR_PRIOR
 from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
 from jaxbundle.types import present
 
@@ -117,6 +116,11 @@ def _distance(a, b, given):
 CONTROL = Kind("control points", less, ("point",), ("X", "Y", "Z"), snooped="single")
 EXTERIOR = EXTERIOR_PRIOR
 DISTANCES = Kind("distances", _distance, ("point", "point"), ("d",), snooped="single")
+
+
+def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
+    """Priors of the parameters of the cameras of a table."""
+    return Kind("interior orientation", less, (camera,), parameters, snooped="", invariant=True)
 
 
 SIMILARITY = similarity(("point",), ("image",))

@@ -8,6 +8,7 @@ import datetime
 import math
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxbundle.photographs.reading import open_image
 from jaxbundle.photographs.sensors import sensor_width
@@ -24,6 +25,20 @@ FILM_DIAGONAL = math.hypot(36, 24)
 MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Units of the resolution in the focal plane."""
 UPRIGHT = 1
+NOMINAL = 0.05
+"""Relative σ of a principal distance from a stated focal length: focal lengths are rounded, the
+sensor is a few per cent wider than the photograph, and focused at 20 focal lengths the principal
+distance is 5 % longer."""
+ROUNDING = 1 / math.sqrt(12)
+"""mm: σ of a focal length equivalent to 35 mm film, which is a whole number."""
+
+
+class StatedDistance(NamedTuple):
+    """A principal distance stated by a file, and its σ, pixels; its source in words."""
+
+    value: float
+    sigma: float
+    source: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,18 +77,24 @@ class Exif:
         repeated = first and self.model.lower().startswith(first[0].lower())
         return (self.model if repeated else f"{self.make} {self.model}").strip()
 
-    def principal_distance(self) -> tuple[float, str] | None:
-        """The principal distance in pixels and its source; None if unknown."""
+    def principal_distance(self) -> StatedDistance | None:
+        """The principal distance in pixels of this file, whatever the size of the photograph as it
+        was taken; None if unknown."""
         long = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
-            return self.focal_length / width * long, "focal length and sensor"
-        if self.focal_length_35:
-            return (self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size),
-                    "focal length equivalent to 35 mm film")  # fmt: skip
-        if self.focal_length and self.resolution:
-            return self.focal_length * self.resolution, "focal length and resolution"
-        return None
+            value, relative = self.focal_length / width * long, NOMINAL
+            source = "focal length and sensor"
+        elif self.focal_length_35:
+            value = self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size)
+            relative = math.hypot(NOMINAL, ROUNDING / self.focal_length_35)
+            source = "focal length equivalent to 35 mm film"
+        elif self.focal_length and self.resolution:
+            value, relative = self.focal_length * self.resolution, NOMINAL
+            source = "focal length and resolution"
+        else:
+            return None
+        return StatedDistance(value, relative * value, source)
 
 
 def read_exif(path: str | Path) -> Exif:

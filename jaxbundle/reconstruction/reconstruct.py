@@ -21,6 +21,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.reconstruction import aspect_ratio
 from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
@@ -221,8 +222,8 @@ class _Making:
         if self.cameras.given:
             return
         cameras, notes = start_cameras(
-            self.cameras.cameras, self.cameras.of, self.cameras.lens, self.cameras.known, features,
-            matches,
+            self.cameras.cameras, self.cameras.of, self.cameras.lens,
+            [one is not None for one in self.cameras.stated], features, matches,
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
@@ -310,10 +311,12 @@ class _Making:
             tracks, features, lambda k: read_photograph(self.photographs[k].path, colour=True),
             lambda: self.tell("least squares matching", next(done), len(features)),
         )  # fmt: skip
-        network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
+        network = tie_network(self.photographs, self.cameras, measured, self.extra, name,
+                              self.settings.aspect_sigma)  # fmt: skip
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
+        weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
         refuse_folded(weighted, measured, self.names)
         doubts = refuse_superimposed(weighted.adjustment, network, self.tried, self.names)
@@ -326,8 +329,8 @@ class _Making:
     def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
-        guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
-                   if not known]  # fmt: skip
+        guessed = [camera.id for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
+                   if stated is None and not self.cameras.given]  # fmt: skip
         failed: NotSolvedError | None = None
         for oriented in start_values(network, guessed, pairs):
             try:
@@ -351,6 +354,35 @@ class _Making:
         assert failed is not None, "start values are there, or an error says why not"
         raise failed
 
+    def _check_ratios(
+        self, oriented: Oriented, weighted: Weighted, measured, note: str
+    ) -> tuple[Weighted, str]:
+        """The adjustment with square pixels, unless halves of the photographs agree that they are
+        not."""
+        contradicted = aspect_ratio.contradicted_ratios(weighted.adjustment)
+        if not contradicted:
+            return weighted, note
+        self._begin("ratio of the focal lengths")
+        halves = aspect_ratio.replicated_ratios(weighted.adjustment)
+        released = {}
+        for id, found in contradicted.items():
+            both = halves.get(id)
+            said = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(found)}, "
+            if both is None:
+                said += "halves of them none: "
+            else:
+                said += f"halves of them {' and '.join(map(_ratio_in_words, both))}: "
+            if both is not None and aspect_ratio.is_replicated(*both):
+                released[id] = found
+                self.notes.append(f"{said}the pixels are not square")
+            else:
+                self.notes.append(f"{said}not confirmed, the pixels are taken as square (fy/fx "
+                                  f"1 ± {self.settings.aspect_sigma:g})")  # fmt: skip
+        if not released:
+            return weighted, note
+        network = aspect_ratio.release(oriented.network, released)
+        return self._adjust(dataclasses.replace(oriented, network=network), measured)
+
     def _adjust(self, oriented: Oriented, measured) -> tuple[Weighted, str]:
         placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
         kinds, named = _kinds(placed, measured, self.names)
@@ -369,6 +401,10 @@ def _distances_found(result: Adjustment) -> str:
     return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
                    for id, c in _principal_distances(result).items()
                    if c["free"] and c["sigma"])  # fmt: skip
+
+
+def _ratio_in_words(ratio: aspect_ratio.Ratio) -> str:
+    return f"{1 + ratio.deviation:.5f} ± {ratio.sigma:.5f}"
 
 
 def _not_solved(result: Adjustment) -> NotSolvedError:

@@ -108,9 +108,6 @@ def test_removed_observations_stay_out(georeferenced, tmp_path):
 
 
 @pytest.mark.parametrize("table, text, said", [
-    ("camera_priors", "camera,parameter,value,sigma\nnone,c,24,0.1\n", "camera 'none' is unknown"),
-    ("camera_priors", "camera,parameter,value,sigma\ncam,K2,0,0.1\n", "'K2' of camera 'cam' is held"),
-    ("camera_priors", "camera,parameter,value,sigma\ncam,c,24,0\n", "sigma is 0; it must be pos"),
     ("exterior_priors", "image,X0,Y0,Z0,omega,phi,kappa,sX0,sY0,sZ0,somega,sphi,skappa\n"
      "1,1,,,,,,,,,,,\n", "X0 and sX0: give both or neither"),
 ])  # fmt: skip

@@ -21,7 +21,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue, Result
-from jaxbundle.network.further.priors import exterior
+from jaxbundle.network.further.exterior_priors import exterior
 from jaxbundle.network.tables import Camera, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
 from jaxbundle.system.programs import compile_once

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.network.further import CameraPriors, ExteriorPriors, Further, RollingShutter
+from jaxbundle.network.further import CameraParameters, ExteriorPriors, Further, RollingShutter
 from jaxbundle.network.further.base import among
 from jaxbundle.network.sightings import keep_points, without_distances
 from jaxbundle.network.tables import Images, Network, Observations, Points
@@ -54,7 +54,7 @@ def readjustable_network(adjustment) -> Network:
     """The network of a solved `Adjustment` with adjusted start values and all observations that
     took part: adjusted again it gives the same values, σ and σ0.
 
-    Priors of orientations and cameras become rows of `exterior_priors` and `camera_priors`, because
+    Priors of orientations and cameras become rows of `exterior_priors` and `camera_parameters`, because
     what was observed differs from the start values; control points have their given coordinates.
     σ are the final ones, after variance components and robust weights. Observations removed by data
     snooping, points without coordinates and check points are left out.
@@ -82,7 +82,7 @@ def readjustable_network(adjustment) -> Network:
         distances=dataclasses.replace(
             network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
         ),
-        further=(*_further(adjustment), *_priors(adjustment)),
+        further=_joined(*_further(adjustment), *_priors(adjustment)),
         warnings=("the adjusted network",),
     )  # fmt: skip
     adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
@@ -130,9 +130,25 @@ def _priors(adjustment) -> list[Further]:
                 rows.append((camera.id, name, float(data.interior[row, j]), 1 / weight))
     if rows:
         camera, parameter, value, sigma = zip(*rows)
-        found.append(CameraPriors(camera=camera, parameter=parameter, value=np.array(value),
-                                  sigma=np.array(sigma)))  # fmt: skip
+        found.append(CameraParameters(
+            camera=camera, parameter=parameter, value=np.array(value), sigma=np.array(sigma)
+        ))  # fmt: skip
     return found
+
+
+def _joined(*given: Further) -> tuple[Further, ...]:
+    """One table of each kind: priors follow the rows of the same kind that the network had."""
+    tables: dict[str, Further] = {}
+    for one in given:
+        first = tables.get(one.TABLE)
+        if first is None:
+            tables[one.TABLE] = one
+            continue
+        names = [f.name for f in dataclasses.fields(one) if f.name not in ("settings", "source")]
+        join = lambda a, b: np.concatenate([a, b]) if isinstance(a, np.ndarray) else (*a, *b)
+        both: dict = {name: join(getattr(first, name), getattr(one, name)) for name in names}
+        tables[one.TABLE] = type(one)(**both, settings=first.settings)
+    return tuple(tables.values())
 
 
 def _further(adjustment) -> list[Further]:
