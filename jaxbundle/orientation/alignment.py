@@ -1,5 +1,7 @@
 """Transformation of models: to control and given positions, to each other, or to scale."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -17,6 +19,9 @@ FEWEST_WITH_OUTLIERS = 6
 ROUNDS = 3
 LEAST_TO_TELL = 4
 """Minimum control points for distinguishing an object from its mirror image."""
+TRIPLES = 150
+"""Largest number of similarities by three points; with a third of wrong points, all are good in one
+of three."""
 MIRRORED, FITS = 5.0, 30.0
 """Mirror image: required improvement of the fit, and fit relative to the extent."""
 
@@ -154,3 +159,28 @@ def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
         off = np.linalg.norm(source @ A.T + t - target, axis=1)
         good = off <= OUTLIER_LIMIT * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
     return found
+
+
+def similarity_of_most(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
+    """A and t of X' = A·X + t that fit most of the points, of which less than half may be wrong;
+    None: collinear.
+
+    Least median of the distances over similarities by three points (Rousseeuw 1984), then least
+    squares for the points within 2.5 robust standard deviations."""
+    n, rng = len(source), np.random.default_rng(0)
+    triples = list(itertools.islice(itertools.combinations(range(n), 3), TRIPLES + 1))
+    if len(triples) > TRIPLES:
+        triples = [rng.choice(n, 3, replace=False) for _ in range(TRIPLES)]
+    best, least = None, np.inf
+    for triple in triples:
+        found = many.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
+        if found is not None:
+            off = np.linalg.norm(source @ found[0].T + found[1] - target, axis=1)
+            # three points always nearly fit: the others decide
+            median = np.median(np.delete(off, triple)) if n > 3 else off.max()
+            if median < least:
+                best, least = off, median
+    if best is None:
+        return None
+    limit = max(2.5 * 1.4826 * least, np.sort(best)[2])
+    return many.similarity(source, target, (best <= limit).astype(float))

@@ -63,7 +63,9 @@ class Assessment:
     """Which points are `used`; the σ of control [n, 3], estimated where it was not given, with its
     `redundancy` in the plane and in height; for every point the error of its prediction from the
     others used, its σ [n, 3] and the probability of a larger one (NaN if it cannot be predicted).
-    `assumed`: σ could not be estimated. `factor`: given σ were multiplied by it, because hardly any
+    `assumed`: σ could not be estimated, in the plane and in height.
+
+    `factor`: given σ were multiplied by it, because hardly any
     point agrees with them."""
 
     used: Bool[np.ndarray, " n"]
@@ -72,7 +74,7 @@ class Assessment:
     error: Float[np.ndarray, "n 3"]
     error_sigma: Float[np.ndarray, "n 3"]
     probability: Float[np.ndarray, " n"]
-    assumed: bool
+    assumed: tuple[bool, bool]
     factor: float = 1.0
 
 
@@ -86,6 +88,10 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
 
     **Arguments:** `assumed`: σ if the points are too few to estimate it.
     """
+    if not len(found):
+        nothing, lacking = np.zeros((0, 3)), (True, True)
+        return Assessment(np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0),
+                          lacking)  # fmt: skip
     used = _search(found, assumed, significance)
     factor = 1.0
     if 2 * (~used).sum() >= len(found) and np.isfinite(found.sigma).any():
@@ -98,7 +104,8 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
         found = dataclasses.replace(found, sigma=scaled)
         used = _search(found, assumed, significance)
     sigma, redundancy, guessed = _resolve(found, used, assumed)
-    error, spread, probability = (np.full(s, np.nan) for s in ((len(found), 3),) * 2 + (len(found),))
+    error, spread = np.full((2, len(found), 3), np.nan)
+    probability = np.full(len(found), np.nan)
     for i in range(len(found)):
         test = _predict(found, used, [i], assumed)
         if test is not None:
@@ -194,7 +201,7 @@ def _resolve(found: Discrepancies, used, assumed: float):
     here = [g for g in groups if (g & used[:, None]).any()]
     redundancy = [0.0, 0.0]
     if not here:
-        return sigma, tuple(redundancy), bool(unknown.any())
+        return sigma, tuple(redundancy), (bool(groups[0].any()), bool(groups[1].any()))
     start = np.abs(found.difference - np.median(found.difference[used], axis=0))
     for group in here:
         sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), found.least)
@@ -211,7 +218,8 @@ def _resolve(found: Discrepancies, used, assumed: float):
             redundancy[which] = float(sigma[group][0] ** 2 * trace)
         if np.abs(sigma[unknown] / before[unknown] - 1).max() < SETTLED:
             break
-    lacking = [g for g, r in zip(groups, redundancy) if g.any() and r < LEAST_REDUNDANCY]
-    for group in lacking:
-        sigma[group] = assumed
-    return sigma, tuple(redundancy), bool(lacking)
+    lacking = tuple(bool(g.any()) and r < LEAST_REDUNDANCY for g, r in zip(groups, redundancy))
+    for group, few in zip(groups, lacking):
+        if few:
+            sigma[group] = assumed
+    return sigma, tuple(redundancy), lacking

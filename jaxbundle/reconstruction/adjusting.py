@@ -150,7 +150,7 @@ def _count_agreeing(network: Network, clearer: Weighted) -> int:
         return clearer.agreeing
 
 
-def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network, np.ndarray]:
+def adjust_determined(network: Network, **options) -> tuple[Adjustment, Network, np.ndarray]:
     """The adjustment without undetermined tie points; the network without them; its rows among
     those given."""
     rows = np.arange(len(network.observations))
@@ -180,7 +180,7 @@ def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points
 
 def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
-    result, network, kept = _adjust_determined(network)
+    result, network, kept = adjust_determined(network)
     kinds, given = kinds[kept], network.observations.sigma
     total, doubtful = np.ones(len(kept)), []
     if result.converged:
@@ -192,7 +192,7 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     for _ in range(ROUNDS):
         tell("data snooping")
         network = _with_sigma(network, given * total[:, None])
-        result, network, kept = _adjust_determined(
+        result, network, kept = adjust_determined(
             network, snooping="pope", significance=significance, doubtful=doubtful
         )
         kinds, given, total = kinds[kept], given[kept], total[kept]

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.io.networks.control import with_control
 from jaxbundle.network.build import make_further, make_network
 from jaxbundle.network.further import CameraParameters
-from jaxbundle.network.tables import Network, Points
+from jaxbundle.network.tables import Network
 from jaxbundle.photographs.exif import StatedDistance
 from jaxbundle.reconstruction.attitudes import Attitudes
 from jaxbundle.reconstruction.named import Named
@@ -22,8 +21,6 @@ PRIORS = {
 to itself (unless the files state it), of cx and cy to the longer side. What few photographs do not
 determine is then part of the σ of the result; parameters held at usual values would bias the others
 by many σ."""
-FEWEST_CONTROL = 3
-"""Minimum control points in a part to transform it into their frame."""
 FREE = ("fx", "fy", *(name for name in PRIORS if name != "fx"))
 ASPECT = "fy/fx"
 OF_THE_LENS = ("fx", "k1", "k2", "k3")
@@ -33,10 +30,10 @@ OF_THE_LENS = ("fx", "k1", "k2", "k3")
 @dataclasses.dataclass(frozen=True)
 class Extra:
     """Further data of a network: named points including control, distances between
-    them; positions of the photographs with their σ, and attitudes."""
+    them; positions of the photographs with their σ, and attitudes. (Coordinates of control:
+    `georeferencing`.)"""
 
     named: Named
-    control: Points | None = None
     distances: tuple[dict, ...] = ()
     positions: tuple[np.ndarray, np.ndarray] | None = None
     attitudes: Attitudes | None = None
@@ -86,10 +83,7 @@ def tie_network(
         stated = [cameras.stated[c] for c in used]
         network = _observe(network, stated, aspect_sigma)
         network = _with_ties(network, [cameras.lens[c] for c in used], np.isfinite(aspect_sigma))
-    control = extra.control
-    if control is None or len(there & set(control.id)) < FEWEST_CONTROL:
-        return network
-    return with_control(network, control).replace(object_unit="m")
+    return network
 
 
 def track_name(track: int) -> str:

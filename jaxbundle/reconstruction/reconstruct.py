@@ -19,15 +19,18 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
-from jaxbundle.photographs.places import map_positions
+from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
 from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
+from jaxbundle.reconstruction.block import Block, describe_block
 from jaxbundle.reconstruction.control import Control
+from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
+from jaxbundle.reconstruction.georeferencing import ENOUGH_CONTROL, Given, georeference
 from jaxbundle.reconstruction.named import find_named, name_unused
-from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
+from jaxbundle.reconstruction.network import Extra, tie_network, track_name
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
@@ -63,6 +66,9 @@ REPEATS = 0.3
 LARGEST_MISFIT = 4.0
 """Factor of σ above which a result is called doubtful; right results of rendered facades have up to
 2.5."""
+FARTHEST_CONTROL = 10_000.0
+"""Metres between control in a system without a name and satellite positions in their UTM zone; a
+block from the air is smaller, another system is farther."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -70,12 +76,16 @@ TEXTURE = 16
 @dataclasses.dataclass(frozen=True)
 class Part:
     """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
-    kinds of measurements."""
+    kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
+    could not be used, with the reason in `no_control`."""
 
     name: str
     adjustment: Adjustment
     colours: Mapping[str, tuple[int, int, int]]
     factors: Mapping[str, float]
+    block: Block
+    control: ControlTable | None = None
+    no_control: str = ""
 
 
 @print_in_one_screen
@@ -83,13 +93,14 @@ class Part:
 class Reconstruction:
     """`parts`, the largest first; photographs in none of them, with the reason; notes;
     verified `pairs`, by the names of their photographs: matches, agreeing matches,
-    kind; `photographs`: the examined files, by name."""
+    kind; `photographs`: the examined files, by name; `name` of the whole."""
 
     parts: tuple[Part, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
     photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    name: str = ""
 
     def __str__(self) -> str:
         lines = [
@@ -100,6 +111,13 @@ class Reconstruction:
         ]  # fmt: skip
         lines += [f"warning: {part.name}: {said}" for part in self.parts
                   for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
+        for part in self.parts:
+            lines += [f"warning: {part.name}: control is not used: {part.no_control}"] * bool(
+                part.no_control
+            )
+            if part.control is not None:
+                lines.append(part.control.sigma)
+                lines += [f"control: {said}" for said in part.control.notes]
         lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
         return "\n".join([*lines, *self.notes])
 
@@ -112,13 +130,15 @@ def reconstruct(
     tell: Tell = lambda stage, done, total: None,
     control: Control | None = None,
     distances: Sequence[dict] = (),
+    name: str = "",
 ) -> Reconstruction:
     """Orient photographs by their content, with self-calibration.
 
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
     all; `store`: folder for features and matches; `tell(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
-    `distances`: rows `from`, `to`, `value`, `sigma` between named points.
+    `distances`: rows `from`, `to`, `value`, `sigma` between named points; `name` of the result,
+    default: of the first folder.
 
     **Raises:** `InputError` if the photographs cannot be used; `NotSolvedError` if no two of
     them can be oriented.
@@ -128,21 +148,64 @@ def reconstruct(
     cameras = assign_cameras(photographs, camera)
     with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
         named, notes = find_named(photographs, settings.targets, control, pool.map)
-    notes += name_unused(named, control, distances, FEWEST_CONTROL)
-    positions = map_positions([p.exif.place for p in photographs]) if control is None else None
-    if positions is not None:
-        notes.append(f"satellite positions of the photographs: {positions.system}")
-    if control is not None and control.system:
-        notes.append(f"control in {control.system}")
+    positions, said = _positions(photographs, control)
+    notes += said
+    framed = positions is not None and positions.define_frame
+    notes += name_unused(named, control, distances, 1 if framed else ENOUGH_CONTROL)
     attitudes = None
-    if positions is not None:
+    if positions is not None and framed:
         attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
-    extra = Extra(named, control and control.points, tuple(distances),
-                  positions and positions[:2], attitudes)  # fmt: skip
+    names = tuple(p.name for p in photographs)
+    frame = None
+    if control is not None:
+        points = control.points.take(~control.points.has_role("tie"))
+        frame = Given(points, named, names, control.system, positions and positions[:2])
+        checks = {id for id, role in zip(points.id, points.role) if role == "check"}
+        named = named.take(np.array([one not in checks for one in named.name], bool))
+    extra = Extra(named, tuple(distances), positions[:2] if positions and framed else None,
+                  attitudes)  # fmt: skip
+    system = control.system if control is not None else positions.words if framed else ""
+    first = Path(given[0])
+    name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)
     making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
     making.notes += notes
+    making.frame, making.system, making.title = frame, system, name
     return making.run()
+
+
+def _positions(
+    photographs: Sequence[Photograph], control: Control | None
+) -> tuple[MapPositions | None, list[str]]:
+    """The satellite positions of the photographs in the system of control, else in their UTM zone,
+    and what is done with them."""
+    places = [p.exif.place for p in photographs]
+    if control is None:
+        found = map_positions(places)
+        if found is None:
+            return None, []
+        if not found.define_frame:
+            return found, ["satellite positions of the photographs extend over less than 8 σ: they "
+                           "do not define the frame"]  # fmt: skip
+        return found, [f"satellite positions of the photographs: {found.words}"]
+    notes = [f"control in {control.system or 'a system that its file does not name'}"]
+    there = sum(place is not None for place in places)
+    if not there:
+        return None, [*notes, "no satellite positions in the photographs: control alone gives the "
+                      "frame"]  # fmt: skip
+    found = map_positions(places, control.system)
+    if found is None:
+        return None, [*notes, f"satellite positions of {there} photographs are not used: they need "
+                      "heights, three photographs, and a system of control in metres"]  # fmt: skip
+    if not control.system:
+        away = np.nanmedian(found.X, 0) - np.median(control.points.position, axis=0)
+        distance = float(np.hypot(*away[:2]))
+        if distance > FARTHEST_CONTROL:
+            return None, [*notes, "satellite positions of the photographs are not used: they are "
+                          f"{distance / 1000:.0f} km from control in {found.system}; name the "
+                          "system of control in the first line of gcp_list.txt"]  # fmt: skip
+    return found, [*notes, f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
+                   f"photographs with their σ, in {found.words}"]  # fmt: skip
 
 
 class _Making:
@@ -157,6 +220,8 @@ class _Making:
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.tried: set[tuple[int, int]] = set()
+        self.frame: Given | None = None
+        self.system = self.title = ""
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -174,7 +239,8 @@ class _Making:
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         files = {p.name: p.path for p in self.photographs}
-        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files)
+        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files,
+                              self.title)  # fmt: skip
 
     def _matches(self):
         features = self._features()
@@ -323,7 +389,21 @@ class _Making:
         self.notes += [note] if note else []
         self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
         self.notes += [f"{name}: {said}" for said in doubts]
-        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
+        control, no_control = None, ""
+        if self.frame is not None:
+            try:
+                weighted, control = georeference(
+                    weighted, self.frame, self.settings.significance, self._begin
+                )
+            except (InputError, NotSolvedError) as error:
+                no_control = str(error)
+            self._begin("")
+        exif = {photograph.name: photograph.exif for photograph in self.photographs}
+        # without control and positions the frame is an arbitrary one
+        absolute = control is not None or self.extra.positions is not None
+        block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
+        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors, block, control,
+                    no_control)  # fmt: skip
         return part, dict(oriented.images)
 
     def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:

@@ -50,7 +50,8 @@ def georeferenced():
          **{f"s{a}": ["free" if np.isinf(s) else s for s in sigma[:, k]]
             for k, a in enumerate("XYZ")}},
         {"image": [images.id[i] for i in rays.image], "point": [points.id[p] for p in rays.point],
-         "x": rays.xy[:, 0], "y": rays.xy[:, 1], **dict.fromkeys(("sx", "sy"), np.full(len(rays), 0.002))},
+         "x": rays.xy[:, 0], "y": rays.xy[:, 1],
+         **dict.fromkeys(("sx", "sy"), np.full(len(rays), 0.002))},
         {"from": [names[0]], "to": [names[1]], "value": [length], "sigma": [0.001]},
         antennas=antennas, antenna={"free": ["shift"], "sigma": {"shift": 10.0}},
         attitudes=attitudes,

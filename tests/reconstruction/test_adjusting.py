@@ -79,7 +79,7 @@ def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, h
         return SimpleNamespace(converged=not undetermined, undetermined=undetermined)
 
     monkeypatch.setattr(adjusting, "adjust", adjust)
-    result, kept, rows = adjusting._adjust_determined(network)
+    result, kept, rows = adjusting.adjust_determined(network)
     assert result.converged and len(kept.points) == len(network.points) - 1
     left = np.array(network.points.id)[network.observations.point[rows]]
     assert list(left) == list(np.array(kept.points.id)[kept.observations.point])

@@ -54,14 +54,15 @@ def readjustable_network(adjustment) -> Network:
     """The network of a solved `Adjustment` with adjusted start values and all observations that
     took part: adjusted again it gives the same values, σ and σ0.
 
-    Priors of orientations and cameras become rows of `exterior_priors` and `camera_parameters`, because
-    what was observed differs from the start values; control points have their given coordinates.
+    Priors of orientations and cameras become rows of `exterior_priors` and `camera_parameters`,
+    because what was observed differs from the start values; control points have their given
+    coordinates.
     σ are the final ones, after variance components and robust weights. Observations removed by data
     snooping, points without coordinates and check points are left out.
     """
     problem = adjustment.problem
     network, data = problem.network, problem.data
-    images, points, rays = network.images, network.points, network.observations
+    images, rays = network.images, network.observations
     values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(

@@ -64,8 +64,9 @@ def _control(adjustment) -> Finding:
     tau = np.abs(adjustment.residuals["tau"][adjustment.residuals["kind"] == "control"])
     tau = tau[np.isfinite(tau)]
     if not len(tau):
-        state = GOOD if sum(number.values()) > 3 else DOUBTFUL
-        return Finding("Control", state, f"{', '.join(parts)}; no residuals to test them by")
+        words = (f"{', '.join(parts)} held exactly: their coordinates have no σ, so that nothing "
+                 "tests them; state σ, or make some of them check points")  # fmt: skip
+        return Finding("Control", DOUBTFUL, words)
     limit = critical_value(adjustment)
     words = f"{', '.join(parts)}; largest |τ| {significant(tau.max())}, critical value at 0.1 % "
     state = GOOD if tau.max() <= limit else BAD
@@ -80,7 +81,8 @@ def _checks(adjustment) -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table, limit = adjustment.table("checks"), critical_value(adjustment)
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    largest = (np.abs(d[s > 0]) / s[s > 0]).max(initial=0.0)
+    known = (s > 0) & np.isfinite(d)
+    largest = (np.abs(d[known]) / s[known]).max(initial=0.0)
     words = (
         f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
         f"difference {significant(largest)} times the σ of its intersection"
