@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, are_controlled
+from jaxbundle.orientation.growth import FITS, Model, are_controlled
 from jaxbundle.orientation.sights import Sights
 
 OUTLIER_LIMIT = 3.0
@@ -22,8 +22,8 @@ LEAST_TO_TELL = 4
 TRIPLES = 150
 """Largest number of similarities by three points; with a third of wrong points, all are good in one
 of three."""
-MIRRORED, FITS = 5.0, 30.0
-"""Mirror image: required improvement of the fit, and fit relative to the extent."""
+MIRRORED = 5.0
+"""Mirror image: required improvement of the fit."""
 
 
 def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model | None:

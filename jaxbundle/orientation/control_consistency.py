@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
 
-SIGNIFICANCE = 0.01
+SIGNIFICANCE = 0.05
 """Probability of suspecting any point of control without contradictions."""
 PAIRS_UP_TO = 20
 """With at most this many points two are also tested together: two errors of one size, as of

@@ -13,8 +13,6 @@ their UTM zone.
 import csv
 import dataclasses
 import math
-import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +21,12 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import read_control
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.rules import check_choice
 from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
 
 MANUAL = 1.0
 """Default σ of a manual measurement, pixels."""
-EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
-"""A selection of check points, such as `every 3rd`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,32 +58,6 @@ def with_sigma(control: Control, text: str) -> Control:
     points, free = control.points, np.array(control.points.role, object) != "fixed"
     given = np.where(np.isnan(control.points.sigma) & free[:, None], sigma, points.sigma)
     return dataclasses.replace(control, points=dataclasses.replace(points, sigma=given))
-
-
-def select_checks(points: Points, selection: Sequence[str]) -> Points:
-    """Control points with some of them as check points.
-
-    **Arguments:** `selection`: names, several with commas, or `every 3rd` (in the order of the
-    file, the second, fifth, … point).
-
-    **Raises:** `InputError` for an unknown name, or if no control is left."""
-    chosen: set[str] = set()
-    for text in selection:
-        every = EVERY.match(text.strip())
-        if every and (step := int(every[1])) > 1:
-            chosen |= {*points.id[step // 2 :: step]}
-            continue
-        for name in [text] if text in points.id else [part.strip() for part in text.split(",")]:
-            if name not in points.id:
-                raise InputError(
-                    f"--check {name}: no such point in {points.source.name}"
-                    f"{did_you_mean(name, points.id)}; expected names, or every 3rd"
-                )
-            chosen.add(name)
-    roles = tuple("check" if id in chosen else role for id, role in zip(points.id, points.role))
-    if chosen and set(roles) == {"check"}:
-        raise InputError(f"--check: all {len(roles)} points are check points; no control is left")
-    return dataclasses.replace(points, role=roles)
 
 
 def read_control_measurements(path: str | Path) -> Control:

@@ -54,7 +54,8 @@ def test_sigma_is_estimated_and_good_points_are_kept():
         result = assess(found, ASSUMED)
         kept += result.used.all()
         sigmas.append(result.sigma[0])
-    assert kept >= 28
+    # at 5 %: 25 or fewer of 30 have a probability of 0.3 %
+    assert kept > 25
     mean = np.sqrt(np.mean(np.square(sigmas), 0))
     np.testing.assert_allclose(mean, 0.5, rtol=0.12)
 

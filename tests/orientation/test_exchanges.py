@@ -49,3 +49,15 @@ def test_the_corners_of_a_square_have_two_explanations():
 
 def test_points_of_another_object_have_no_explanation():
     assert contradiction(POINTS[:8], POINTS[8:16]) is None
+
+
+def test_the_tolerance_is_that_of_the_sigma_of_control():
+    """Handheld control, σ a sixth of its extent, contradicts nothing; exact control would."""
+    source, target = lists(9)
+    target = target + 0.5 * np.random.default_rng(1).standard_normal(target.shape)
+    assert contradiction(source, target, np.full((9, 3), 0.5)) is None
+    exact = contradiction(source, target, np.full((9, 3), np.nan))
+    assert exact is None or exact.before > 0.5
+    far = target.copy()
+    far[[0, 2]] = far[[2, 0]] + [[30, 0, 0], [-30, 0, 0]]
+    assert contradiction(source, far, np.full((9, 3), 0.5)) is not None

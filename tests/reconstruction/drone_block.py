@@ -1,0 +1,113 @@
+"""A small simulated drone block: nine photographs from 60 m, tie points, control points, satellite
+positions with an offset; at the level below matching."""
+
+import dataclasses
+
+import numpy as np
+
+import jaxbundle
+from jaxbundle import Camera
+from jaxbundle.network.tables import Points
+from jaxbundle.planning.simulate import simulate_with_truth
+from jaxbundle.planning.stations import Stations
+from jaxbundle.reconstruction.adjusting import Weighted
+from jaxbundle.reconstruction.georeferencing import Given
+from jaxbundle.reconstruction.named import Named
+
+ORIGIN = np.array([235_000.0, 3_811_000.0, 250.0])
+OFFSET = np.array([1.5, -2.0, 31.0])
+"""Satellite positions minus control."""
+SATELLITE = np.array([1.0, 1.0, 2.0])
+F, SIZE = 1500.0, (2000, 1500)
+CAMERA = Camera("drone", "opencv", {"fx": F, "fy": F, "cx": 999.5, "cy": 749.5},
+                free=("fx", "cx", "cy", "k1"), tie=(("fx", "fy"),), image_size=SIZE,
+                sigma={"fx": 0.2 * F, "cx": 20.0, "cy": 20.0, "k1": 0.3})  # fmt: skip
+CONTROL, TIES = 9, 60
+NAMES = tuple(f"gcp{k:02d}" for k in range(CONTROL))
+
+
+@dataclasses.dataclass
+class Drone:
+    """True control points, the measurements of all points, the network without control, and given
+    satellite positions."""
+
+    truth: np.ndarray
+    named: Named
+    network: jaxbundle.Network
+    images: tuple[str, ...]
+    positions: tuple[np.ndarray, np.ndarray]
+
+    def given(self, X, sigma=np.nan, roles=None, positions=True, named=None) -> Given:
+        """What a surveyor gives: control coordinates [9, 3] and their σ."""
+        s = np.broadcast_to(np.asarray(sigma, float), (CONTROL, 3)).copy()
+        points = Points(NAMES, roles or ("control",) * CONTROL, X, s)
+        return Given(points, named or self.named, self.images, "EPSG:32611",
+                     self.positions if positions else None)  # fmt: skip
+
+    def block(self, positions=True, named=None) -> Weighted:
+        """The block adjusted without control, in the system of the positions or in its own."""
+        network = self.network
+        if not positions:
+            X0 = network.images.position
+            images = dataclasses.replace(network.images, position=(X0 - ORIGIN) / 20.0,
+                                         sigma=np.full_like(network.images.sigma, np.nan))  # fmt: skip
+            points = dataclasses.replace(network.points,
+                                         position=(network.points.position - ORIGIN) / 20.0)  # fmt: skip
+            network = network.replace(images=images, points=points, datum="inner")
+        if named is not None:
+            network = with_measurements(network, named)
+        result = jaxbundle.adjust(network, snooping="pope")
+        assert result.converged
+        return Weighted(result, {}, len(network.observations))
+
+
+def with_measurements(network, named):
+    """The network with other measurements of the control points."""
+    row = {id: k for k, id in enumerate(network.points.id)}
+    old = network.observations
+    ties = old.take(~np.isin(old.point, [row[n] for n in NAMES]))
+    return network.replace(observations=dataclasses.replace(
+        ties, image=np.concatenate([ties.image, named.image]),
+        point=np.concatenate([ties.point, [row[n] for n in named.name]]),
+        xy=np.concatenate([ties.xy, named.xy]), sigma=np.concatenate([ties.sigma, named.sigma]),
+        source=jaxbundle.network.tables.Source("observations"),
+    ))  # fmt: skip
+
+
+def drone_block(seed: int) -> Drone:
+    """The block of a seed."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid([-18, 0, 18], [-14, 0, 14]), -1).reshape(-1, 2)
+    X0 = np.concatenate([grid + rng.uniform(-2, 2, (9, 2)), rng.uniform(57, 63, (9, 1))], 1)
+    angles = np.stack([*rng.uniform(-0.08, 0.08, (2, 9)), rng.uniform(-3, 3, 9)], 1)
+    ground = lambda n, w: np.stack([rng.uniform(-w, w, n), rng.uniform(-w, w, n),
+                                    rng.uniform(-3, 3, n)], 1)  # fmt: skip
+    X = np.concatenate([ground(CONTROL, 22.0), ground(TIES, 45.0)]) + ORIGIN
+    stations = Stations(X0 + ORIGIN, angles)
+    simulated = simulate_with_truth(stations, X, CAMERA, noise=0.3, seed=seed)
+    network, truth = simulated.network, simulated.truth
+    ids = [NAMES[int(id)] if int(id) < CONTROL else f"t{id}" for id in _numbers(network.points.id)]
+    rays = network.observations
+    named = np.flatnonzero(np.array([ids[p] in NAMES for p in rays.point]))
+    measured = Named(rays.image[named], tuple(ids[p] for p in rays.point[named]),
+                     rays.xy[named].copy(), np.ones((len(named), 2)))  # fmt: skip
+    manual = np.array([ids[p] in NAMES for p in rays.point])
+    sigma = np.repeat(np.where(manual, 1.0, 0.3)[:, None], 2, 1)
+    satellite = truth.images.position + OFFSET + SATELLITE * rng.standard_normal((9, 3))
+    spread = np.tile(SATELLITE, (9, 1))
+    images = dataclasses.replace(
+        network.images, position=satellite, angles=truth.images.angles,
+        sigma=np.concatenate([spread, np.full((9, 3), np.nan)], 1),
+    )  # fmt: skip
+    position = truth.points.position + OFFSET
+    network = network.replace(
+        images=images, observations=dataclasses.replace(rays, sigma=sigma), datum="control",
+        points=Points(tuple(ids), ("tie",) * len(ids), position, np.full((len(ids), 3), np.nan)),
+    )  # fmt: skip
+    control = np.array([truth.points.position[ids.index(n)] for n in NAMES])
+    return Drone(control, measured, network, network.images.id, (satellite, spread))
+
+
+def _numbers(ids):
+    """The targets of the points, counted from 0."""
+    return [int(id) - 1 for id in ids]

@@ -1,0 +1,171 @@
+"""Control and satellite positions of a simulated drone block: what is used, named and written."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.cli.outputs import write_targets
+from jaxbundle.errors import InputError
+from jaxbundle.reconstruction.block import describe_block
+from jaxbundle.reconstruction.georeferencing import georeference
+
+SIGMA = 0.5
+"""Of handheld control, metres."""
+
+
+def controlled(drone, given, positions=True, named=None):
+    """The final adjustment, the table by name, and the whole table."""
+    block = drone.block(positions, named)
+    final, table = georeference(block, given, 0.001, lambda stage: None)
+    return final.adjustment, {p.id: p for p in table.points}, table
+
+
+def swapped(named, point, other):
+    """Measurements in which one of a point has the place of another in the same photograph."""
+    for k, (image, name) in enumerate(zip(named.image, named.name)):
+        for n in np.flatnonzero(named.image == image):
+            if name == point and named.name[n] == other:
+                xy = named.xy.copy()
+                xy[k] = named.xy[n] + 0.4
+                return dataclasses.replace(named, xy=xy), int(image)
+    raise AssertionError(f"{point} and {other} are in no common photograph")
+
+
+@pytest.fixture(scope="module")
+def drone():
+    return drone_block(4)
+
+
+@pytest.fixture(scope="module")
+def handheld(drone):
+    return drone.truth + SIGMA * np.random.default_rng(8).standard_normal((CONTROL, 3))
+
+
+@pytest.fixture(scope="module")
+def good(drone, handheld):
+    return controlled(drone, drone.given(handheld))
+
+
+def test_positions_are_observed_with_an_offset(drone, good):
+    result, _, table = good
+    assert isinstance(result, Adjustment) and result.network.datum == "control"
+    positions = describe_block(result, {}, "EPSG:32611").positions
+    assert len(positions.difference) == 9
+    # three σ of the offset; the RMS of nine positions
+    assert np.all(np.abs(positions.offset - OFFSET) < 3 * positions.offset_sigma + 0.3)
+    assert np.all(positions.rms / SATELLITE < 1.8) and np.all(positions.rms / SATELLITE > 0.4)
+    assert "estimated from the residuals" in table.sigma
+
+
+def test_sigma_of_control_is_estimated_and_used(good):
+    _, points, _ = good
+    assert all(p.used for p in points.values())
+    sigma = points["gcp00"].sigma
+    # its own relative σ is 1/√(2·redundancy), about 0.2 in the plane and 0.3 in height
+    assert 0.25 < sigma[0] < 0.9 and 0.2 < sigma[2] < 1.1
+
+
+def test_the_ground_is_within_its_sigma(drone, good):
+    result, points, _ = good
+    X = np.array([result.point_values[result.problem.network.points.id.index(n)] for n in NAMES])
+    sigma = np.sqrt(np.diagonal(result.point_covariance, axis1=1, axis2=2))
+    rows = [result.problem.network.points.id.index(n) for n in NAMES]
+    assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
+
+
+@pytest.mark.parametrize("positions", [True, False])
+def test_a_wrong_name_and_a_bad_point_are_named(drone, handheld, positions):
+    named, image = swapped(drone.named, "gcp04", "gcp00")
+    X = handheld.copy()
+    X[6] += [2.9, -2.6, 0.0]
+    _, points, table = controlled(drone, drone.given(X, positions=positions, named=named),
+                                  positions, named)  # fmt: skip
+    assert table.left_out == ["gcp06"]
+    assert "the other points and the photographs put it" in points["gcp06"].verdict
+    assert points["gcp04"].used and drone.images[image] in points["gcp04"].verdict
+    assert "the place of gcp00: a wrong name" in points["gcp04"].verdict
+    others = [p.verdict for id, p in points.items() if id not in ("gcp04", "gcp06")]
+    assert set(others) == {"used"}
+    # compared although not used: the error of the point, with that of the others
+    assert np.linalg.norm(points["gcp06"].residual[:2] + [2.9, -2.6]) < 3 * SIGMA
+
+
+def test_stated_sigma_is_not_refused(drone, handheld):
+    named, _ = swapped(drone.named, "gcp04", "gcp00")
+    X = handheld.copy()
+    X[6] += [4.9, -4.6, 0.0]
+    _, points, table = controlled(drone, drone.given(X, SIGMA, named=named), named=named)
+    assert table.left_out == ["gcp06"] and "as stated (0.50 m)" in table.sigma
+    np.testing.assert_allclose(points["gcp01"].sigma, SIGMA)
+
+
+def test_exchanged_coordinates_are_named(drone, handheld):
+    X = handheld.copy()
+    X[[2, 7]] = X[[7, 2]]
+    _, points, table = controlled(drone, drone.given(X))
+    assert table.left_out == ["gcp02", "gcp07"]
+    assert "it fits the coordinates of gcp07" in points["gcp02"].verdict
+
+
+def test_heights_of_zero_are_unknown(drone, handheld):
+    X = handheld * [1, 1, 0]
+    result, points, table = controlled(drone, drone.given(X))
+    assert "the heights of all control points are 0" in table.notes[0]
+    assert "unknown" in table.notes[0]
+    assert all(p.used and np.isnan(p.residual[2]) for p in points.values())
+    positions = describe_block(result, {}, "x").positions
+    # the heights are those of the satellite positions: no offset is estimated
+    assert np.isnan(positions.offset[2]) and np.isfinite(positions.offset[:2]).all()
+    k = result.problem.network.points.id.index("gcp01")
+    assert abs(result.point_values[k, 2] - drone.truth[1, 2] - OFFSET[2]) < 3 * SATELLITE[2]
+
+
+def test_check_points_are_compared_and_never_used(drone, handheld):
+    X = handheld.copy()
+    X[3] += [40.0, 0.0, 0.0]
+    roles = tuple("check" if k in (3, 8) else "control" for k in range(CONTROL))
+    keep = ~np.isin(np.array(drone.named.name), ["gcp03", "gcp08"])
+    result, points, table = controlled(drone, drone.given(X, roles=roles),
+                                       named=drone.named.take(keep))  # fmt: skip
+    assert {"gcp03", "gcp08"}.isdisjoint(result.problem.network.points.id)
+    assert points["gcp03"].residual[0] == pytest.approx(-40.0, abs=4 * SIGMA)
+    assert points["gcp03"].verdict == "check" and not points["gcp03"].used
+    assert np.isfinite(table.rms("check")).all() and table.rms("check")[0] > 20
+
+
+def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
+    roles = ("control", "control", *["check"] * (CONTROL - 2))
+    keep = np.isin(np.array(drone.named.name), NAMES[:2])
+    with pytest.raises(InputError, match="expected 3, got 2"):
+        controlled(drone, drone.given(handheld, roles=roles, positions=False), False,
+                   drone.named.take(keep))  # fmt: skip
+
+
+def test_the_written_network_gives_the_same_numbers(good, tmp_path):
+    result, _, _ = good
+    write_targets(result, "", tmp_path / "out", brief=True, plots=False)
+    tables = {p.name for p in (tmp_path / "out" / "network").iterdir()}
+    assert {"antennas.csv", "camera_parameters.csv"} <= tables
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxbundle", "adjust", tmp_path / "out" / "network", "--json",
+         tmp_path / "again.json", "--quiet"], capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    again = json.loads((tmp_path / "again.json").read_text())
+    before = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert again["redundancy"] == before["redundancy"] and again["datum"] == "control"
+    assert again["sigma0"] == pytest.approx(before["sigma0"], rel=1e-8)
+    strip = again["further_unknowns"]["GNSS strip"]["all"]
+    for name, one in before["further_unknowns"]["GNSS strip"]["all"].items():
+        assert strip[name]["value"] == pytest.approx(one["value"], abs=1e-5)
+        assert strip[name]["sigma"] == pytest.approx(one["sigma"], rel=1e-5)
+    for id, point in before["points"].items():
+        for axis in "XYZ":
+            assert again["points"][id][axis]["value"] == pytest.approx(point[axis]["value"], abs=1e-5)
+            assert again["points"][id][axis]["sigma"] == pytest.approx(point[axis]["sigma"], rel=1e-5)
