@@ -391,10 +391,10 @@ def test_an_image_first_placed_by_repeated_parts_is_placed_again():
     np.testing.assert_allclose(ratio(images.position), ratio(true), rtol=0.1)
 
 
-def test_handheld_control_is_not_refused():
+def test_handheld_control_is_not_refused(with_control):
     """σ of control a twelfth of its extent, with one measurement under a wrong name: start values
     are found, and the wrong measurement is named."""
-    network, truth = block(strips=2, images=3, points=80, control=range(9), start=TRUE)
+    network = with_control.network
     control = np.flatnonzero(network.points.has_role("control"))
     sigma, X = network.points.sigma.copy(), network.points.position.copy()
     extent = np.ptp(X[control], axis=0).max()
@@ -403,11 +403,10 @@ def test_handheld_control_is_not_refused():
     points = dataclasses.replace(network.points, position=X, sigma=sigma)
     rays = network.observations
     xy = rays.xy.copy()
-    seen = [np.flatnonzero(rays.point == p) for p in control[:2]]
-    wrong = seen[0][0]
+    wrong = int(np.flatnonzero(rays.point == control[-1])[0])
     xy[wrong] += [15.0, -9.0]
     network = bare(network.replace(points=points, observations=dataclasses.replace(rays, xy=xy)))
     found = orient(network)
     assert not found.images and not found.finding
-    name = f"{points.id[control[0]]} in {network.images.id[rays.image[wrong]]}"
+    name = f"{points.id[control[-1]]} in {network.images.id[rays.image[wrong]]}"
     assert found.left_out == (name,)
