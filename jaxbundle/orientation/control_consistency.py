@@ -204,8 +204,8 @@ def _resolve(found: Discrepancies, used, assumed: float):
         return sigma, tuple(redundancy), (bool(groups[0].any()), bool(groups[1].any()))
     start = np.abs(found.difference - np.median(found.difference[used], axis=0))
     for group in here:
-        sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), found.least)
-    for _ in range(ROUNDS):
+        sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
+    for number in range(ROUNDS):
         W, d, rows, _ = _weight_matrix(found, sigma, used)
         Wd, before = W @ d, sigma.copy()
         for group in here:
@@ -214,8 +214,9 @@ def _resolve(found: Discrepancies, used, assumed: float):
             if trace > 0:
                 s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
                 sigma[group] = max(s, found.least)
-            which = 0 if group[:, :2].any() else 1
-            redundancy[which] = float(sigma[group][0] ** 2 * trace)
+            if number == 0:
+                # with a σ that dominates C; where the estimate is small, its share is hardly any
+                redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
         if np.abs(sigma[unknown] / before[unknown] - 1).max() < SETTLED:
             break
     lacking = tuple(bool(g.any()) and r < LEAST_REDUNDANCY for g, r in zip(groups, redundancy))

@@ -268,9 +268,9 @@ def _name_wrong(block: "_Block", found: Choice, id: str) -> None:
         return
     off = block.misses(one, X)
     for n in np.flatnonzero(~one.good):
-        ground = off[n] * one.pixel[n] * np.linalg.norm(X - block.X0[one.image[n]])
-        said = (f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px "
-                f"({ground:.1f} m) from where the other photographs see it")  # fmt: skip
+        passes = np.linalg.norm(np.cross(X - block.X0[one.image[n]], one.rays[n]))
+        said = (f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px from "
+                f"where the other photographs see it, its ray passes at {passes:.2f} m")  # fmt: skip
         other = block.seen_there(one, n, id, found.measured)
         found.wrong.setdefault(id, []).append(
             said + (f"; it is at the place of {other}: a wrong name" if other else "")

@@ -60,15 +60,18 @@ def test_sigma_is_estimated_and_good_points_are_kept():
     np.testing.assert_allclose(mean, 0.5, rtol=0.12)
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("planimetric, stated", [(True, np.nan), (False, np.nan), (False, 0.5)])
-def test_a_bad_point_is_named_and_no_good_one(seed, planimetric, stated):
-    _, found = block(9, seed, planimetric=planimetric, stated=stated)
-    found.difference[5, :2] += [4.5, -3.0]
-    result = assess(found, ASSUMED)
-    assert np.flatnonzero(~result.used).tolist() == [5]
-    assert abs(result.error[5, 0] - 4.5) < 3 * 0.6
-    assert result.probability[5] < 1e-3 and not any(result.assumed)
+def test_a_bad_point_is_named_and_hardly_ever_a_good_one(planimetric, stated):
+    others = 0
+    for seed in range(12):
+        _, found = block(9, seed, planimetric=planimetric, stated=stated)
+        found.difference[5, :2] += [4.5, -3.0]
+        result = assess(found, ASSUMED)
+        left = np.flatnonzero(~result.used).tolist()
+        assert 5 in left and result.probability[5] < 5e-3 and not any(result.assumed)
+        assert abs(result.error[5, 0] - 4.5) < 3 * 0.6
+        others += len(left) > 1
+    assert others <= 2  # at 5 %: more than 2 of 12 have a probability of 2 %
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -1,13 +1,12 @@
 """Control and satellite positions of a simulated drone block: what is used, named and written."""
 
-import dataclasses
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block
+from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block, swapped
 
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cli.outputs import write_targets
@@ -19,22 +18,11 @@ SIGMA = 0.5
 """Of handheld control, metres."""
 
 
-def controlled(drone, given, positions=True, named=None):
+def controlled(drone, given):
     """The final adjustment, the table by name, and the whole table."""
-    block = drone.block(positions, named)
+    block = drone.block(given.positions is not None)
     final, table = georeference(block, given, 0.001, lambda stage: None)
     return final.adjustment, {p.id: p for p in table.points}, table
-
-
-def swapped(named, point, other):
-    """Measurements in which one of a point has the place of another in the same photograph."""
-    for k, (image, name) in enumerate(zip(named.image, named.name)):
-        for n in np.flatnonzero(named.image == image):
-            if name == point and named.name[n] == other:
-                xy = named.xy.copy()
-                xy[k] = named.xy[n] + 0.4
-                return dataclasses.replace(named, xy=xy), int(image)
-    raise AssertionError(f"{point} and {other} are in no common photograph")
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +69,13 @@ def test_the_ground_is_within_its_sigma(drone, good):
 
 @pytest.mark.parametrize("positions", [True, False])
 def test_a_wrong_name_and_a_bad_point_are_named(drone, handheld, positions):
-    named, image = swapped(drone.named, "gcp04", "gcp00")
+    named, row = swapped(drone.named, "gcp04", "gcp00")
     X = handheld.copy()
     X[6] += [2.9, -2.6, 0.0]
-    _, points, table = controlled(drone, drone.given(X, positions=positions, named=named),
-                                  positions, named)  # fmt: skip
+    _, points, table = controlled(drone, drone.given(X, positions=positions, named=named))
     assert table.left_out == ["gcp06"]
     assert "the other points and the photographs put it" in points["gcp06"].verdict
-    assert points["gcp04"].used and drone.images[image] in points["gcp04"].verdict
+    assert points["gcp04"].used and drone.images[named.image[row]] in points["gcp04"].verdict
     assert "the place of gcp00: a wrong name" in points["gcp04"].verdict
     others = [p.verdict for id, p in points.items() if id not in ("gcp04", "gcp06")]
     assert set(others) == {"used"}
@@ -100,7 +87,7 @@ def test_stated_sigma_is_not_refused(drone, handheld):
     named, _ = swapped(drone.named, "gcp04", "gcp00")
     X = handheld.copy()
     X[6] += [4.9, -4.6, 0.0]
-    _, points, table = controlled(drone, drone.given(X, SIGMA, named=named), named=named)
+    _, points, table = controlled(drone, drone.given(X, SIGMA, named=named))
     assert table.left_out == ["gcp06"] and "as stated (0.50 m)" in table.sigma
     np.testing.assert_allclose(points["gcp01"].sigma, SIGMA)
 
@@ -130,9 +117,7 @@ def test_check_points_are_compared_and_never_used(drone, handheld):
     X = handheld.copy()
     X[3] += [40.0, 0.0, 0.0]
     roles = tuple("check" if k in (3, 8) else "control" for k in range(CONTROL))
-    keep = ~np.isin(np.array(drone.named.name), ["gcp03", "gcp08"])
-    result, points, table = controlled(drone, drone.given(X, roles=roles),
-                                       named=drone.named.take(keep))  # fmt: skip
+    result, points, table = controlled(drone, drone.given(X, roles=roles))
     assert {"gcp03", "gcp08"}.isdisjoint(result.problem.network.points.id)
     assert points["gcp03"].residual[0] == pytest.approx(-40.0, abs=4 * SIGMA)
     assert points["gcp03"].verdict == "check" and not points["gcp03"].used
@@ -141,10 +126,8 @@ def test_check_points_are_compared_and_never_used(drone, handheld):
 
 def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
     roles = ("control", "control", *["check"] * (CONTROL - 2))
-    keep = np.isin(np.array(drone.named.name), NAMES[:2])
     with pytest.raises(InputError, match="expected 3, got 2"):
-        controlled(drone, drone.given(handheld, roles=roles, positions=False), False,
-                   drone.named.take(keep))  # fmt: skip
+        controlled(drone, drone.given(handheld, roles=roles, positions=False))
 
 
 def test_the_written_network_gives_the_same_numbers(good, tmp_path):
@@ -161,11 +144,10 @@ def test_the_written_network_gives_the_same_numbers(good, tmp_path):
     before = json.loads((tmp_path / "out" / "result.json").read_text())
     assert again["redundancy"] == before["redundancy"] and again["datum"] == "control"
     assert again["sigma0"] == pytest.approx(before["sigma0"], rel=1e-8)
-    strip = again["further_unknowns"]["GNSS strip"]["all"]
-    for name, one in before["further_unknowns"]["GNSS strip"]["all"].items():
-        assert strip[name]["value"] == pytest.approx(one["value"], abs=1e-5)
-        assert strip[name]["sigma"] == pytest.approx(one["sigma"], rel=1e-5)
-    for id, point in before["points"].items():
-        for axis in "XYZ":
-            assert again["points"][id][axis]["value"] == pytest.approx(point[axis]["value"], abs=1e-5)
-            assert again["points"][id][axis]["sigma"] == pytest.approx(point[axis]["sigma"], rel=1e-5)
+    pairs = [(row[n], again["further_unknowns"]["GNSS strip"]["all"][n])
+             for row in before["further_unknowns"]["GNSS strip"].values() for n in row]  # fmt: skip
+    pairs += [(point[axis], again["points"][id][axis]) for id, point in before["points"].items()
+              for axis in "XYZ"]  # fmt: skip
+    for one, other in pairs:
+        assert other["value"] == pytest.approx(one["value"], abs=1e-5)
+        assert other["sigma"] == pytest.approx(one["sigma"], rel=1e-5)
