@@ -45,14 +45,12 @@ class Discrepancies:
 
     **Fields:** `difference` [n, 3]; `cofactor` [n, 3, n, 3], their covariance without that of
     control; `sigma` [n, 3] of control: NaN where it is to be estimated, infinite on axes that are
-    not controlled; `open` [n, 3, k], what the block leaves open; `least`: smallest estimated σ.
-    """
+    not controlled; `open` [n, 3, k], what the block leaves open."""
 
     difference: Float[np.ndarray, "n 3"]
     cofactor: Float[np.ndarray, "n 3 n 3"]
     sigma: Float[np.ndarray, "n 3"]
     open: Float[np.ndarray, "n 3 k"]
-    least: float
 
     def __len__(self) -> int:
         return len(self.difference)
@@ -63,7 +61,7 @@ class Assessment:
     """Which points are `used`; the σ of control [n, 3], estimated where it was not given, with its
     `redundancy` in the plane and in height; for every point the error of its prediction from the
     others used, its σ [n, 3] and the probability of a larger one (NaN if it cannot be predicted).
-    `assumed`: σ could not be estimated, in the plane and in height.
+    `assumed`: whether σ is the assumed one, in the plane and in height.
 
     `factor`: given σ were multiplied by it, because hardly any
     point agrees with them."""
@@ -86,7 +84,7 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     least half of the points stay: if more contradict their given σ, these are wrong, and all are
     multiplied by one factor.
 
-    **Arguments:** `assumed`: σ if the points are too few to estimate it.
+    **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one.
     """
     if not len(found):
         nothing, lacking = np.zeros((0, 3)), (True, True)
@@ -114,35 +112,34 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
 
 
 def _search(found: Discrepancies, assumed: float, significance: float) -> Bool[np.ndarray, " n"]:
+    """Which points do not contradict the others."""
     used = np.ones(len(found), bool)
     fewest = max(FEWEST_AGREEING, (len(found) + 1) // 2)
-    while used.sum() > fewest:
-        rows = np.flatnonzero(used).tolist()
-        worst, least = [], level_of_one(significance, len(rows))
-        for tests in ([[i] for i in rows], _pairs(rows)):
-            level = level_of_one(significance, len(tests))
-            for test in tests if used.sum() - len(tests[0]) >= fewest else ():
-                p = _probability(found, used, test, assumed)
-                if p < level and p / level < least / level_of_one(significance, len(rows)):
-                    worst, least = test, p / level * level_of_one(significance, len(rows))
-            if worst:
-                break
-        if not worst:
-            break
+    while worst := _most_improbable(found, used, assumed, significance, used.sum() - fewest):
         used[worst] = False
-    for i in sorted(np.flatnonzero(~used), key=lambda i: -_probability(found, used, [i], assumed)):
+    left_out = np.flatnonzero(~used).tolist()
+    for i in sorted(left_out, key=lambda i: -_probability(found, used, [i], assumed)):
         if _probability(found, used, [i], assumed) > level_of_one(significance, len(found)):
             used[i] = True
     return used
 
 
-def _pairs(rows: Sequence[int]) -> list[list[int]]:
-    return [list(p) for p in itertools.combinations(rows, 2)] if len(rows) <= PAIRS_UP_TO else [[]]
+def _most_improbable(
+    found: Discrepancies, used, assumed: float, significance: float, most: int
+) -> list[int]:
+    """The point, or else the two points, of at most this number, that are most improbable; none if
+    chance explains all."""
+    rows = np.flatnonzero(used).tolist()
+    pairs = itertools.combinations(rows, 2) if len(rows) <= PAIRS_UP_TO else ()
+    for tests in ([[i] for i in rows], [list(pair) for pair in pairs]):
+        if tests and len(tests[0]) <= most:
+            p = [_probability(found, used, test, assumed) for test in tests]
+            if min(p) < level_of_one(significance, len(tests)):
+                return tests[int(np.argmin(p))]
+    return []
 
 
 def _probability(found: Discrepancies, used, tested: Sequence[int], assumed: float) -> float:
-    if not tested:
-        return 1.0
     test = _predict(found, used, tested, assumed)
     return 1.0 if test is None else test[2]
 
@@ -201,7 +198,7 @@ def _resolve(found: Discrepancies, used, assumed: float):
     here = [g for g in groups if (g & used[:, None]).any()]
     redundancy = [0.0, 0.0]
     if not here:
-        return sigma, tuple(redundancy), (bool(groups[0].any()), bool(groups[1].any()))
+        return sigma, (0.0, 0.0), (bool(groups[0].any()), bool(groups[1].any()))
     start = np.abs(found.difference - np.median(found.difference[used], axis=0))
     for group in here:
         sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
@@ -213,14 +210,17 @@ def _resolve(found: Discrepancies, used, assumed: float):
             trace = np.diag(W)[mine].sum()
             if trace > 0:
                 s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
-                sigma[group] = max(s, found.least)
+                sigma[group] = max(s, assumed)
             if number == 0:
                 # with a σ that dominates C; where the estimate is small, its share is hardly any
                 redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
         if np.abs(sigma[unknown] / before[unknown] - 1).max() < SETTLED:
             break
-    lacking = tuple(bool(g.any()) and r < LEAST_REDUNDANCY for g, r in zip(groups, redundancy))
-    for group, few in zip(groups, lacking):
+    plane, height = (
+        bool(g.any()) and (r < LEAST_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
+        for g, r in zip(groups, redundancy)
+    )
+    for group, few in zip(groups, (plane, height)):
         if few:
             sigma[group] = assumed
-    return sigma, tuple(redundancy), lacking
+    return sigma, (redundancy[0], redundancy[1]), (plane, height)

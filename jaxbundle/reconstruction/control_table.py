@@ -117,8 +117,8 @@ def describe_sigma(
         sigma = float(assessed.sigma[:, k][unknown[:, k]][0])
         r = assessed.redundancy[0 if k == 0 else 1]
         if assessed.assumed[0 if k == 0 else 1]:
-            how = ("assumed, 2 pixels on the ground, because the points are too few to estimate it "
-                   "(state it with --control-sigma)")  # fmt: skip
+            how = ("assumed, 2 pixels on the ground, because its residuals do not show a larger "
+                   "one (state it with --control-sigma)")  # fmt: skip
         else:
             how = f"estimated from the residuals of control (redundancy {r:.1f})"
         words.append(f"control without σ: {significant(sigma, 2)} {unit} {name}, {how}")

@@ -42,10 +42,10 @@ OFFSET, OFFSET_HEIGHT = 10.0, 100.0
 common to the code solutions of one flight; in height geoid undulations reach 107 m (EGM2008)."""
 WRONG = 5.0
 """A ray that misses its point by more, in σ of the measurement, is a wrong measurement."""
-ASSUMED, LEAST = 2.0, 0.1
-"""σ of control that too few points determine, and the smallest estimated one, in pixels on the
-ground: what is marked and identified in photographs is not more exact than that, and a smaller σ
-than a tenth changes nothing beside image measurements of one pixel."""
+ASSUMED = 2.0
+"""σ of control that its residuals do not determine, and the smallest estimated one, in pixels on
+the ground: what is marked and identified in photographs is hardly more exact, unless it is stated.
+"""
 CONTRADICTORY_HEIGHTS = 3.0
 """Heights that are all 0 are unknown if the heights of the block differ by more, in σ."""
 ENOUGH_CONTROL = 3
@@ -97,7 +97,7 @@ def georeference(
         block.move(usable, control)
         measured = block.resolve()
     pixel = block.ground_sample_distance
-    assessed = assess(block.compare(usable, control, LEAST * pixel), ASSUMED * pixel)
+    assessed = assess(block.compare(usable, control), ASSUMED * pixel)
     choice = _choose(block, control, measured, usable, assessed, ASSUMED * pixel)
     if not block.has_positions and choice.used.sum() < ENOUGH_CONTROL:
         raise InputError(
@@ -267,10 +267,11 @@ def _name_wrong(block: "_Block", found: Choice, id: str) -> None:
     if not np.isfinite(X).all():
         return
     off = block.misses(one, X)
-    for n in np.flatnonzero(~one.good):
+    for n in np.flatnonzero(~one.good).tolist():
         passes = np.linalg.norm(np.cross(X - block.X0[one.image[n]], one.rays[n]))
-        said = (f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px from "
-                f"where the other photographs see it, its ray passes at {passes:.2f} m")  # fmt: skip
+        said = (f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px "
+                "from where the other photographs see it, its ray passes at "
+                f"{passes:.2f} m")  # fmt: skip
         other = block.seen_there(one, n, id, found.measured)
         found.wrong.setdefault(id, []).append(
             said + (f"; it is at the place of {other}: a wrong name" if other else "")
@@ -335,7 +336,7 @@ class _Block:
         )  # fmt: skip
         self.row = {id: k for k, id in enumerate(self.network.images.id)}
         points = self.network.points.id
-        known = np.isfinite(self.X).all(1)
+        known = np.all(np.isfinite(self.X), axis=1)
         named = set(given.points.id)
         self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
         self.has_positions = np.isfinite(self.network.images.sigma[:, :3]).all(1).sum() > 2
@@ -350,7 +351,8 @@ class _Block:
         rows = np.array(rows, int)
         image = np.array([self.row[names[named.image[k]]] for k in rows], int)
         if not len(rows):
-            return Measured(rows, image, np.zeros((0, 3)), *np.zeros((2, 0)), np.zeros(0, bool),
+            nothing = np.zeros(0)
+            return Measured(rows, image, np.zeros((0, 3)), nothing, nothing, np.zeros(0, bool),
                             np.full(3, np.nan))  # fmt: skip
         camera = self.network.images.camera[image]
         ends = [self._ideal(camera, named.xy[rows] + shift) for shift in ([0, 0], [0.5, 0.5])]
@@ -450,13 +452,12 @@ class _Block:
                  for one, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())]
         return float(np.median(np.concatenate(found))) if found else 1.0
 
-    def compare(self, places: Sequence[int], points: Points, least: float) -> Discrepancies:
+    def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint cofactors."""
         rows = [self.determined[points.id[k]] for k in places]
         if not rows:
             nothing = np.zeros((0, 3))
-            return Discrepancies(nothing, np.zeros((0, 3, 0, 3)), nothing, np.zeros((0, 3, 0)),
-                                 least)  # fmt: skip
+            return Discrepancies(nothing, np.zeros((0, 3, 0, 3)), nothing, np.zeros((0, 3, 0)))
         X, given = self.X[rows], points.position[list(places)]
         C = self._joint_cofactors(rows)
         n, sigma = len(rows), points.sigma[list(places)].copy()
@@ -469,8 +470,8 @@ class _Block:
             turn = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
             G = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turn, x[:, :, None]], 2)
         fixed = np.array([points.role[k] == "fixed" for k in places])
-        sigma[fixed] = least
-        return Discrepancies(X - given, C, sigma, G, least)
+        sigma[fixed] = 0.0
+        return Discrepancies(X - given, C, sigma, G)
 
     def _joint_cofactors(self, rows) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""

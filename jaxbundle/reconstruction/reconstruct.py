@@ -164,7 +164,9 @@ def reconstruct(
         named = named.take(np.array([one not in checks for one in named.name], bool))
     extra = Extra(named, tuple(distances), positions[:2] if positions and framed else None,
                   attitudes)  # fmt: skip
-    system = control.system if control is not None else positions.words if framed else ""
+    system = "" if control is None else control.system
+    if control is None and positions is not None and framed:
+        system = positions.words
     first = Path(given[0])
     name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)

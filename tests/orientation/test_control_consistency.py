@@ -21,7 +21,7 @@ def block(n, seed, sigma=0.5, open_columns=True, planimetric=False, stated=np.na
     s = np.full((n, 3), stated)
     if planimetric:
         s[:, 2] = np.inf
-    return X, Discrepancies(d, C, s, G, 1e-3)
+    return X, Discrepancies(d, C, s, G)
 
 
 @pytest.mark.parametrize("open_columns", [True, False])

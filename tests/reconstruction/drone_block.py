@@ -55,12 +55,13 @@ class Drone:
     def _block(self, positions: bool) -> Weighted:
         network = self.network
         if not positions:
-            X0 = network.images.position
-            images = dataclasses.replace(network.images, position=(X0 - ORIGIN) / 20.0,
-                                         sigma=np.full_like(network.images.sigma, np.nan))  # fmt: skip
-            points = dataclasses.replace(network.points,
-                                         position=(network.points.position - ORIGIN) / 20.0)  # fmt: skip
-            network = network.replace(images=images, points=points, datum="inner")
+            images, points = network.images, network.points
+            network = network.replace(
+                images=dataclasses.replace(images, position=(images.position - ORIGIN) / 20.0,
+                                           sigma=np.full((len(images), 6), np.nan)),
+                points=dataclasses.replace(points, position=(points.position - ORIGIN) / 20.0),
+                datum="inner",
+            )  # fmt: skip
         result = jaxbundle.adjust(network)
         assert result.converged
         return Weighted(result, {}, len(network.observations))

@@ -63,14 +63,28 @@ def _control(adjustment) -> Finding:
     parts = [count(n, f"{role} point") for role, n in number.items() if n]
     tau = np.abs(adjustment.residuals["tau"][adjustment.residuals["kind"] == "control"])
     tau = tau[np.isfinite(tau)]
-    if not len(tau):
-        words = (f"{', '.join(parts)} held exactly: their coordinates have no σ, so that nothing "
-                 "tests them; state σ, or make some of them check points")  # fmt: skip
-        return Finding("Control", DOUBTFUL, words)
     limit = critical_value(adjustment)
+    if not len(tau):
+        return _held_control(adjustment, ", ".join(parts), limit)
     words = f"{', '.join(parts)}; largest |τ| {significant(tau.max())}, critical value at 0.1 % "
     state = GOOD if tau.max() <= limit else BAD
     return Finding("Control", state, words + significant(limit))
+
+
+def _held_control(adjustment, parts: str, limit: float) -> Finding:
+    """Points without σ are exact: their errors are in the image residuals, and three of them fit
+    any network."""
+    rows, points = adjustment.residuals, adjustment.problem.network.points
+    ids = [id for id, fixed in zip(points.id, points.has_role("fixed")) if fixed]
+    own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
+    tau = np.abs(rows["tau"][own])
+    tau = tau[np.isfinite(tau)]
+    words = f"{parts} held exactly, because no σ is stated; "
+    if len(ids) <= 3 or not len(tau):
+        return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ")
+    words += (f"largest |τ| of their image points {significant(tau.max())}, critical value at "
+              f"0.1 % {significant(limit)}")  # fmt: skip
+    return Finding("Control", GOOD if tau.max() <= limit else DOUBTFUL, words)
 
 
 def _checks(adjustment) -> list[Finding]:
