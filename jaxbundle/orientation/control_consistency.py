@@ -163,12 +163,12 @@ def _predict(found: Discrepancies, used, tested: Sequence[int], assumed: float):
     unknown, p = np.isnan(found.sigma).ravel()[rows[mine]], []
     for height, freedom in enumerate(redundancy):
         part = np.flatnonzero((rows[mine] % 3 == 2) == height)
-        if len(part):
-            T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
-            estimated = unknown[part].any() and freedom >= LEAST_REDUNDANCY
-            p.append(f_tail(T / len(part), len(part), freedom) if estimated
-                     else chi2_tail(T, len(part)))  # fmt: skip
-    p = min(1.0, len(p) * min(p))
+        if not len(part) or (unknown[part].any() and freedom < LEAST_REDUNDANCY):
+            continue  # an assumed σ tests nothing
+        T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
+        p.append(f_tail(T / len(part), len(part), freedom) if unknown[part].any()
+                 else chi2_tail(T, len(part)))  # fmt: skip
+    p = min(1.0, len(p) * min(p, default=1.0))
     error, spread = np.full(3, np.nan), np.full(3, np.nan)
     first = of[mine] == tested[0]
     axes = rows[mine][first] % 3

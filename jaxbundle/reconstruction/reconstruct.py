@@ -148,7 +148,7 @@ def reconstruct(
     cameras = assign_cameras(photographs, camera)
     with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
         named, notes = find_named(photographs, settings.targets, control, pool.map)
-    positions, said = _positions(photographs, control)
+    positions, said = find_positions(photographs, control)
     notes += said
     framed = positions is not None and positions.define_frame
     notes += name_unused(named, control, distances, 1 if framed else ENOUGH_CONTROL)
@@ -176,7 +176,7 @@ def reconstruct(
     return making.run()
 
 
-def _positions(
+def find_positions(
     photographs: Sequence[Photograph], control: Control | None
 ) -> tuple[MapPositions | None, list[str]]:
     """The satellite positions of the photographs in the system of control, else in their UTM zone,

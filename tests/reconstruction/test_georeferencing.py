@@ -1,5 +1,7 @@
 """Control and satellite positions of a simulated drone block: what is used, named and written."""
 
+import csv
+import datetime
 import json
 import subprocess
 import sys
@@ -10,9 +12,12 @@ from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block, swapped
 
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cli.outputs import write_targets
+from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError
+from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction.block import describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
+from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 
 SIGMA = 0.5
 """Of handheld control, metres."""
@@ -128,6 +133,43 @@ def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
     roles = ("control", "control", *["check"] * (CONTROL - 2))
     with pytest.raises(InputError, match="expected 3, got 2"):
         controlled(drone, drone.given(handheld, roles=roles, positions=False))
+
+
+def test_report_page_and_json_show_control_and_block(drone, handheld, tmp_path):
+    named, row = swapped(drone.named, "gcp04", "gcp00")
+    X = handheld.copy()
+    X[6] += [2.9, -2.6, 0.0]
+    roles = tuple("check" if k == 8 else "control" for k in range(CONTROL))
+    block = drone.block()
+    final, table = georeference(block, drone.given(X, roles=roles, named=named), 0.001,
+                                lambda stage: None)  # fmt: skip
+    time = datetime.datetime(2026, 5, 4, 10, 30)
+    exif = {id: Exif((2000, 1500), time=time) for id in drone.images}
+    facts = describe_block(final.adjustment, exif, "EPSG:32611")
+    part = Part("part 1", final.adjustment, {}, {}, facts, table)
+    found = Reconstruction((part,), {}, ("a note",), (), {}, "quarry")
+    folder = tmp_path / "out"
+    write_reconstruction(found, "", folder, True, False, False)
+    text = (folder / "report.txt").read_text()
+    page = (folder / "report.html").read_text()
+    told = json.loads((folder / "result.json").read_text())["reconstruction"]
+    for said in ("quarry", "2026-05-04", "EPSG:32611", "Ground sample distance", "Flying height",
+                 "Area covered", "Overlap", "Camera positions", "gcp06", "a wrong name",
+                 drone.images[named.image[row]], "estimated from the residuals"):  # fmt: skip
+        assert said in " ".join(text.split()) and said in page, said
+    assert told["name"] == "quarry"
+    (one,) = told["parts"]
+    assert one["block"]["ground_sample_distance"] == pytest.approx(60.0 / 1500.0, rel=0.1)
+    assert one["block"]["flying_height"] == pytest.approx(60.0, rel=0.1)
+    # 36 × 28 m of stations, and half a footprint of 80 × 60 m in any direction around them
+    assert 36 * 28 < one["block"]["area"] < 116 * 108
+    control = one["control"]["points"]
+    assert not control["gcp06"]["used"] and control["gcp08"]["verdict"] == "check"
+    assert control["gcp01"]["residual"]["X"] is not None
+    assert set(one["block"]["camera_positions"]["difference"]) == set(drone.images)
+    with (folder / "control.csv").open() as file:
+        rows = {row["id"]: row for row in csv.DictReader(file)}
+    assert rows["gcp06"]["used"] == "False" and "left out" in rows["gcp06"]["verdict"]
 
 
 def test_the_written_network_gives_the_same_numbers(good, tmp_path):
