@@ -20,9 +20,10 @@ point of σ² ← σ²·(dᵀ·W·D·W·d)/tr(W·D), from the points not tested;
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
 
@@ -95,7 +96,7 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     if 2 * (~used).sum() >= len(found) and np.isfinite(found.sigma).any():
         everything = np.ones(len(found), bool)
         sigma, *_ = _resolve(found, everything, assumed)
-        W, d, rows, _ = _weight_matrix(found, sigma, everything)
+        W, d, rows = _weight_matrix(found, sigma, everything)
         redundancy = len(rows) - found.open.shape[2]
         factor = float(np.sqrt(max(d @ W @ d / max(redundancy, 1), 1.0)))
         scaled = np.where(np.isfinite(found.sigma), found.sigma * factor, found.sigma)
@@ -104,8 +105,9 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     sigma, redundancy, guessed = _resolve(found, used, assumed)
     error, spread = np.full((2, len(found), 3), np.nan)
     probability = np.full(len(found), np.nan)
+    common = _Model.of(found, used, used, assumed) if used.sum() > PAIRS_UP_TO else None
     for i in range(len(found)):
-        test = _predict(found, used, [i], assumed)
+        test = _predict(found, used, [i], assumed, common if used[i] else None)
         if test is not None:
             error[i], spread[i], probability[i] = test
     return Assessment(used, sigma, redundancy, error, spread, probability, guessed, factor)
@@ -130,38 +132,65 @@ def _most_improbable(
     """The point, or else the two points, of at most this number, that are most improbable; none if
     chance explains all."""
     rows = np.flatnonzero(used).tolist()
-    pairs = itertools.combinations(rows, 2) if len(rows) <= PAIRS_UP_TO else ()
-    for tests in ([[i] for i in rows], [list(pair) for pair in pairs]):
+    few = len(rows) <= PAIRS_UP_TO
+    # of many points one changes the estimated σ by too little to matter
+    common = None if few else _Model.of(found, used, used, assumed)
+    for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
         if tests and len(tests[0]) <= most:
-            p = [_probability(found, used, test, assumed) for test in tests]
+            p = [_probability(found, used, test, assumed, common) for test in tests]
             if min(p) < level_of_one(significance, len(tests)):
                 return tests[int(np.argmin(p))]
     return []
 
 
-def _probability(found: Discrepancies, used, tested: Sequence[int], assumed: float) -> float:
-    test = _predict(found, used, tested, assumed)
+def _probability(
+    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: "_Model | None" = None
+) -> float:
+    test = _predict(found, used, tested, assumed, model)
     return 1.0 if test is None else test[2]
 
 
-def _predict(found: Discrepancies, used, tested: Sequence[int], assumed: float):
+class _Model(NamedTuple):
+    """σ [n, 3] and its redundancy in the plane and in height; W and W·d of the controlled axes of
+    some points, their `rows` among all axes."""
+
+    sigma: Float[np.ndarray, "n 3"]
+    redundancy: tuple[float, float]
+    W: Float[np.ndarray, "m m"]
+    Wd: Float[np.ndarray, " m"]
+    rows: Int[np.ndarray, " m"]
+
+    @staticmethod
+    def of(found: Discrepancies, others, all_, assumed: float) -> "_Model":
+        """With σ estimated from `others`, W of `all_`."""
+        sigma, redundancy, _ = _resolve(found, others, assumed)
+        W, d, rows = _weight_matrix(found, sigma, all_)
+        return _Model(sigma, redundancy, W, W @ d, rows)
+
+
+def _predict(
+    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: _Model | None = None
+):
     """Error of the prediction of the first tested point, its σ, and the probability of a larger T
-    of all of them; None if the others do not predict them."""
-    others, all_ = used.copy(), used.copy()
-    others[list(tested)], all_[list(tested)] = False, True
-    sigma, redundancy, _ = _resolve(found, others, assumed)
-    W, d, rows, of = _weight_matrix(found, sigma, all_)
-    mine = np.flatnonzero(np.isin(of, tested))
+    of all of them; None if the others do not predict them.
+
+    **Arguments:** `model`: of all used points, instead of one with σ from the others."""
+    if model is None:
+        others, all_ = used.copy(), used.copy()
+        others[list(tested)], all_[list(tested)] = False, True
+        model = _Model.of(found, others, all_, assumed)
+    rows = model.rows
+    mine = np.flatnonzero(np.isin(rows // 3, tested))
     if not len(mine):
         return None
-    own = W[np.ix_(mine, mine)]
+    own = model.W[np.ix_(mine, mine)]
     scale = np.abs(np.diag(own)).max(initial=0.0)
     if not scale or np.linalg.eigvalsh(own)[0] < 1e-9 * scale:
         return None
     covariance = np.linalg.inv(own)
-    e = covariance @ (W @ d)[mine]
+    e = covariance @ model.Wd[mine]
     unknown, p = np.isnan(found.sigma).ravel()[rows[mine]], []
-    for height, freedom in enumerate(redundancy):
+    for height, freedom in enumerate(model.redundancy):
         part = np.flatnonzero((rows[mine] % 3 == 2) == height)
         if not len(part) or (unknown[part].any() and freedom < LEAST_REDUNDANCY):
             continue  # an assumed σ tests nothing
@@ -170,14 +199,14 @@ def _predict(found: Discrepancies, used, tested: Sequence[int], assumed: float):
                  else chi2_tail(T, len(part)))  # fmt: skip
     p = min(1.0, len(p) * min(p, default=1.0))
     error, spread = np.full(3, np.nan), np.full(3, np.nan)
-    first = of[mine] == tested[0]
+    first = rows[mine] // 3 == tested[0]
     axes = rows[mine][first] % 3
     error[axes], spread[axes] = e[first], np.sqrt(np.diag(covariance))[first]
     return error, spread, p
 
 
 def _weight_matrix(found: Discrepancies, sigma, used):
-    """W and d of the controlled axes of the used points; their rows among all axes, and points."""
+    """W and d of the controlled axes of the used points; their rows among all axes."""
     rows = np.flatnonzero((used[:, None] & np.isfinite(sigma)).ravel())
     n = 3 * len(found)
     S = found.cofactor.reshape(n, n)[np.ix_(rows, rows)] + np.diag(sigma.ravel()[rows] ** 2)
@@ -186,7 +215,7 @@ def _weight_matrix(found: Discrepancies, sigma, used):
     if G.shape[1]:
         U = W @ G
         W = W - U @ np.linalg.pinv(G.T @ U, hermitian=True) @ U.T
-    return W, found.difference.ravel()[rows], rows, rows // 3
+    return W, found.difference.ravel()[rows], rows
 
 
 def _resolve(found: Discrepancies, used, assumed: float):
@@ -203,7 +232,7 @@ def _resolve(found: Discrepancies, used, assumed: float):
     for group in here:
         sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
     for number in range(ROUNDS):
-        W, d, rows, _ = _weight_matrix(found, sigma, used)
+        W, d, rows = _weight_matrix(found, sigma, used)
         Wd, before = W @ d, sigma.copy()
         for group in here:
             mine = group.ravel()[rows]

@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further import Antennas, ExteriorPriors
 from jaxbundle.network.sightings import keep_points
-from jaxbundle.network.tables import Network, Observations, Points
+from jaxbundle.network.tables import Distances, Network, Observations, Points
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import similarity_of_most
@@ -48,6 +48,9 @@ the ground: what is marked and identified in photographs is hardly more exact, u
 """
 CONTRADICTORY_HEIGHTS = 3.0
 """Heights that are all 0 are unknown if the heights of the block differ by more, in σ."""
+COMPARED_TOGETHER, PAIRED_RAYS = 100, 8
+"""Largest number of control points with a joint covariance, and of rays of one point of which every
+pair is tried: 28 pairs."""
 ENOUGH_CONTROL = 3
 """Minimum control points of a block without satellite positions."""
 
@@ -97,7 +100,7 @@ def georeference(
         block.move(usable, control)
         measured = block.resolve()
     pixel = block.ground_sample_distance
-    assessed = assess(block.compare(usable, control), ASSUMED * pixel)
+    usable, assessed = _assess_all(block, control, usable, ASSUMED * pixel)
     choice = _choose(block, control, measured, usable, assessed, ASSUMED * pixel)
     if not block.has_positions and choice.used.sum() < ENOUGH_CONTROL:
         raise InputError(
@@ -121,6 +124,21 @@ def georeference(
         (*filter(None, [heights]), *choice.remarks()), "m",
     )  # fmt: skip
     return dataclasses.replace(found, adjustment=result, agreeing=int(used.sum())), table
+
+
+def _assess_all(
+    block: "_Block", control: Points, usable: Sequence[int], assumed: float
+) -> tuple[list[int], Assessment]:
+    """The usable points in the order of their assessment: very many in groups that spread over all
+    of them, since time grows with the cube of their number."""
+    number = max(1, -(-len(usable) // COMPARED_TOGETHER))
+    groups = [list(usable[first::number]) for first in range(number)]
+    found = [assess(block.compare(group, control), assumed) for group in groups]
+    join = lambda name: np.concatenate([getattr(one, name) for one in found])
+    return [k for group in groups for k in group], Assessment(
+        join("used"), join("sigma"), found[0].redundancy, join("error"), join("error_sigma"),
+        join("probability"), found[0].assumed, max(one.factor for one in found),
+    )  # fmt: skip
 
 
 @dataclasses.dataclass
@@ -401,8 +419,9 @@ class _Block:
         usable = np.flatnonzero(np.isfinite(one.rays).all(1))
         best = np.zeros(len(one.rows), bool)
         closest = np.inf
-        for i in usable:
-            for j in usable[usable > i]:
+        tried = usable[many.spread(len(usable), PAIRED_RAYS)]
+        for i in tried:
+            for j in tried[tried > i]:
                 pair = np.isin(np.arange(len(one.rows)), [i, j])
                 off = self.misses(one, self._meet(one, pair)) / one.sigma
                 good = off < WRONG
@@ -527,7 +546,8 @@ class _Block:
     def with_control(self, control: Points, choice: Choice) -> Network:
         """The network at the solution with control, its measurements and positions."""
         whole, network = self.network, readjustable_network(self.result)
-        named = set(control.id)
+        named, ids, distances = set(control.id), network.points.id, network.distances
+        ends = [(ids[a], ids[b]) for a, b in distances.points]
         network = keep_points(network, np.array([id not in named for id in network.points.id]))
         row = {id: k for k, id in enumerate(network.points.id)}
         at = np.array([row.get(id, -1) for id in whole.points.id])
@@ -537,6 +557,8 @@ class _Block:
             self.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
         )
         images, moved = network.images, [self.of_id[id] for id in network.points.id]
+        row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
+        here = np.array([a in row and b in row for a, b in ends], bool)
         return network.replace(
             images=dataclasses.replace(images, position=self.X0, angles=self.angles),
             points=Points(
@@ -551,6 +573,11 @@ class _Block:
             ),
             further=(*(one for one in network.further if not isinstance(one, ExteriorPriors)),
                      *self._positions(choice)),
+            distances=Distances(
+                np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep],
+                         int).reshape(-1, 2),
+                distances.value[here], distances.sigma[here], distances.source.take(here),
+            ),
             datum="control", datum_points=(), object_unit="m", warnings=whole.warnings,
         )  # fmt: skip
 
@@ -560,13 +587,17 @@ class _Block:
         image, spread = [], []
         for k, id in enumerate(control.id):
             one = choice.measured[id]
-            role = control.role[k] if choice.used[k] else "check"
-            if one.good.sum() < (2 if role == "check" else 1):
+            # a point with wrong coordinates is a good tie point
+            role = "check" if control.role[k] == "check" else "tie"
+            role = control.role[k] if choice.used[k] else role
+            if one.good.sum() < (1 if choice.used[k] else 2):
                 continue
             there = np.isfinite(one.position).all()
             start = one.position if there else self.on_ray(one)
-            position.append(np.where(np.isinf(choice.sigma[k]), start, control.position[k]))
-            sigma.append(np.full(3, np.nan) if role == "fixed" else choice.sigma[k])
+            free = np.isinf(choice.sigma[k]) | (role == "tie")
+            position.append(np.where(free, start, control.position[k]))
+            exact = role in ("fixed", "tie")
+            sigma.append(np.full(3, np.nan) if exact else choice.sigma[k])
             rows += one.rows[one.good].tolist()
             image += one.image[one.good].tolist()
             spread += one.sigma[one.good].tolist()
