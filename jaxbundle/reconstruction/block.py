@@ -19,6 +19,9 @@ from jaxbundle.report.layout import significant
 DOWNWARD = 0.7
 """Least cosine between the viewing directions and the vertical of a block with a flying height and
 an area: 45 degrees."""
+CONTRADICTORY = 3.0
+"""Offset and RMS of satellite positions, in σ, above which they contradict control or photographs.
+"""
 RANGE = 0.01
 """Share of the points beyond each side of the area: they may be far away by a gross error."""
 
@@ -38,6 +41,21 @@ class CameraPositions:
     def rms(self) -> Float[np.ndarray, "3"]:
         """RMS of the differences."""
         return np.sqrt(np.mean(np.square([*self.difference.values()]), 0))
+
+    def contradictions(self, prior: Float[np.ndarray, "3"], unit: str) -> list[str]:
+        """How the positions contradict control and their own σ, in words; `prior`: σ of the
+        offset before the adjustment."""
+        said = []
+        for axis, value, s in zip("XYZ", self.offset, prior):
+            if np.isfinite(value) and abs(value) > CONTRADICTORY * s:
+                said.append(f"satellite positions and control contradict each other: their offset "
+                            f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
+                            "their coordinate systems")  # fmt: skip
+        for axis, value, s in zip("XYZ", self.rms, self.sigma):
+            if value > CONTRADICTORY * s:
+                said.append(f"satellite positions contradict the photographs: RMS in {axis} "
+                            f"{significant(value)} {unit}, their σ {significant(s)} {unit}")  # fmt: skip
+        return said
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +177,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
                    "arbitrary: neither control, satellite positions nor scale bars"),
         network.object_unit, float(np.nanmedian(of_image * pixel)), float(np.nanmedian(of_image)),
         height, area, on_ties.sum() / max(len(ground), 1), on_ties.sum() / len(X0), places,
-        _positions(result),
+        camera_positions(result),
     )  # fmt: skip
 
 
@@ -201,7 +219,7 @@ def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
     return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
 
 
-def _positions(result: Adjustment) -> CameraPositions | None:
+def camera_positions(result: Adjustment) -> CameraPositions | None:
     """Given positions against the adjusted ones: antennas with the shift of their system, or
     priors of the images."""
     network, X0 = result.problem.network, result.image_values[:, :3]

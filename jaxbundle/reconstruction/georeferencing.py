@@ -7,8 +7,8 @@
 3. The intersected points are compared with the given coordinates by leave-one-out prediction
    (`orientation.control_consistency`), which estimates the σ of control where none is given.
 4. Everything is adjusted together: control with its σ, satellite positions with theirs and an
-   offset between the two systems. Check points, and control that contradicts the rest, are
-   intersected and compared.
+   offset between the two systems. Check points are intersected and compared; control that
+   contradicts the rest is compared as tie points.
 """
 
 import dataclasses
@@ -33,6 +33,7 @@ from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.control_consistency import Assessment, Discrepancies, assess
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.reconstruction.adjusting import Weighted, adjust_determined
+from jaxbundle.reconstruction.block import camera_positions
 from jaxbundle.reconstruction.control_table import ControlPoint, ControlTable, describe_sigma
 from jaxbundle.reconstruction.named import Named
 from jaxbundle.types import present
@@ -119,10 +120,11 @@ def georeference(
     fixed = [id for id, role in zip(control.id, control.role) if role == "fixed"]
     free = np.array([role == "control" for role in control.role])
     words = describe_sigma(control.sigma[free], choice.assessed(free), fixed, "m")
-    table = ControlTable(
-        tuple(_tabulate(result, block, control, choice)), words,
-        (*filter(None, [heights]), *choice.remarks()), "m",
-    )  # fmt: skip
+    positions = camera_positions(result)
+    prior = np.array([OFFSET, OFFSET, OFFSET_HEIGHT])
+    notes = [heights] * bool(heights) + choice.remarks()
+    notes += [] if positions is None else positions.contradictions(prior, "m")
+    table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
     return dataclasses.replace(found, adjustment=result, agreeing=int(used.sum())), table
 
 
@@ -357,8 +359,8 @@ class _Block:
         known = np.all(np.isfinite(self.X), axis=1)
         named = set(given.points.id)
         self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
-        self.has_positions = np.isfinite(self.network.images.sigma[:, :3]).all(1).sum() > 2
-
+        observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
+        self.has_positions = int(observed.sum()) > 2
         self.of_id = {id: k for k, id in enumerate(points)}
 
     def measure(self, id: str) -> Measured:

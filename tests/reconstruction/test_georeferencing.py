@@ -15,7 +15,7 @@ from jaxbundle.cli.outputs import write_targets
 from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.exif import Exif
-from jaxbundle.reconstruction.block import describe_block
+from jaxbundle.reconstruction.block import CameraPositions, describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 
@@ -127,6 +127,17 @@ def test_check_points_are_compared_and_never_used(drone, handheld):
     assert points["gcp03"].residual[0] == pytest.approx(-40.0, abs=4 * SIGMA)
     assert points["gcp03"].verdict == "check" and not points["gcp03"].used
     assert np.isfinite(table.rms("check")).all() and table.rms("check")[0] > 20
+
+
+def test_positions_that_contradict_control_are_told_with_numbers():
+    difference = {str(k): np.array([0.5, -9.0 + 18 * (k % 2), 1.0]) for k in range(4)}
+    sigma, nothing = np.array([1.0, 1.0, 2.0]), np.full(3, np.nan)
+    positions = CameraPositions(difference, sigma, np.array([154.0, 2.0, 31.0]), sigma)
+    offset, rms = positions.contradictions(np.array([10.0, 10.0, 100.0]), "m")
+    assert "offset in X is +154.0 m, its prior σ 10 m" in offset
+    assert "RMS in Y 9.00 m, their σ 1.00 m" in rms
+    good = CameraPositions({"1": sigma}, sigma, nothing, nothing)
+    assert good.contradictions(np.array([10.0, 10.0, 100.0]), "m") == []
 
 
 def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
