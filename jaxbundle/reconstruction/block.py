@@ -53,8 +53,8 @@ class CameraPositions:
                             "their coordinate systems")  # fmt: skip
         for axis, value, s in zip("XYZ", self.rms, self.sigma):
             if value > CONTRADICTORY * s:
-                said.append(f"satellite positions contradict the photographs: RMS in {axis} "
-                            f"{significant(value)} {unit}, their σ {significant(s)} {unit}")  # fmt: skip
+                found = f"RMS in {axis} {significant(value)} {unit}, their σ {significant(s)} {unit}"
+                said.append(f"satellite positions contradict the photographs: {found}")
         return said
 
 
