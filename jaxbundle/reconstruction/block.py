@@ -53,8 +53,9 @@ class CameraPositions:
                             "their coordinate systems")  # fmt: skip
         for axis, value, s in zip("XYZ", self.rms, self.sigma):
             if value > CONTRADICTORY * s:
-                found = f"RMS in {axis} {significant(value)} {unit}, their σ {significant(s)} {unit}"
-                said.append(f"satellite positions contradict the photographs: {found}")
+                numbers = f"{significant(value)} {unit}, their σ {significant(s)} {unit}"
+                said.append(f"satellite positions contradict the photographs: RMS in {axis} "
+                            f"{numbers}")  # fmt: skip
         return said
 
 

@@ -1,7 +1,6 @@
 """Control points with their measurements: files of OpenDroneMap, tables, errors by line."""
 
 import dataclasses
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -114,13 +113,13 @@ def test_options_of_control_need_control(tmp_path, command):
     assert done.status == 2 and "--control-sigma and --check need --control" in done.err
 
 
-def test_check_points_of_a_project(tmp_path, command):
-    project = EXAMPLES / "bingo_indoor"
-    known = read_network(project)
-    control = [id for id, role in zip(known.points.id, known.points.role) if role != "tie"]
-    done = command("adjust", project, "--check", control[0], "--json", "-", "--brief")
-    assert done.status == 0, done.err
-    assert control[0] in json.loads(done.out)["check_points"]["points"]
+def test_check_points_of_a_project_are_control_points(command):
+    done = command("adjust", EXAMPLES / "bingo_indoor", "--check", "nowhere", "--json", "-")
+    assert done.status == 2 and "--check nowhere: expected a control point" in done.err
+    points = read_network(EXAMPLES / "bingo_indoor").points
+    chosen = select_checks(points, ["every 2nd"])
+    assert (chosen.has_role("check") <= points.has_role("control")).all()
+    assert chosen.has_role("check").sum() == points.has_role("control").sum() // 2
 
 
 PLACES = [Place(34.4064 + 2e-4 * k, -119.88 + 3e-4 * (k % 3), 100.0 + k) for k in range(6)]
