@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.orientation.control_consistency import Assessment
-from jaxbundle.report.layout import significant
+from jaxbundle.report.layout import column_decimals, fixed, significant
 
 HEADER = ("point", "rays", "dX", "dY", "dZ", "σX", "σY", "σZ", "px", "verdict")
 """The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
@@ -30,11 +30,11 @@ class ControlPoint:
     image_residual: float
     verdict: str
 
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table as text, in the order of `HEADER`."""
-        sigma = ("free" if np.isinf(s) else significant(s, 2) for s in self.sigma)
-        return (self.id, str(self.rays), *(significant(d) for d in self.residual), *sigma,
-                significant(self.image_residual, 2), self.verdict)  # fmt: skip
+    def cells(self, places: int) -> tuple[str, ...]:
+        """The row of the table as text, in the order of `HEADER`; decimal `places` of lengths."""
+        sigma = ("free" if np.isinf(s) else fixed(s, places) for s in self.sigma)
+        return (self.id, str(self.rays), *(fixed(d, places) for d in self.residual), *sigma,
+                fixed(self.image_residual, 2), self.verdict)  # fmt: skip
 
     def numbers(self) -> dict:
         """The row as numbers by name; None: not there."""
@@ -72,11 +72,12 @@ class ControlTable:
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table as text, the RMS last."""
-        rows = [point.cells() for point in self.points]
+        places = column_decimals(np.concatenate([point.sigma for point in self.points]), 2, 4)
+        rows = [point.cells(places) for point in self.points]
         for role, words in (("control", "RMS, used control"), ("check", "RMS, check points")):
             found = self.rms(role)
             if np.isfinite(found).any():
-                rows.append((words, "", *(significant(x) for x in found), *[""] * 5))
+                rows.append((words, "", *(fixed(x, places) for x in found), *[""] * 5))
         return rows
 
     def as_dict(self) -> dict:

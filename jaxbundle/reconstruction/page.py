@@ -37,10 +37,9 @@ def describe_part(found, part) -> str:
     if part.control is not None:
         unit = part.control.unit
         lines += heading(f"Control and check points: adjusted − given, in {unit}")
-        lines += table(HEADER[:-1], [row[:-1] for row in part.control.rows()], "lrrrrrrrr")
-        lines.append("")
-        for one in part.control.points:
-            lines += text_paragraph(f"{one.id}: {one.verdict}", 0, 4)
+        # the reasons of verdicts are in the notes
+        rows = [(*row[:-1], row[-1].partition(":")[0]) for row in part.control.rows()]
+        lines += table(HEADER, rows, "lrrrrrrrrl")
         lines += ["", *text_paragraph(f"{part.control.sigma}.")]
         lines += [line for note in part.control.notes for line in text_paragraph(f"- {note}", 0, 2)]
     return "\n".join([*lines, "", ""])
