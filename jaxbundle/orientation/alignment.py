@@ -162,11 +162,11 @@ def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
 
 
 def similarity_of_most(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
-    """A and t of X' = A·X + t that fit most of the points, of which less than half may be wrong;
-    None: collinear.
+    """A and t of X' = A·X + t that fit most of the points; None: collinear.
 
-    Least median of the distances over similarities by three points (Rousseeuw 1984), then least
-    squares for the points within 2.5 robust standard deviations."""
+    The least (n/2 + 2)-th smallest distance over similarities by three of n points, which
+    themselves nearly fit (Rousseeuw 1984, least median of squares), then least squares for the
+    points within 2.5 robust standard deviations."""
     n, rng = len(source), np.random.default_rng(0)
     triples = list(itertools.islice(itertools.combinations(range(n), 3), TRIPLES + 1))
     if len(triples) > TRIPLES:
@@ -176,10 +176,8 @@ def similarity_of_most(source: Float[np.ndarray, "n 3"], target: Float[np.ndarra
         found = many.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
         if found is not None:
             off = np.linalg.norm(source @ found[0].T + found[1] - target, axis=1)
-            # three points always nearly fit: the others decide
-            median = np.median(np.delete(off, triple)) if n > 3 else off.max()
-            if median < least:
-                best, least = off, median
+            if (middle := np.sort(off)[min(n, n // 2 + 2) - 1]) < least:
+                best, least = off, middle
     if best is None:
         return None
     limit = max(2.5 * 1.4826 * least, np.sort(best)[2])
