@@ -93,5 +93,6 @@ def _summary(found: Reconstruction) -> dict:
              "global_test_passed": part.adjustment.global_test()["passed"]}
             for part in found.parts
         ],
-        "left_out": dict(found.left_out), "notes": list(found.notes), "pairs": len(found.pairs),
+        "warnings": list(found.warnings), "left_out": dict(found.left_out),
+        "notes": list(found.notes), "pairs": len(found.pairs),
     }  # fmt: skip

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.network.columns import count
+from jaxbundle.reconstruction.adjusting import LARGEST_MISFIT, WRONG_MISFIT
+from jaxbundle.report.head import count_points
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.page import (
     UNKNOWN,
@@ -17,7 +19,10 @@ from jaxbundle.report.page import (
 )
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
-from jaxbundle.report.page.verdict import DOUBTFUL, GOOD
+from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+
+WITHOUT = ("χ² test",)
+"""Findings of an adjustment that do not apply: σ are estimated from the residuals."""
 
 
 def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
@@ -33,10 +38,20 @@ def _describe(found, part) -> Addition:
     overview = f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
     if found.notes:
         overview += items(found.notes)
+    findings = (*([_fit(part)] if part.factors else []), _photographs(found, part))
     return Addition(
-        "reconstruction", (_photographs(found, part),), overview=overview,
-        sections=tuple(sections), tables={"pairs": _pairs(found)},
+        "reconstruction", findings, overview=overview, warnings=found.warnings,
+        sections=tuple(sections), tables={"pairs": _pairs(found)}, without=WITHOUT,
     )  # fmt: skip
+
+
+def _fit(part) -> Finding:
+    """The fit of the measurements, relative to their σ from matching."""
+    words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
+    worst = part.misfit
+    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
+    return Finding("Fit", state, f"residuals relative to their σ from matching: {words}; these "
+                   "factors are in all σ of the result")  # fmt: skip
 
 
 def _photographs(found, part) -> Finding:
@@ -57,7 +72,8 @@ def _counts(found, part) -> list[tuple[str, str]]:
         network = one.adjustment.network
         rows.append((
             clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
-            f"{count(len(network.images), 'photograph')}, {count(len(network.points), 'point')}, "
+            f"{count(len(network.images), 'photograph')}, "
+            f"{count(count_points(one.adjustment), 'point')}, "
             f"σ0 {significant(one.adjustment.sigma0, 4)}",
         ))  # fmt: skip
     return [*rows, ("Verified pairs", str(len(found.pairs)))]
