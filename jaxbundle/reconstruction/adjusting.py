@@ -46,9 +46,11 @@ AGREEING_RAY = 0.001
 """Maximum misclosure of an agreeing ray, relative to the image extent."""
 LOSSES = 6
 """Maximum rounds of excluding points left undetermined, in one adjustment."""
-MOST_ITERATIONS = 2000
-"""Iterations of one adjustment. Two photographs, or many with the same viewing direction, determine
-an unknown camera only weakly, and the search then needs several hundred."""
+FEWEST_ITERATIONS, MOST_ITERATIONS, MOST_WORK = 200, 2000, 4_000_000
+"""Iterations of one adjustment, and iterations times image points. Two photographs, or many with
+the same viewing direction, determine an unknown camera only weakly, and the search then needs
+several hundred; with more photographs a search that has not ended soon has wrong start values,
+and others are tried."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +160,7 @@ def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network
     """The adjustment without undetermined tie points; the network without them; its rows among
     those given."""
     rows = np.arange(len(network.observations))
-    again = lambda: adjust(network, max_iterations=MOST_ITERATIONS, **options)
+    again = lambda: adjust(network, max_iterations=limit_iterations(network), **options)
     for _ in range(LOSSES):
         try:
             result = again()
@@ -173,6 +175,12 @@ def _adjust_determined(network: Network, **options) -> tuple[Adjustment, Network
         rows = rows[kept[network.observations.point]]
         network = keep_points(network, kept)
     return again(), network, rows
+
+
+def limit_iterations(network: Network) -> int:
+    """The maximum number of iterations of an adjustment, by its size."""
+    work = MOST_WORK // max(len(network.observations), 1)
+    return min(max(work, FEWEST_ITERATIONS), MOST_ITERATIONS)
 
 
 def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:

@@ -48,8 +48,10 @@ def test_photographs_that_cannot_be_read_are_named_with_the_remedy(folder):
 
 def test_other_files_are_summed_up_without_hidden_ones(folder):
     (said,) = name_other_files([folder])
-    assert said == (f"{folder}: not read: 1 raw file beside photographs of the same name; 1 folder "
-                    "with photographs (more/); give them, too; 3 other files (2 .txt, 1 .mp4)")  # fmt: skip
+    assert said == (
+        f"{folder}: not read: 1 raw file beside photographs of the same name; 1 folder with "
+        "photographs (more/); give them, too; 3 other files (2 .txt, 1 .mp4)"
+    )
     assert describe_other_files(folder / "more") == ""
     assert folder / "a.NEF" not in list_photographs(folder)
 
