@@ -92,6 +92,8 @@ def test_resolution_in_the_focal_plane_is_that_of_the_photograph_as_it_was_taken
     details[0x920A], details[0xA20E], details[0xA210] = 8.0, 254.0, 3  # pixels for a centimetre
     details[0xA002], details[0xA003] = 180, 120
     Image.fromarray(GREY).save(tmp_path / "half.jpg", exif=head)
+    Image.fromarray(GREY[:, :60]).save(tmp_path / "square.jpg", exif=head)
+    assert read_exif(tmp_path / "square.jpg").principal_distance() is None  # of unknown scale
     told = read_exif(tmp_path / "half.jpg").principal_distance()
     assert told[::2] == (pytest.approx(8.0 * 25.4 / 2), "focal length and resolution")
     assert told.sigma == pytest.approx(0.05 * told.value)
