@@ -3,6 +3,7 @@
 HEIC is read if `pillow-heif` is installed, AVIF if Pillow was built with it.
 """
 
+import importlib
 from pathlib import Path
 
 SUFFIXES = (
@@ -56,7 +57,7 @@ def remedy(path: str | Path) -> str:
 def register_heic() -> None:
     """Let Pillow read HEIC, if `pillow-heif` is installed."""
     try:
-        import pillow_heif
+        plugin = importlib.import_module("pillow_heif")
     except ImportError:
         return
-    pillow_heif.register_heif_opener()
+    plugin.register_heif_opener()

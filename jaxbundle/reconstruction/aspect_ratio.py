@@ -115,7 +115,7 @@ def _at_solution(result: Adjustment) -> Network:
     points = Points(points.id, points.role, position, points.sigma, points.source)
     rays = Observations(rays.image, rays.point, rays.xy, rays.sigma, rays.source).take(used)
     found = network.replace(cameras=cameras, images=images, points=points, observations=rays)
-    return keep_points(found, np.isfinite(position).all(1))
+    return keep_points(found, np.all(np.isfinite(position), axis=1))
 
 
 def _deviation(result: Adjustment, camera: str, value: float) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """What a folder of photographs contains: nothing is dropped without a word."""
 
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -90,3 +91,19 @@ def test_a_folder_of_heic_ends_with_the_remedy(tmp_path, command):
     told = command("reconstruct", tmp_path, "--out", tmp_path / "out")
     assert told.status == 2 and "0 of 3 photographs can be used" in told.err
     assert "IMG_0.HEIC (HEIC is read after pip install pillow-heif" in told.err
+
+
+def test_unknown_tags_of_tiff_are_not_told(tmp_path):
+    """By OpenCV, in a process of its own: dozens of lines for a folder."""
+    from PIL import Image, TiffImagePlugin
+
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[34855] = 160
+    for k in range(2):
+        Image.fromarray(np.roll(GREY, 9 * k, 1)).save(tmp_path / f"{k}.tif", tiffinfo=tags)
+    command = [sys.executable, "-m", "jaxbundle", "calibrate", tmp_path]
+    told = subprocess.run(
+        [*command, "--board", "4x3", "--square", "1"], capture_output=True, encoding="utf-8"
+    )
+    assert told.returncode == 2 and "TIFF" not in told.stderr
+    assert "no photograph of 2" in told.stderr
