@@ -209,6 +209,7 @@ class _Making:
                 self.names[k], f"it shows the same as {self.names[other]} ({still} of {number} "
                 "matches are at the same place): saved again, or taken from the same place"
             )
+        self._require_two()
         matches = [m for m in matches if not {*m.images} & again.keys()]
         self.tried = {m.images for m in matches}
         matches, marked = without_marks(matches, features, sizes)
@@ -229,10 +230,14 @@ class _Making:
             self.left_out.setdefault(
                 self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
             )
-        if len(features) - len(bad) < 2:
+        self._require_two()
+        return features
+
+    def _require_two(self) -> None:
+        """Refuse to go on with a single photograph."""
+        if sum(name not in self.left_out for name in self.names) < 2:
             said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
             raise InputError(f"fewer than two photographs can be used: {said}")
-        return features
 
     def _reader(self, photograph: Photograph):
         def read():

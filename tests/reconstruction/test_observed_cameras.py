@@ -20,7 +20,7 @@ SIZE = (3000, 2000)
 FILE = StatedDistance(2350.0, 117.5, "focal length and sensor")
 
 
-def network(stated, aspect_sigma=2e-4, lens=(0, 0)):
+def network(stated, aspect_sigma=2e-4, lens=(0, 1)):
     """Two cameras, whose start values come from matches, with two photographs each."""
     cameras = tuple(
         Camera(id, "opencv", {"fx": 2100.0, "fy": 2100.0, "cx": 1499.5, "cy": 999.5, "k1": 0.05},
@@ -55,14 +55,18 @@ def test_the_file_is_observed_not_the_start_value_from_matches():
 
 
 def test_focal_lengths_of_one_lens_are_tied_only_if_its_pixels_are_square():
+    """Then the file states it for both once, not twice."""
     ties = lambda made: next(one for one in made.further if one.TABLE == "ties")
-    assert "fx" in ties(network((FILE, FILE))).parameter
-    free = network((FILE, FILE), np.inf)
+    one = network((FILE, FILE), lens=(0, 0))
+    assert "fx" in ties(one).parameter
+    assert ("a", "fx") in rows(one) and not {("b", "fx"), ("b", "k1")} & rows(one).keys()
+    free = network((FILE, FILE), np.inf, lens=(0, 0))
     assert "fx" not in ties(free).parameter and ("a", "fy/fx") not in rows(free)
+    assert {("a", "fx"), ("b", "fx")} <= rows(free).keys()
 
 
 def test_another_principal_distance_changes_only_that_of_unknown_cameras():
-    found = _with_distances(network((FILE, None), lens=(0, 1)), {"b": 4200.0})
+    found = _with_distances(network((FILE, None)), {"b": 4200.0})
     assert [c.parameters["fx"] for c in found.cameras] == [2100.0, 4200.0]
     assert rows(found)["b", "fx"] == pytest.approx((4200.0, 0.2 * 4200.0))
     assert rows(found)["a", "fx"] == (FILE.value, FILE.sigma)

@@ -193,6 +193,15 @@ def test_what_cannot_be_used_is_refused(tmp_path):
         assign_cameras(found, camera)
 
 
+def test_two_copies_of_one_photograph_are_too_few(tmp_path, command):
+    write_photographs(tmp_path, "a", 1, 3)
+    grey = cv2.imread(str(tmp_path / "a0.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "copy.jpg"), grey, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    told = command("reconstruct", tmp_path, "--out", tmp_path / "out")
+    assert told.status == 2 and "fewer than two photographs can be used" in told.err
+    assert "shows the same as" in told.err
+
+
 def test_the_command_refuses_before_it_writes(tmp_path, command):
     empty = tmp_path / "empty"
     empty.mkdir()
