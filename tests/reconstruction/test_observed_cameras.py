@@ -8,6 +8,7 @@ import pytest
 import jaxbundle
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import Exif, StatedDistance
+from jaxbundle.reconstruction.aspect_ratio import release
 from jaxbundle.reconstruction.named import no_named_points
 from jaxbundle.reconstruction.network import Extra, observed_parameters, tie_network
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
@@ -63,6 +64,13 @@ def test_focal_lengths_of_one_lens_are_tied_only_if_its_pixels_are_square():
     free = network((FILE, FILE), np.inf, lens=(0, 0))
     assert "fx" not in ties(free).parameter and ("a", "fy/fx") not in rows(free)
     assert {("a", "fx"), ("b", "fx")} <= rows(free).keys()
+
+
+def test_pixels_that_are_not_square_separate_the_focal_lengths_of_both_formats():
+    made = release(network((FILE, FILE), lens=(0, 0)), ["a"])
+    (ties,) = (one for one in made.further if one.TABLE == "ties")
+    assert set(ties.parameter) == {"k1", "k2", "k3"}
+    assert ("a", "fy/fx") not in rows(made) and ("b", "fy/fx") in rows(made)
 
 
 def test_another_principal_distance_changes_only_that_of_unknown_cameras():
