@@ -53,7 +53,9 @@ def write_reconstruction(
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            _write_part(found, part, folder, plots, f"{part.name}\n\n", {})
+            own = (said for said in found.warnings if said.startswith(f"{part.name}:"))
+            note = "\n".join([*(f"warning: {said}" for said in own), part.name])
+            _write_part(found, part, folder, plots, f"{note}\n\n", {})
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new)

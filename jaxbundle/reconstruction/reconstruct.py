@@ -334,7 +334,8 @@ class _Making:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         some = "no three photographs overlap one another" if pairs else "no photographs overlap"
-        return f"not solved: {some}: {said}"
+        return (f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
+                "to the next, on which the object or its surroundings have texture")  # fmt: skip
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
