@@ -54,7 +54,10 @@ def write_reconstruction(
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            _write_part(found, part, folder, plots, describe_part(found, part), {})
+            own = (f"warning: {said}" for said in found.warnings
+                   if said.startswith(f"{part.name}:"))  # fmt: skip
+            note = "\n".join([*own, describe_part(found, part)])
+            _write_part(found, part, folder, plots, note, {})
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new)
@@ -113,5 +116,6 @@ def _summary(found: Reconstruction) -> dict:
              "control_not_used": part.no_control}
             for part in found.parts
         ],
-        "left_out": dict(found.left_out), "notes": list(found.notes), "pairs": len(found.pairs),
+        "warnings": list(found.warnings), "left_out": dict(found.left_out),
+        "notes": list(found.notes), "pairs": len(found.pairs),
     }  # fmt: skip

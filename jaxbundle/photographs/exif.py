@@ -20,6 +20,8 @@ PNG_PACKET = "XML:com.adobe.xmp"
 FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
 TAKEN_X, TAKEN_Y = 0xA002, 0xA003
+SHAPE = 0.02
+"""Difference of the ratio of the sides, from rounding and borders, without a crop."""
 FILM_DIAGONAL = math.hypot(36, 24)
 """mm: reference of focal lengths equivalent to 35 mm film."""
 MM = {2: 25.4, 3: 10.0, 4: 1.0}
@@ -57,7 +59,8 @@ class Place:
 @dataclasses.dataclass(frozen=True)
 class Exif:
     """Size in pixels; the camera; focal length in mm, and its equivalent for
-    35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time."""
+    35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time; whether
+    the photograph was `cropped` to another shape."""
 
     size: tuple[int, int]
     make: str = ""
@@ -69,6 +72,7 @@ class Exif:
     time: datetime.datetime | None = None
     place: Place | None = None
     attitude: Attitude | None = None
+    cropped: bool = False
 
     @property
     def camera(self) -> str:
@@ -80,6 +84,8 @@ class Exif:
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
         was taken; None if unknown."""
+        if self.cropped:
+            return None
         long = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
@@ -113,10 +119,10 @@ def read_exif(path: str | Path) -> Exif:
             return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
-    taken = max(_positive(details.get(TAKEN_X)) or 0, _positive(details.get(TAKEN_Y)) or 0)
-    if resolution and taken:
+    taken = sorted(_positive(details.get(side)) or 0 for side in (TAKEN_X, TAKEN_Y))
+    if resolution and taken[1]:
         # of the original photograph: programs that reduce it usually keep this
-        resolution *= max(size) / taken
+        resolution *= max(size) / taken[1]
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     return Exif(
         size=size,
@@ -129,6 +135,7 @@ def read_exif(path: str | Path) -> Exif:
         time=_time(details.get(DATE_TAKEN) or head.get(DATE), details.get(FRACTION)),
         place=_place(gps, xmp),
         attitude=xmp.attitude,
+        cropped=taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > SHAPE,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.further import Ties
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network, Observations, Points
 from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
@@ -85,13 +86,24 @@ def is_replicated(one: Ratio, other: Ratio) -> bool:
 
 
 def release(network: Network, cameras) -> Network:
-    """The network without the observed ratios of some cameras."""
+    """The network without the observed ratios of some cameras. Their fx is no longer that of
+    photographs of the same lens in the other format."""
     observed = observed_parameters(network)
     if observed is None:
         return network
     keep = [name != ASPECT or id not in cameras
             for id, name in zip(observed.camera, observed.parameter)]  # fmt: skip
-    return with_observed(network, observed.take(np.array(keep)))
+    network = with_observed(network, observed.take(np.array(keep)))
+    return network.replace(further=tuple(
+        _without_focal_lengths(one, cameras) if isinstance(one, Ties) else one
+        for one in network.further
+    ))  # fmt: skip
+
+
+def _without_focal_lengths(ties: Ties, cameras) -> Ties:
+    columns = zip(ties.camera, ties.other, ties.parameter)
+    keep = [name != "fx" or not {one, other} & {*cameras} for one, other, name in columns]
+    return ties.take(np.array(keep))
 
 
 def _without_ratios(network: Network) -> Network:
@@ -115,7 +127,7 @@ def _at_solution(result: Adjustment) -> Network:
     points = Points(points.id, points.role, position, points.sigma, points.source)
     rays = Observations(rays.image, rays.point, rays.xy, rays.sigma, rays.source).take(used)
     found = network.replace(cameras=cameras, images=images, points=points, observations=rays)
-    return keep_points(found, np.isfinite(position).all(1))
+    return keep_points(found, np.all(np.isfinite(position), axis=1))
 
 
 def _deviation(result: Adjustment, camera: str, value: float) -> tuple[float, float]:

@@ -24,7 +24,8 @@ by many σ."""
 FREE = ("fx", "fy", *(name for name in PRIORS if name != "fx"))
 ASPECT = "fy/fx"
 OF_THE_LENS = ("fx", "k1", "k2", "k3")
-"""Common parameters of cameras with one lens."""
+"""Common parameters of cameras with one lens: of photographs in portrait and landscape format. The
+first only if pixels are square."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,8 +82,9 @@ def tie_network(
     )  # fmt: skip
     if not cameras.given:
         stated = [cameras.stated[c] for c in used]
-        network = _observe(network, stated, aspect_sigma)
-        network = _with_ties(network, [cameras.lens[c] for c in used], np.isfinite(aspect_sigma))
+        lens = [cameras.lens[c] for c in used]
+        of_lens = OF_THE_LENS if np.isfinite(aspect_sigma) else OF_THE_LENS[1:]
+        network = _with_ties(_observe(network, stated, lens, of_lens, aspect_sigma), lens, of_lens)
     return network
 
 
@@ -92,18 +94,26 @@ def track_name(track: int) -> str:
 
 
 def _observe(
-    network: Network, stated: Sequence[StatedDistance | None], aspect_sigma: float
+    network: Network,
+    stated: Sequence[StatedDistance | None],
+    lens: Sequence[int],
+    of_lens: Sequence[str],
+    aspect_sigma: float,
 ) -> Network:
-    """The network with what is known of its unknown cameras as observations."""
+    """The network with what is known of its unknown cameras as observations; what is common to the
+    cameras of one lens is observed once."""
     rows = []
-    for camera, file in zip(network.cameras, stated):
+    for k, (camera, file) in enumerate(zip(network.cameras, stated)):
         side = max(camera.image_size or (1, 1))
         for name, relative in PRIORS.items():
+            if name in of_lens and lens[k] in lens[:k]:
+                continue
+            if name == "fx" and file is not None:
+                rows.append((camera.id, name, file.value, file.sigma))
+                continue
             value = camera.parameters.get(name, 0.0) if name in ("fx", "cx", "cy") else 0.0
             unit = {"fx": value, "cx": side, "cy": side}.get(name, 1.0)
             rows.append((camera.id, name, value, relative * unit))
-        if file is not None:
-            rows[-len(PRIORS)] = (camera.id, "fx", file.value, file.sigma)
         if np.isfinite(aspect_sigma):
             rows.append((camera.id, ASPECT, 1.0, aspect_sigma))
     columns = dict(zip(("camera", "parameter", "value", "sigma"), map(list, zip(*rows))))
@@ -123,16 +133,14 @@ def with_observed(network: Network, observed: CameraParameters) -> Network:
     return network.replace(further=(*others, observed))
 
 
-def _with_ties(network: Network, lens: Sequence[int], square: bool) -> Network:
-    """The network with common parameters of cameras with one lens. Where pixels need not be square,
-    the focal lengths of photographs in portrait and landscape format are not tied."""
+def _with_ties(network: Network, lens: Sequence[int], of_lens: Sequence[str]) -> Network:
+    """The network with common parameters of cameras with one lens."""
     first, columns = {}, {"camera": [], "other": [], "parameter": []}
     for camera, number in zip(network.cameras, lens):
         one = first.setdefault(number, camera)
-        for name in OF_THE_LENS if one is not camera else ():
-            if name != "fx" or square:
-                for column, value in zip(columns.values(), (one.id, camera.id, name)):
-                    column.append(value)
+        for name in of_lens if one is not camera else ():
+            for column, value in zip(columns.values(), (one.id, camera.id, name)):
+                column.append(value)
     if not columns["camera"]:
         return network
     return network.replace(further=(*network.further, *make_further({"ties": columns}, 1.0)))

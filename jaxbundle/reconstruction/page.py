@@ -5,7 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.network.columns import count
+from jaxbundle.reconstruction.adjusting import LARGEST_MISFIT, WRONG_MISFIT
 from jaxbundle.reconstruction.control_table import HEADER
+from jaxbundle.report.head import count_points
 from jaxbundle.report.layout import clean, heading, significant, table
 from jaxbundle.report.layout import facts as text_facts
 from jaxbundle.report.layout import paragraph as text_paragraph
@@ -21,6 +23,11 @@ from jaxbundle.report.page import (
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
 from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+
+WITHOUT = ("χ² test",)
+"""Findings of an adjustment that do not apply: σ are estimated from the residuals."""
+CONTROL = ("Control", "Check points")
+"""Findings of an adjustment in place of which those of the control table stand."""
 
 
 def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
@@ -55,12 +62,21 @@ def _describe(found, part) -> Addition:
     overview += f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
     if found.notes:
         overview += items(found.notes)
+    findings = (*([_fit(part)] if part.factors else []), _photographs(found, part))
     return Addition(
-        "reconstruction", (_photographs(found, part), *_judge_control(part)),
-        without=("Control", "Check points") if part.control is not None or part.no_control else (),
-        overview=overview,
-        sections=tuple(sections), tables={"pairs": _pairs(found)},
+        "reconstruction", (*findings, *_judge_control(part)), overview=overview,
+        warnings=found.warnings, sections=tuple(sections), tables={"pairs": _pairs(found)},
+        without=(*WITHOUT, *CONTROL) if part.control is not None or part.no_control else WITHOUT,
     )  # fmt: skip
+
+
+def _fit(part) -> Finding:
+    """The fit of the measurements, relative to their σ from matching."""
+    words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
+    worst = part.misfit
+    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
+    return Finding("Fit", state, f"residuals relative to their σ from matching: {words}; these "
+                   "factors are in all σ of the result")  # fmt: skip
 
 
 def _photographs(found, part) -> Finding:
@@ -131,7 +147,8 @@ def _counts(found, part) -> list[tuple[str, str]]:
         network = one.adjustment.network
         rows.append((
             clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
-            f"{count(len(network.images), 'photograph')}, {count(len(network.points), 'point')}, "
+            f"{count(len(network.images), 'photograph')}, "
+            f"{count(count_points(one.adjustment), 'point')}, "
             f"σ0 {significant(one.adjustment.sigma0, 4)}",
         ))  # fmt: skip
     return [*rows, ("Verified pairs", str(len(found.pairs)))]

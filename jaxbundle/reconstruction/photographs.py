@@ -9,7 +9,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import UPRIGHT, Exif, StatedDistance, read_exif
-from jaxbundle.photographs.reading import SUFFIXES, photograph_size
+from jaxbundle.photographs.folders import describe_other_files, list_photographs
+from jaxbundle.photographs.formats import SUFFIXES
+from jaxbundle.photographs.reading import photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
 DEFAULT_RATIO = 1.2
@@ -68,13 +70,21 @@ def find_photographs(
     return found, left_out
 
 
+def name_other_files(given: Sequence[str | Path]) -> list[str]:
+    """Notes about files in the given folders that are no photographs."""
+    said = [describe_other_files(one) for one in map(Path, given) if one.is_dir()]
+    return [words for words in said if words]
+
+
 def _files(given) -> list[Path]:
     paths: list[Path] = []
     for one in map(Path, given):
         if one.is_dir():
-            inside = sorted(p for p in one.iterdir() if p.suffix.lower() in SUFFIXES)
+            inside = list_photographs(one)
             if not inside:
-                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})")
+                other = describe_other_files(one).removeprefix(f"{one}: ")
+                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})"
+                                 + (f"; {other}" if other else ""))  # fmt: skip
             paths += inside
         elif not one.exists():
             raise InputError(f"{one}: no such file")

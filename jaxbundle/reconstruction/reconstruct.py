@@ -22,7 +22,12 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
-from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
+from jaxbundle.reconstruction.adjusting import (
+    LARGEST_MISFIT,
+    WRONG_MISFIT,
+    Weighted,
+    adjust_weighted,
+)
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.block import Block, describe_block
 from jaxbundle.reconstruction.control import Control
@@ -37,12 +42,15 @@ from jaxbundle.reconstruction.photographs import (
     Photograph,
     assign_cameras,
     find_photographs,
+    name_other_files,
 )
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
+from jaxbundle.report.head import count_points
 from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.calibration import start_cameras
+from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
@@ -63,12 +71,12 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
-LARGEST_MISFIT = 4.0
-"""Factor of σ above which a result is called doubtful; right results of rendered facades have up to
-2.5."""
 FARTHEST_CONTROL = 10_000.0
 """Metres between control in a system without a name and satellite positions in their UTM zone; a
 block from the air is smaller, another system is farther."""
+CONTRADICTS_FILE = 3.29
+"""Difference from the principal distance of the files, in σ, that chance explains in one of a
+thousand."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -87,34 +95,39 @@ class Part:
     control: ControlTable | None = None
     no_control: str = ""
 
+    @property
+    def misfit(self) -> float:
+        """How many times worse than their σ from matching measurements of the worst kind fit."""
+        return max(self.factors.values(), default=1.0)
+
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
-    """`parts`, the largest first; photographs in none of them, with the reason; notes;
-    verified `pairs`, by the names of their photographs: matches, agreeing matches,
-    kind; `photographs`: the examined files, by name; `name` of the whole."""
+    """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
+    why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
+    matches, agreeing matches, kind; `photographs`: the examined files, by name;
+    `name` of the whole."""
 
     parts: tuple[Part, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
     photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     name: str = ""
 
     def __str__(self) -> str:
-        lines = [
+        lines = [f"warning: {said}" for said in self.warnings]
+        lines += [
             f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
-            f"{count(len(part.adjustment.network.points), 'point')}, "
+            f"{count(count_points(part.adjustment), 'point')}, "
             f"σ0 {part.adjustment.sigma0:.3f}{_distances_found(part.adjustment)}"
             for part in self.parts
         ]  # fmt: skip
         lines += [f"warning: {part.name}: {said}" for part in self.parts
                   for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
         for part in self.parts:
-            lines += [f"warning: {part.name}: control is not used: {part.no_control}"] * bool(
-                part.no_control
-            )
             if part.control is not None:
                 lines.append(part.control.sigma)
                 lines += [f"control: {said}" for said in part.control.notes]
@@ -148,6 +161,7 @@ def reconstruct(
     cameras = assign_cameras(photographs, camera)
     with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
         named, notes = find_named(photographs, settings.targets, control, pool.map)
+    notes += name_other_files(given)
     positions, said = find_positions(photographs, control)
     notes += said
     framed = positions is not None and positions.define_frame
@@ -221,6 +235,7 @@ class _Making:
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
+        self.warnings: list[tuple[float, str]] = []
         self.tried: set[tuple[int, int]] = set()
         self.frame: Given | None = None
         self.system = self.title = ""
@@ -241,8 +256,9 @@ class _Making:
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         files = {p.name: p.path for p in self.photographs}
+        warnings = [said for _, said in sorted(self.warnings, key=lambda one: -one[0])]
         return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files,
-                              self.title)  # fmt: skip
+                              tuple(warnings), self.title)  # fmt: skip
 
     def _matches(self):
         features = self._features()
@@ -251,8 +267,17 @@ class _Making:
         matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
                         self.tell)  # fmt: skip
         self.store.drop_unused()
+        sizes = [p.size for p in self.photographs]
+        again = find_duplicates(matches, features, sizes)
+        for k, (other, still, number) in again.items():
+            self.left_out.setdefault(
+                self.names[k], f"it shows the same as {self.names[other]} ({still} of {number} "
+                "matches are at the same place): saved again, or taken from the same place"
+            )
+        self._require_two()
+        matches = [m for m in matches if not {*m.images} & again.keys()]
         self.tried = {m.images for m in matches}
-        matches, marked = without_marks(matches, features, [p.size for p in self.photographs])
+        matches, marked = without_marks(matches, features, sizes)
         if marked:
             self.notes.append(
                 f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
@@ -270,10 +295,14 @@ class _Making:
             self.left_out.setdefault(
                 self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
             )
-        if len(features) - len(bad) < 2:
+        self._require_two()
+        return features
+
+    def _require_two(self) -> None:
+        """Refuse to go on with a single photograph."""
+        if sum(name not in self.left_out for name in self.names) < 2:
             said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
             raise InputError(f"fewer than two photographs can be used: {said}")
-        return features
 
     def _reader(self, photograph: Photograph):
         def read():
@@ -304,7 +333,7 @@ class _Making:
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
                               f"by others in triplets: {list_some(named, 3, str)}")  # fmt: skip
         if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
-            self.notes.append(
+            self._warn(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
                 "repeats itself, and parts of it may have been superimposed; compare the "
                 "result with the object, or take photographs with shorter bases"
@@ -347,6 +376,10 @@ class _Making:
             raise NotSolvedError(self._why_nothing(pairs, failed), self.names)
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
+    def _warn(self, said: str, weight: float = 1.0) -> None:
+        """Keep a warning; those of larger weight are shown first."""
+        self.warnings.append((weight, said))
+
     def _begin(self, stage: str) -> None:
         """Begin a stage of unknown length, after the end of the one before."""
         if self.stage:
@@ -366,7 +399,8 @@ class _Making:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         some = "no three photographs overlap one another" if pairs else "no photographs overlap"
-        return f"not solved: {some}: {said}"
+        return (f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
+                "to the next, on which the object or its surroundings have texture")  # fmt: skip
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
@@ -389,8 +423,7 @@ class _Making:
         refuse_folded(weighted, measured, self.names)
         doubts = refuse_superimposed(weighted.adjustment, network, self.tried, self.names)
         self.notes += [note] if note else []
-        self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
-        self.notes += [f"{name}: {said}" for said in doubts]
+        self.notes += _name_unused(name, weighted)
         control, no_control = None, ""
         if self.frame is not None:
             try:
@@ -399,6 +432,7 @@ class _Making:
                 )
             except (InputError, NotSolvedError) as error:
                 no_control = str(error)
+                self._warn(f"{name}: control is not used: {error}", np.inf)
             self._begin("")
         exif = {photograph.name: photograph.exif for photograph in self.photographs}
         # without control and positions the frame is an arbitrary one
@@ -406,7 +440,28 @@ class _Making:
         block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors, block, control,
                     no_control)  # fmt: skip
+        if part.misfit >= LARGEST_MISFIT:
+            self._warn(f"{name}: {_misfit_in_words(part)}", part.misfit)
+        for said in (*self._contradict_files(weighted.adjustment), *doubts):
+            self._warn(f"{name}: {said}")
         return part, dict(oriented.images)
+
+    def _contradict_files(self, result: Adjustment) -> list[str]:
+        """Principal distances that contradict those of the files, in words."""
+        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated)}
+        said = []
+        for id, found in _principal_distances(result).items():
+            file = stated.get(id)
+            if file is None or not found["sigma"]:
+                continue
+            sigma = np.hypot(file.sigma, found["sigma"])
+            if abs(found["value"] - file.value) > CONTRADICTS_FILE * sigma:
+                said.append(
+                    f"camera {id}: principal distance {found['value']:.0f} px contradicts the "
+                    f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
+                    "photographs were cropped or zoomed, or the result is wrong"
+                )
+        return said
 
     def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
@@ -509,13 +564,14 @@ def _name_unused(name: str, weighted: Weighted) -> list[str]:
             "measurements contradict each other, as on an object that repeats itself"]  # fmt: skip
 
 
-def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
-    """A note on measurements that contradict each other by far more than their σ."""
-    if weighted.worst < LARGEST_MISFIT:
-        return []
-    return [f"{name}: measurements fit {weighted.worst:.1f} times worse than their σ from "
-            "matching: the object repeats itself or moves, or the camera model does not fit the "
-            "lens; compare the result with the object"]  # fmt: skip
+def _misfit_in_words(part: Part) -> str:
+    """Measurements that contradict each other by far more than their σ."""
+    wrong = part.misfit >= WRONG_MISFIT
+    return (
+        f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "
+        "worse than their σ from matching: the object repeats itself or moves, or the camera model "
+        "does not fit the lens; compare the result with the object"
+    )
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

@@ -36,7 +36,7 @@ NEAR = 1.05
 """Ratio of principal distances below which verified pairs are still right."""
 FEWEST_RAYS = 12
 """Minimum image points of a photograph; of fewer most may be gross errors."""
-LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
+LEAST_OF_IMAGES, OF_OTHERS = 0.5, 1
 """Minimum share of photographs oriented by start values with another principal distance; and
 maximum number of such start values that are adjusted."""
 

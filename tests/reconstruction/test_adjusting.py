@@ -86,6 +86,17 @@ def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, h
     assert lost not in left and len(rows) == len(network.observations) - 4
 
 
+@pytest.mark.parametrize("image_points", [500, 3000, 15_000, 400_000])
+def test_a_search_without_end_costs_no_more_than_the_size_of_its_network(image_points):
+    """Several hundred iterations for two photographs; for more, a bounded number of evaluated image
+    points."""
+    network = SimpleNamespace(observations=range(image_points))
+    most = adjusting.limit_iterations(network)
+    assert 200 <= most <= 2000
+    assert most * image_points <= max(4_000_000, 200 * image_points)
+    assert image_points > 3000 or most > 1000
+
+
 def photographs_of_columns(share):
     """Six photographs of a grid, most points in two of them; of these, a share is measured at
     the neighbouring column in the second one."""

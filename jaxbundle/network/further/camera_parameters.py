@@ -45,7 +45,7 @@ class CameraParameters(Further):
     value: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
 
-    TABLE, MEASURED = "camera_parameters", "value"
+    TABLE = "camera_parameters"
 
     @classmethod
     def of(
