@@ -179,8 +179,8 @@ def reconstruct(
     extra = Extra(named, tuple(distances), positions[:2] if positions and framed else None,
                   attitudes)  # fmt: skip
     system = "" if control is None else control.system
-    if control is None and positions is not None and framed:
-        system = positions.words
+    if positions is not None and (framed or control is not None):
+        system = positions.words if control is None else system or positions.system
     first = Path(given[0])
     name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)
@@ -196,16 +196,17 @@ def find_positions(
     """The satellite positions of the photographs in the system of control, else in their UTM zone,
     and what is done with them."""
     places = [p.exif.place for p in photographs]
+    there = sum(place is not None for place in places)
     if control is None:
         found = map_positions(places)
         if found is None:
-            return None, []
+            return None, [f"satellite positions of {there} photographs are not used: expected "
+                          "three or more with heights"] * bool(there)  # fmt: skip
         if not found.define_frame:
             return found, ["satellite positions of the photographs extend over less than 8 σ: they "
                            "do not define the frame"]  # fmt: skip
         return found, [f"satellite positions of the photographs: {found.words}"]
     notes = [f"control in {control.system or 'a system that its file does not name'}"]
-    there = sum(place is not None for place in places)
     if not there:
         return None, [*notes, "no satellite positions in the photographs: control alone gives the "
                       "frame"]  # fmt: skip
