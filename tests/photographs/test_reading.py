@@ -120,12 +120,12 @@ def test_sensors_are_not_mistaken():
 def test_positions_in_a_map():
     assert utm_system(48.2, 16.4) == "EPSG:32633" and utm_system(-33.5, -70.7) == "EPSG:32719"
     places = [Place(48.0 + 1e-3 * k, 16.0, 200.0 + k) for k in range(4)]
-    X, sigma, _, said = map_positions([*places, None])
+    X, sigma, _, said, wide = map_positions([*places, None])
     # a thousandth of a degree of the meridian at 48° is 111.2 m, times the scale of UTM
     assert np.allclose(np.diff(X[:4, 1]), 111.2 * 0.9996, atol=0.15)
     assert np.isnan(X[4]).all() and np.allclose(sigma[0], [3, 3, 6]) and "EPSG:32633" in said
     near = [Place(48.0 + 1e-6 * k, 16.0, 200.0) for k in range(4)]
-    assert map_positions(near) is None
+    assert wide and not map_positions(near).define_frame
     moved, said = to_map(np.array([[16.0, 48.0, 200.0]]), "EPSG:4326", "gcp")
     assert np.allclose(moved, X[:1], atol=1e-3) and said == "EPSG:32633"
     with pytest.raises(InputError, match="gcp: coordinate system 'EPSG:1' is not known"):
