@@ -88,7 +88,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
         "seconds": time.perf_counter() - start, "processor": time.process_time() - processor,
         "stages": stages, "peak_mb": machine.peak_mb(),
         "parts": [of_part(part, truth) for part in found.parts],
-        "left_out": dict(found.left_out), "notes": list(found.notes),
+        "left_out": dict(found.left_out), "notes": [*found.warnings, *found.notes],
     }  # fmt: skip
 
 

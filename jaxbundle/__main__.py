@@ -1,7 +1,7 @@
 """`jaxbundle` and `python -m jaxbundle`: the command line.
 
-One BLAS thread, unless the environment says otherwise: threads are slow on small matrices. The
-library reads the variable on import.
+One BLAS thread, unless the environment says otherwise: threads are slow on small matrices. OpenCV
+reports errors only. The libraries read these variables on import.
 """
 
 import gc
@@ -22,6 +22,7 @@ def main() -> None:
     write_everywhere()
     gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # warnings about unknown tags of TIFF
     if "reconstruct" in sys.argv[1:2]:
         from jaxbundle.system.configuration import allow_programs_at_once
 

@@ -104,6 +104,23 @@ def test_a_reconstruction_names_what_it_left_out(convergent4):
     assert len(column(text, "points", "X")) == len(convergent4.points["id"])
 
 
+@pytest.mark.parametrize("factor, state, words", [
+    (3.0, "met", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
+])  # fmt: skip
+def test_a_reconstruction_that_fits_badly_says_so_first(convergent4, factor, state, words):
+    part = Part("part 1", convergent4, {}, {"sift": factor, "other": 1.0})
+    warnings = (f"part 1: {words}measurements fit {factor} times worse",) if words else ()
+    found = Reconstruction((part,), {}, ("a note",), (), {"a": None}, warnings)
+    first = str(found).splitlines()[0]
+    assert first == (f"warning: {warnings[0]}" if words else first) and part.misfit == factor
+    page = Page("".join(compose_part(found, part)))
+    cells = page.texts["td"]
+    fit = next(k for k, cell in enumerate(cells) if cell.startswith("residuals relative to"))
+    assert cells[fit - 1] == state
+    assert not any("confirmed" in cell for cell in cells)
+    assert page.texts["li"][: len(warnings)] == [*warnings]
+
+
 # --- additions ------------------------------------------------------------------------------
 
 

@@ -23,7 +23,6 @@ from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.writing.fingerprints import of_words
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import (
-    SUFFIXES,
     BoardViews,
     Look,
     collect_views,
@@ -31,6 +30,7 @@ from jaxbundle.measure.views import (
     photographs,
 )
 from jaxbundle.network.columns import list_some
+from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.system.workers import Failed, Workers
 
 

@@ -215,7 +215,7 @@ def residual_rows(adjustment, kind, image, point, axes, weight, tested):
     weight = np.asarray(weight)
     free = np.clip(1 - hat, 0, 1)
     unit = np.ones(weight.shape[1])
-    if kind in OF_ANGLES or (kind == "prior" and axes == EXTERIOR):
+    if kind in OF_ANGLES or tuple(axes) == EXTERIOR:
         unit[-3:] = adjustment.angle_scale
     used = weight > 0
     sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)

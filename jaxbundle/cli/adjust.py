@@ -7,7 +7,18 @@ import typer
 
 import jaxbundle
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
-from jaxbundle.cli.app import Control, Force, Format, Html, Input, Quiet, Settings, app, choice
+from jaxbundle.cli.app import (
+    Check,
+    Control,
+    Force,
+    Format,
+    Html,
+    Input,
+    Quiet,
+    Settings,
+    app,
+    choice,
+)
 from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
 
@@ -27,6 +38,7 @@ def adjust(
     set: Settings = None,
     format: Format = None,
     control: Control = None,
+    check: Check = None,
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     method: Annotated[str, choice(METHODS)] = "levenberg-marquardt",
     reduction: Annotated[
@@ -80,6 +92,7 @@ def adjust(
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import iterating, staging
     from jaxbundle.io import read_network
+    from jaxbundle.io.networks.control import select_checks
     from jaxbundle.io.writing.fingerprints import of_input
     from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.report.page import UNKNOWN
@@ -93,18 +106,21 @@ def adjust(
         first = join_for_one_task(
             join, cluster, quiet,
             of_input(input), control and of_input(control), set, format, max_iterations, method,
-            reduction, robust, snooping, significance, eliminate, components, budget,
+            reduction, robust, snooping, significance, eliminate, components, budget, check,
         )  # fmt: skip
         if not first:
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
+    if check:
+        network = network.replace(points=select_checks(network.points, check))
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
     check_targets(input, network, json, out, control, force, html, save)
     origin = UNKNOWN
     if html or out is not None:
         origin = trace_origin(input, network, control, {
-            "--set": ", ".join(set or ()), "--max-iterations": max_iterations, "--robust": robust,
+            "--set": ", ".join(set or ()), "--check": ", ".join(check or ()),
+            "--max-iterations": max_iterations, "--robust": robust,
             "--snooping": snooping, "--significance": significance, "--eliminate": eliminate,
             "--components": components, "--budget": ", ".join(budget or ()),
         })  # fmt: skip

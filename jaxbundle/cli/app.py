@@ -120,6 +120,13 @@ Control = Annotated[
     Path | None,
     typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] that replaces the control of the input"),
 ]
+Check = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME|'every 3rd'",
+        help="control points that are only compared with the result; repeatable",
+    ),
+]
 Force = Annotated[bool, typer.Option("--force", help="replace foreign files in --out")]
 Html = Annotated[str, typer.Option(help="write the result as one HTML page")]
 

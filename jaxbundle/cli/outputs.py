@@ -23,7 +23,7 @@ from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.io.results.result_json import result_text, unsolved_text
-from jaxbundle.io.results.result_project import adjusted_network
+from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
 from jaxbundle.io.writing.fingerprints import input_files
 from jaxbundle.io.writing.folders import check_folder, replace_folder
@@ -259,7 +259,7 @@ def fill_results(
         if budget is not None:
             columns = budget.table()
             write_csv(folder / f"{BUDGET}.csv", list(columns), table_rows(columns))
-        fill_project(adjusted_network(result), folder / ADJUSTED)
+        fill_project(readjustable_network(result), folder / ADJUSTED)
         if (found := orientation_covariance(result)) is not None:
             unit = ANGLE_UNITS[result.network.angle_unit]
             write_orientation_covariance(found, folder / ADJUSTED / PRECISION, unit)

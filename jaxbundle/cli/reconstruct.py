@@ -1,12 +1,14 @@
 """`jaxbundle reconstruct`: photographs to an adjusted network."""
 
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
-from jaxbundle.cli.app import Force, Html, Quiet, app, choice
+from jaxbundle.cli.app import Check, Force, Html, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -23,6 +25,13 @@ def reconstruct_command(
         Path | None,
         typer.Option(help="control points: gcp_list.txt, or a table, with or without measurements"),
     ] = None,
+    control_sigma: Annotated[
+        str | None,
+        typer.Option(metavar="SIGMA[,HEIGHT]", help="σ of control points without their own, "
+                     "metres; default: estimated"),
+    ] = None,
+    check: Check = None,
+    name: Annotated[str, typer.Option(help="name of the job; default: the folder")] = "",
     targets: Annotated[
         str | None,
         typer.Option(help=f"coded targets: {', '.join(CODED_TARGETS)}; :OPTION after it"),
@@ -33,6 +42,9 @@ def reconstruct_command(
     features: Annotated[str, choice(FEATURES)] = "sift",
     pairs: Annotated[str, choice(MATCHED_PAIRS, "matched")] = "auto",
     points: Annotated[int, typer.Option(min=20, help="desired tie points per photograph")] = 1500,
+    square_pixels: Annotated[
+        bool, typer.Option(help="observe fy/fx as 1; otherwise both focal lengths are unknown")
+    ] = True,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     html: Html = "",
     brief: Annotated[
@@ -50,8 +62,9 @@ def reconstruct_command(
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.reconstruct_files import BY, FILES, make_store, write_reconstruction
+    from jaxbundle.io.networks.control import select_checks
     from jaxbundle.measure.coded_targets import check_kind
-    from jaxbundle.reconstruction.control import read_control_measurements
+    from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
     from jaxbundle.reconstruction.named import read_distances
     from jaxbundle.reconstruction.photographs import find_photographs
     from jaxbundle.reconstruction.reconstruct import reconstruct
@@ -63,8 +76,16 @@ def reconstruct_command(
     if targets is not None:
         check_kind(targets)
     settings = Settings(Detection(features), pairs, points, targets=targets)
+    if not square_pixels:
+        settings = replace(settings, aspect_sigma=inf)
     given = None if camera is None else camera_given(camera)
     known = None if control is None else read_control_measurements(control)
+    if known is None and (control_sigma or check):
+        raise InputError("--control-sigma and --check need --control")
+    if known is not None and control_sigma:
+        known = with_sigma(known, control_sigma)
+    if known is not None and check:
+        known = replace(known, points=select_checks(known.points, check))
     bars = () if distances is None else read_distances(distances)
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     check_writable(json, out, BY, FILES, files, force)
@@ -73,10 +94,11 @@ def reconstruct_command(
     store = make_store(out, force)
     advise(f"run the same command again to resume; matches are kept in {store}")
     with staging(quiet or json == "-") as tell:
-        result = reconstruct(photos, given, settings, store, tell, known, bars)
+        result = reconstruct(photos, given, settings, store, tell, known, bars, name)
     origin = trace_files([*files, *(p.path for p in found)], {
-        "--camera": camera, "--targets": targets, "--features": features, "--pairs": pairs,
-        "--points": points,
+        "--camera": camera, "--control-sigma": control_sigma, "--check": ", ".join(check or ()),
+        "--targets": targets, "--features": features, "--pairs": pairs,
+        "--points": points, "--no-square-pixels": True if not square_pixels else None,
     })  # fmt: skip
     with staging(quiet or json == "-") as show:
         write_reconstruction(result, json, out, brief, plots, force, html, origin, show)

@@ -18,13 +18,14 @@ from jaxbundle.io.writing.folders import read_marker, replace_folder
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
-from jaxbundle.reconstruction.page import compose_part
+from jaxbundle.reconstruction.page import compose_part, describe_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
 from jaxbundle.types import Progress
 
 BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
-OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
+CONTROL, POSITIONS = "control.csv", "camera_positions.csv"
+OF_A_PART = (*RESULTS, CONTROL, POSITIONS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
 FILES = (*OF_A_PART, *(f"part_*/{name}" for name in OF_A_PART), PAIRS, *PAIR_FIGURES)
 FIGURE_PIXELS = 1200
 """Pixels of the longer side of a photograph in a figure."""
@@ -50,11 +51,15 @@ def write_reconstruction(
     with write_result(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
-        _write_part(found, first, new, plots, str(found) + "\n\n", also, progress)
+        told = f"{found}\n\n{describe_part(found, first)}"
+        _write_part(found, first, new, plots, told, also, progress)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            _write_part(found, part, folder, plots, f"{part.name}\n\n", {}, progress)
+            own = (f"warning: {said}" for said in found.warnings
+                   if said.startswith(f"{part.name}:"))  # fmt: skip
+            note = "\n".join([*own, describe_part(found, part)])
+            _write_part(found, part, folder, plots, note, {}, progress)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
@@ -66,6 +71,7 @@ def _write_part(
     progress: Progress | None,
 ) -> None:  # fmt: skip
     fill_results(part.adjustment, folder, plots, note, also, progress=progress)
+    _write_tables(part, folder)
     if plots:
         read = lambda name: _thumbnail(found.photographs[name])
         draw_tracks(part.adjustment, read, folder, progress)
@@ -75,6 +81,20 @@ def _write_part(
         fill_colmap(network, folder / MODEL, False)
     except InputError as error:
         print(f"no COLMAP model: {error}")
+
+
+def _write_tables(part: Part, folder: Path) -> None:
+    """Control and check points, and camera positions, as tables."""
+    if part.control is not None:
+        axes = [f"{kind}{a}" for kind in ("", "s", "d") for a in "XYZ"]
+        write_csv(folder / CONTROL, ["id", "role", "used", "rays", *axes, "px", "verdict"], (
+            (p.id, p.role, p.used, p.rays, *p.given, *p.sigma, *p.residual, p.image_residual,
+             p.verdict) for p in part.control.points
+        ))  # fmt: skip
+    positions = part.block.positions
+    if positions is not None:
+        rows = ((id, *d) for id, d in positions.difference.items())
+        write_csv(folder / POSITIONS, ["image", "dX", "dY", "dZ"], rows)
 
 
 def _thumbnail(path: Path):
@@ -89,12 +109,17 @@ def _thumbnail(path: Path):
 
 def _summary(found: Reconstruction) -> dict:
     return {
+        "name": found.name,
         "parts": [
             {"name": part.name, "images": list(part.adjustment.network.images.id),
              "sigma0": part.adjustment.sigma0, "sigma_factors": dict(part.factors),
              "removed": len(part.adjustment.removed),
-             "global_test_passed": part.adjustment.global_test()["passed"]}
+             "global_test_passed": part.adjustment.global_test()["passed"],
+             "block": part.block.as_dict(),
+             "control": None if part.control is None else part.control.as_dict(),
+             "control_not_used": part.no_control}
             for part in found.parts
         ],
-        "left_out": dict(found.left_out), "notes": list(found.notes), "pairs": len(found.pairs),
+        "warnings": list(found.warnings), "left_out": dict(found.left_out),
+        "notes": list(found.notes), "pairs": len(found.pairs),
     }  # fmt: skip

@@ -17,12 +17,13 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board_points, largest_chessboard, other_sizes
+from jaxbundle.photographs.folders import list_photographs
+from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
 """Suffixes of photographs in a folder."""
 SAME, ALIKE = 0.05, 0.8
 """Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
@@ -106,7 +107,7 @@ def photographs(given: Sequence[str | Path]) -> list[Path]:
     for item in given:
         path = Path(item)
         if path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+            files = list_photographs(path)
             if not files:
                 raise InputError(f"{path}: no photographs in this folder ({', '.join(SUFFIXES)})")
         elif not path.exists() and any(c in str(item) for c in "*?["):

@@ -18,11 +18,12 @@ import dataclasses
 import jax.numpy as jnp
 
 from jaxbundle import cameras
-from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.any_distance import move_at_any_distance
 from jaxbundle.leastsquares.datum.motions import similarity
 from jaxbundle.leastsquares.declarations import Kind, Local
 from jaxbundle.leastsquares.spaces import Posed, turn_by
+from jaxbundle.network.further.base import less
+from jaxbundle.network.further.exterior_priors import EXTERIOR_PRIOR
 from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
 from jaxbundle.types import present
 
@@ -108,33 +109,18 @@ def image_points(
     return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True, local=local)
 
 
-def _difference(value, given):
-    return value - given
-
-
-def exterior(pose, given):
-    """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
-    [6]."""
-    angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
-    return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
-
-
 def _distance(a, b, given):
     return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
 
 
-CONTROL = Kind("control points", _difference, ("point",), ("X", "Y", "Z"), snooped="single")
-EXTERIOR = Kind(
-    "exterior orientation", exterior, ("image",), ("X0", "Y0", "Z0", "omega", "phi", "kappa"),
-    snooped="",
-)  # fmt: skip
+CONTROL = Kind("control points", less, ("point",), ("X", "Y", "Z"), snooped="single")
+EXTERIOR = EXTERIOR_PRIOR
 DISTANCES = Kind("distances", _distance, ("point", "point"), ("d",), snooped="single")
 
 
 def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
     """Priors of the parameters of the cameras of a table."""
-    return Kind("interior orientation", _difference, (camera,), parameters, snooped="",
-                invariant=True)  # fmt: skip
+    return Kind("interior orientation", less, (camera,), parameters, snooped="", invariant=True)
 
 
 SIMILARITY = similarity(("point",), ("image",))

@@ -1,11 +1,13 @@
 """Transformation of models: to control and given positions, to each other, or to scale."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import Model, are_controlled
+from jaxbundle.orientation.growth import FITS, Model, are_controlled
 from jaxbundle.orientation.sights import Sights
 
 OUTLIER_LIMIT = 3.0
@@ -17,8 +19,11 @@ FEWEST_WITH_OUTLIERS = 6
 ROUNDS = 3
 LEAST_TO_TELL = 4
 """Minimum control points for distinguishing an object from its mirror image."""
-MIRRORED, FITS = 5.0, 30.0
-"""Mirror image: required improvement of the fit, and fit relative to the extent."""
+TRIPLES = 150
+"""Largest number of similarities by three points; with a third of wrong points, all are good in one
+of three."""
+MIRRORED = 5.0
+"""Mirror image: required improvement of the fit."""
 
 
 def move_to_given_frame(network: Network, sights: Sights, model: Model) -> Model | None:
@@ -152,3 +157,26 @@ def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
         off = np.linalg.norm(source @ A.T + t - target, axis=1)
         good = off <= OUTLIER_LIMIT * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
     return found
+
+
+def similarity_of_most(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
+    """A and t of X' = A·X + t that fit most of the points; None: collinear.
+
+    The least (n/2 + 2)-th smallest distance over similarities by three of n points, which
+    themselves nearly fit (Rousseeuw 1984, least median of squares), then least squares for the
+    points within 2.5 robust standard deviations."""
+    n, rng = len(source), np.random.default_rng(0)
+    triples = list(itertools.islice(itertools.combinations(range(n), 3), TRIPLES + 1))
+    if len(triples) > TRIPLES:
+        triples = [rng.choice(n, 3, replace=False) for _ in range(TRIPLES)]
+    best, least = None, np.inf
+    for triple in triples:
+        found = many.similarity(source, target, np.isin(np.arange(n), triple).astype(float))
+        if found is not None:
+            off = np.linalg.norm(source @ found[0].T + found[1] - target, axis=1)
+            if (middle := np.sort(off)[min(n, n // 2 + 2) - 1]) < least:
+                best, least = off, middle
+    if best is None:
+        return None
+    limit = max(2.5 * 1.4826 * least, np.sort(best)[2])
+    return many.similarity(source, target, (best <= limit).astype(float))

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.alignment import FITS
-from jaxbundle.orientation.growth import FOR_ITSELF, Model, are_controlled, intersect
+from jaxbundle.orientation.growth import FITS, FOR_ITSELF, Model, are_controlled, intersect
 from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
@@ -26,6 +25,9 @@ ALL_PAIRS_UP_TO = 12
 """With at most this many points every swap of two is tried."""
 FEWEST_AGREEING = 4
 """Minimum number of consistent points before the others are suspected; three always agree."""
+EXPECTED = 4.0
+"""Distance of a point in space, in σ of its coordinates, that chance explains: χ² of three degrees
+of freedom exceeds its square once in a thousand points."""
 EQUAL_FIT_RATIO = 3.0
 """Explanations with a fit worse than the best by at most this factor are also reported."""
 
@@ -39,7 +41,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
     points = network.points
     alone = _without_control(network, seen, model)
     control = np.flatnonzero(are_controlled(points) & alone.known)
-    found = contradiction(alone.X[control], points.position[control])
+    found = contradiction(alone.X[control], points.position[control], points.sigma[control])
     if found is None:
         return ""
     ids, unit = [points.id[p] for p in control], network.object_unit
@@ -81,14 +83,19 @@ class Contradiction:
 
 
 def contradiction(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
-) -> Contradiction | None:
-    """How two lists of points contradict each other after a similarity; None where they do not
-    (less than 1/`FITS` of their extent), or where no explanation is found."""
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n 3"] | None = None,
+) -> Contradiction | None:  # fmt: skip
+    """How two lists of points contradict each other after a similarity; None where they do not, or
+    where no explanation is found.
+
+    Start values fit to 1/`FITS` of the extent, and control to `EXPECTED` of the largest of its
+    `sigma` (NaN: exact); the tolerance is the root of the sum of both squares."""
     n = len(source)
     if n < 3:
         return None
-    tolerance = float(np.ptp(target, axis=0).max()) / FITS
+    largest = 0.0 if sigma is None else float(np.nan_to_num(sigma, posinf=0.0).max())
+    tolerance = float(np.hypot(np.ptp(target, axis=0).max() / FITS, EXPECTED * largest))
     off = _misfits(source, target, np.ones(n, bool))
     if off is None or off.max() < tolerance:
         return None

@@ -26,6 +26,9 @@ ENOUGH, WAITING = 12, 0.4
 images."""
 DRIFTS, LARGER = 30, 2.5
 """Number of images for the first improvement of a model, and its growth factor until the next."""
+FITS = 30.0
+"""Control fits a model of start values, whose cameras may have an unknown distortion, to this part
+of its extent."""
 PARALLEL, FAR_AWAY = 2e-3, 2e3
 """Maximum angle, radians, between the rays of a distant point and their mean; and its distance, in
 radii of the positions of the images."""
@@ -92,6 +95,18 @@ def are_controlled(points: Points) -> Bool[np.ndarray, " points"]:
     return points.has_role("fixed") | (
         points.has_role("control") & ~np.isposinf(points.sigma).any(1)
     )
+
+
+def are_held(points: Points) -> Bool[np.ndarray, " points"]:
+    """Controlled points whose coordinates serve as start values: σ below 1/`FITS` of the extent of
+    control. Less exact ones, such as those of handheld receivers, are intersected like tie points;
+    with them the model is moved to control, but no ray contradicts them."""
+    known = are_controlled(points)
+    if known.sum() < 3:  # they have no extent to compare with
+        return known
+    extent = np.ptp(points.position[known], axis=0).max()
+    sigma = np.where(points.has_role("fixed")[:, None], 0.0, np.nan_to_num(points.sigma))
+    return known & (sigma.max(1) * FITS <= extent)
 
 
 Improve = Callable[[Sights, Model], None]

@@ -39,6 +39,7 @@ from jaxbundle.orientation.growth import (
     FOR_OTHERS,
     Model,
     are_controlled,
+    are_held,
     finish,
     grow,
     misclosures,
@@ -153,7 +154,7 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
 def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
     wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
-    return are_controlled(network.points) & (2 * wrong > _rays_of(seen, model))
+    return are_held(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
 def _rays_of(seen: Sights, model: Model):
@@ -253,7 +254,7 @@ def _given_model(network: Network, seen: Sights) -> Model:
 
 
 def _with_control(network: Network, model: Model) -> Model:
-    held = are_controlled(network.points)
+    held = are_held(network.points)
     X = np.where(held[:, None], network.points.position, model.X)
     return dataclasses.replace(model, X=X, known=model.known | held, held=held)
 
@@ -261,6 +262,7 @@ def _with_control(network: Network, model: Model) -> Model:
 def _with_approximate_points(network: Network, model: Model) -> Model:
     points = network.points
     given = np.isfinite(points.position).all(1) & ~points.has_role("check")
+    given &= are_held(points) | ~are_controlled(points)
     X = np.where(given[:, None], points.position, model.X)
     return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
 

@@ -8,6 +8,7 @@ import datetime
 import math
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxbundle.photographs.reading import open_image
 from jaxbundle.photographs.sensors import sensor_width
@@ -19,11 +20,27 @@ PNG_PACKET = "XML:com.adobe.xmp"
 FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
 TAKEN_X, TAKEN_Y = 0xA002, 0xA003
+SHAPE = 0.02
+"""Difference of the ratio of the sides, from rounding and borders, without a crop."""
 FILM_DIAGONAL = math.hypot(36, 24)
 """mm: reference of focal lengths equivalent to 35 mm film."""
 MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Units of the resolution in the focal plane."""
 UPRIGHT = 1
+NOMINAL = 0.05
+"""Relative σ of a principal distance from a stated focal length: focal lengths are rounded, the
+sensor is a few per cent wider than the photograph, and focused at 20 focal lengths the principal
+distance is 5 % longer."""
+ROUNDING = 1 / math.sqrt(12)
+"""mm: σ of a focal length equivalent to 35 mm film, which is a whole number."""
+
+
+class StatedDistance(NamedTuple):
+    """A principal distance stated by a file, and its σ, pixels; its source in words."""
+
+    value: float
+    sigma: float
+    source: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +59,8 @@ class Place:
 @dataclasses.dataclass(frozen=True)
 class Exif:
     """Size in pixels; the camera; focal length in mm, and its equivalent for
-    35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time."""
+    35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time; whether
+    the photograph was `cropped` to another shape."""
 
     size: tuple[int, int]
     make: str = ""
@@ -54,6 +72,7 @@ class Exif:
     time: datetime.datetime | None = None
     place: Place | None = None
     attitude: Attitude | None = None
+    cropped: bool = False
 
     @property
     def camera(self) -> str:
@@ -62,18 +81,26 @@ class Exif:
         repeated = first and self.model.lower().startswith(first[0].lower())
         return (self.model if repeated else f"{self.make} {self.model}").strip()
 
-    def principal_distance(self) -> tuple[float, str] | None:
-        """The principal distance in pixels and its source; None if unknown."""
+    def principal_distance(self) -> StatedDistance | None:
+        """The principal distance in pixels of this file, whatever the size of the photograph as it
+        was taken; None if unknown."""
+        if self.cropped:
+            return None
         long = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
-            return self.focal_length / width * long, "focal length and sensor"
-        if self.focal_length_35:
-            return (self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size),
-                    "focal length equivalent to 35 mm film")  # fmt: skip
-        if self.focal_length and self.resolution:
-            return self.focal_length * self.resolution, "focal length and resolution"
-        return None
+            value, relative = self.focal_length / width * long, NOMINAL
+            source = "focal length and sensor"
+        elif self.focal_length_35:
+            value = self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size)
+            relative = math.hypot(NOMINAL, ROUNDING / self.focal_length_35)
+            source = "focal length equivalent to 35 mm film"
+        elif self.focal_length and self.resolution:
+            value, relative = self.focal_length * self.resolution, NOMINAL
+            source = "focal length and resolution"
+        else:
+            return None
+        return StatedDistance(value, relative * value, source)
 
 
 def read_exif(path: str | Path) -> Exif:
@@ -92,10 +119,10 @@ def read_exif(path: str | Path) -> Exif:
             return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
-    taken = max(_positive(details.get(TAKEN_X)) or 0, _positive(details.get(TAKEN_Y)) or 0)
-    if resolution and taken:
+    taken = sorted(_positive(details.get(side)) or 0 for side in (TAKEN_X, TAKEN_Y))
+    if resolution and taken[1]:
         # of the original photograph: programs that reduce it usually keep this
-        resolution *= max(size) / taken
+        resolution *= max(size) / taken[1]
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     return Exif(
         size=size,
@@ -108,6 +135,7 @@ def read_exif(path: str | Path) -> Exif:
         time=_time(details.get(DATE_TAKEN) or head.get(DATE), details.get(FRACTION)),
         place=_place(gps, xmp),
         attitude=xmp.attitude,
+        cropped=taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > SHAPE,
     )
 
 

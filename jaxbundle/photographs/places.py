@@ -23,12 +23,18 @@ SMALLEST_EXTENT = 8.0
 
 class MapPositions(NamedTuple):
     """Positions and their σ, metres, NaN: unknown; meridian convergence there, degrees;
-    the name of the system."""
+    the name of the system; whether they extend far enough to define the frame of a block."""
 
     X: Float[np.ndarray, "n 3"]
     sigma: Float[np.ndarray, "n 3"]
     convergence: Float[np.ndarray, " n"]
     system: str
+    define_frame: bool = True
+
+    @property
+    def words(self) -> str:
+        """The system and the reference of the heights."""
+        return f"{self.system}, heights as the files have them (EXIF: above sea level)"
 
 
 def utm_system(latitude: float, longitude: float) -> str:
@@ -37,23 +43,23 @@ def utm_system(latitude: float, longitude: float) -> str:
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
 
 
-def map_positions(
-    places: Sequence[Place | None],
-) -> MapPositions | None:
-    """Positions in the UTM zone; None if they are too few, or within their σ."""
+def map_positions(places: Sequence[Place | None], system: str = "") -> MapPositions | None:
+    """Positions in a projected system in metres, default the UTM zone; None if they are fewer than
+    three, or the system has another unit."""
     there = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
     if len(there) < 3:
         return None
     rows, known = [k for k, _ in there], [place for _, place in there]
     latitude = np.array([p.latitude for p in known])
     longitude = np.array([p.longitude for p in known])
-    system = utm_system(float(np.median(latitude)), float(np.median(longitude)))
+    system = system or utm_system(float(np.median(latitude)), float(np.median(longitude)))
+    axis = _need_pyproj().CRS.from_user_input(system).axis_info[0]
+    if axis.unit_conversion_factor != 1:
+        return None
     x, y = _transformer("EPSG:4326", system, "positions").transform(longitude, latitude)
     height = np.array([p.height for p in known], float)
     sigma = np.array([p.sigma or SIGMA for p in known])
     spread = np.hypot(np.ptp(x), np.ptp(y))
-    if not spread > SMALLEST_EXTENT * np.median(sigma):
-        return None
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)
     high = [p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known, sigma)]
@@ -61,8 +67,8 @@ def map_positions(
     turn = np.full(len(places), np.nan)
     factors = _need_pyproj().Proj(system).get_factors(longitude, latitude)
     turn[rows] = factors.meridian_convergence
-    words = f"{system}, heights as the files have them (EXIF: above sea level)"
-    return MapPositions(X, s, turn, words)
+    wide = bool(spread > SMALLEST_EXTENT * np.median(sigma))
+    return MapPositions(X, s, turn, system, wide)
 
 
 def to_map(
@@ -83,7 +89,8 @@ def to_map(
     except pyproj.exceptions.CRSError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
     if not known.is_geographic:
-        return X, known.to_string()
+        code = known.to_epsg()
+        return X, f"EPSG:{code}" if code else known.to_string()
     target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
     x, y = _transformer(known, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target

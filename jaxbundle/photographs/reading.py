@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxbundle.errors import InputError
+from jaxbundle.photographs.formats import OF_RAW, RAW, register_heic, remedy
 from jaxbundle.photographs.opencv import need_opencv, need_pillow
 from jaxbundle.system.file_content import check_plain, read_content
 
-SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
-"""Suffixes of photographs in a folder."""
 MOST_PIXELS = 2**30
 """Limit of OpenCV."""
 BRIGHT = 99.8
@@ -40,6 +39,7 @@ def read_photograph(
         raise InputError(f"{path}: no such file")
     if os.path.isdir(path):
         raise InputError(f"{path}: is a folder; give its photographs, such as {path}/*.jpg")
+    _refuse_raw(path)
     content = read_content(path, text=False)
     if not len(content):
         raise InputError(f"{path}: the file is empty")
@@ -73,6 +73,7 @@ def open_image(path: str | Path):
     **Raises:** `InputError` if it cannot be read, is not an image, or has more than 2³⁰ pixels.
     """
     check_plain(path)
+    _refuse_raw(path)
     try:
         image = _open_any_size(path)
     except FileNotFoundError:
@@ -80,6 +81,8 @@ def open_image(path: str | Path):
     except OSError as error:
         if os.path.isfile(path) and not os.path.getsize(path):
             raise InputError(f"{path}: the file is empty") from None
+        if todo := remedy(path):
+            raise InputError(f"{path}: {todo}") from None
         raise InputError(
             f"{path}: not an image that can be read (JPEG, PNG, TIFF are)"
             + (f": {error.strerror}" if error.strerror else "")
@@ -93,10 +96,17 @@ def open_image(path: str | Path):
     return image
 
 
+def _refuse_raw(path):
+    """Raw files of many cameras are TIFF: a small preview would be read for the photograph."""
+    if os.path.exists(path) and os.path.splitext(path)[1].lower() in RAW:
+        raise InputError(f"{path}: {OF_RAW}")
+
+
 def _open_any_size(path):
     """The file opened without Pillow's limit against decompression bombs: 179 million pixels, which
     a photograph may have."""
     Image = need_pillow()
+    register_heic()
     with LIMIT:
         given, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
@@ -126,6 +136,8 @@ def _by_pillow(path, colour):
     try:
         with open_image(path) as image:
             return np.asarray(image.convert("RGB" if colour else "L"))
+    except InputError:
+        raise
     except (OSError, SyntaxError, ValueError):
         raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, …)") from None
 

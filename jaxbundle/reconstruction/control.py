@@ -21,7 +21,8 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import read_control
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.network.tables import Points, Source
+from jaxbundle.network.rules import check_choice
+from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
 
 MANUAL = 1.0
@@ -38,6 +39,25 @@ class Control:
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, " n"]
     system: str = ""
+
+
+def with_sigma(control: Control, text: str) -> Control:
+    """Control with a σ where none is given: `SIGMA`, or `SIGMA,HEIGHT`, metres.
+
+    **Raises:** `InputError`."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(0 < v < math.inf for v in values):
+        raise InputError(
+            f"--control-sigma {text}: expected a positive number of metres, or two with a comma "
+            "(plane and height)"
+        )
+    sigma = np.array([values[0], values[0], values[-1]])
+    points, free = control.points, np.array(control.points.role, object) != "fixed"
+    given = np.where(np.isnan(control.points.sigma) & free[:, None], sigma, points.sigma)
+    return dataclasses.replace(control, points=dataclasses.replace(points, sigma=given))
 
 
 def read_control_measurements(path: str | Path) -> Control:
@@ -97,6 +117,7 @@ def _table(path, head, rows) -> Control:
                 ) from None
 
         id, role = cells["id"].strip(), (cells.get("role") or "control").strip()
+        check_choice("role", role, ROLES, f"{path}, line {number}: ")
         sigmas[id] = ([value(f"s{axis}") for axis in "xyz"], role)
         place = (value("u"), value("v"))
         records.append((id, tuple(value(axis) for axis in "xyz"), cells["image"].strip(), place,

@@ -3,7 +3,9 @@
 1. Most measurements agree with a right result.
 2. Two photographs from nearly one direction share most points in the field of both. Superimposed
    parts share at most those that repeat themselves (Zach, Irschara and Bischof 2008, What can
-   missing correspondences tell us about 3D structure and motion?).
+   missing correspondences tell us about 3D structure and motion?). A blurred photograph lacks most
+   points of its neighbours, but they have its own: a pair contradicts a result only if this is so
+   in neither direction.
 """
 
 import dataclasses
@@ -26,8 +28,8 @@ AGREEING_SHARE = 1 / 3
 ONE_DIRECTION, ONE_SCALE = np.radians(15.0), 1.5
 """Maximum angle between the rays to a point, and ratio of their lengths, with which it is expected
 in both photographs."""
-FEWEST = 50
-"""Minimum expected points of a pair."""
+FEWEST, OF_EACH = 50, 10
+"""Minimum expected points of a pair, and of those of each photograph in the other one."""
 SHARED = 0.1
 """Share of the expected points below which a pair is contradictory."""
 PAIRS, OF_ALL = 3, 0.15
@@ -63,13 +65,16 @@ def refuse_superimposed(
     row = {name: k for k, name in enumerate(names)}
     place = [row[id] for id in result.network.images.id]
     compared, bad = 0, []
-    for i, j in np.argwhere(np.triu(expected, 1) >= FEWEST).tolist():
+    number, common = expected + expected.T, shared + shared.T
+    clear = (number >= FEWEST) & (np.minimum(expected, expected.T) >= OF_EACH)
+    few = shared < SHARED * expected
+    for i, j in np.argwhere(np.triu(clear, 1)).tolist():
         if (min(place[i], place[j]), max(place[i], place[j])) in tried:
             compared += 1
-            if shared[i, j] < SHARED * expected[i, j]:
+            if few[i, j] and few[j, i]:
                 bad.append((i, j))
-    bad.sort(key=lambda pair: -expected[pair])
-    said = [f"{shared[i, j]} of {expected[i, j]} points expected in both {names[place[i]]} and "
+    bad.sort(key=lambda pair: -number[pair])
+    said = [f"{common[i, j]} of {number[i, j]} points expected in both {names[place[i]]} and "
             f"{names[place[j]]} were found" for i, j in bad]  # fmt: skip
     if len(bad) >= max(PAIRS, OF_ALL * compared):
         raise _folded(f"{said[0]}, and too few in {len(bad)} of {compared} such pairs", names)
@@ -80,7 +85,7 @@ def refuse_superimposed(
 def count_shared_points(
     result: Adjustment, measured: Network
 ) -> tuple[Int[np.ndarray, "images images"], Int[np.ndarray, "images images"]]:
-    """For every two photographs the points of each that should also be in the other one, and
+    """The points of every photograph (rows) that should also be in every other one (columns), and
     those of them that are measured there."""
     network, values = result.network, result.image_values
     X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
@@ -110,7 +115,7 @@ def count_shared_points(
                 d @ M[j].T, fields[network.images.camera[j]]
             )
             expected[i, j], shared[i, j] = one.sum(), there[agreeing[i][one]].sum()
-    return expected + expected.T, shared + shared.T
+    return expected, shared
 
 
 def _points_of_images(number: int, image, point) -> list[Int[np.ndarray, " points"]]:

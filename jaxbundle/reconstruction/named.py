@@ -105,12 +105,15 @@ def name_unused(
         )
     notes = [f"scale bars that are not in two photographs: {list_some(lost, 3, str)}"] * bool(lost)
     if control is not None:
-        lost = [id for id in control.points.id if id not in photographs]
-        if len(control.points) - len(lost) < fewest:
+        points = control.points
+        lost = [id for id in points.id if id not in photographs]
+        found = sum(id in photographs and role != "check"
+                    for id, role in zip(points.id, points.role))  # fmt: skip
+        if found < fewest:
             raise InputError(
-                f"{control.points.source.name}: {len(control.points) - len(lost)} control points "
-                f"are measured in the photographs, {fewest} are needed; not found: "
-                f"{list_some(lost, 5, str)}"
+                f"{points.source.name}: {found} control points are measured in the photographs, "
+                f"{fewest} are needed"
+                + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
             )
         notes += [f"control points in no photograph: {list_some(lost, 5, str)}"] * bool(lost)
     return notes

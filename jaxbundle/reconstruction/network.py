@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbundle.io.networks.control import with_control
 from jaxbundle.network.build import make_further, make_network
-from jaxbundle.network.tables import Camera, Network, Points
+from jaxbundle.network.further import CameraParameters
+from jaxbundle.network.tables import Network
+from jaxbundle.photographs.exif import StatedDistance
 from jaxbundle.reconstruction.attitudes import Attitudes
 from jaxbundle.reconstruction.named import Named
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
@@ -17,23 +18,23 @@ PRIORS = {
     "fx": 0.2, "cx": 0.01, "cy": 0.01, "k1": 0.3, "k2": 0.1, "k3": 0.05, "p1": 1e-3, "p2": 1e-3,
 }  # fmt: skip
 """σ of the parameters of an unknown camera before the adjustment, all of them free: of fx relative
-to itself, of cx and cy to the longer side. What few photographs do not determine is then part of
-the σ of the result; parameters held at usual values would bias the others by many σ."""
-FEWEST_PHOTOGRAPHS = 8
-"""Minimum photographs of a camera for pixels that need not be square."""
-FEWEST_CONTROL = 3
-"""Minimum control points in a part to transform it into their frame."""
+to itself (unless the files state it), of cx and cy to the longer side. What few photographs do not
+determine is then part of the σ of the result; parameters held at usual values would bias the others
+by many σ."""
+FREE = ("fx", "fy", *(name for name in PRIORS if name != "fx"))
+ASPECT = "fy/fx"
 OF_THE_LENS = ("fx", "k1", "k2", "k3")
-"""Common parameters of cameras with one lens."""
+"""Common parameters of cameras with one lens: of photographs in portrait and landscape format. The
+first only if pixels are square."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Extra:
     """Further data of a network: named points including control, distances between
-    them; positions of the photographs with their σ, and attitudes."""
+    them; positions of the photographs with their σ, and attitudes. (Coordinates of control:
+    `georeferencing`.)"""
 
     named: Named
-    control: Points | None = None
     distances: tuple[dict, ...] = ()
     positions: tuple[np.ndarray, np.ndarray] | None = None
     attitudes: Attitudes | None = None
@@ -45,13 +46,16 @@ def tie_network(
     measured: Measurements,
     extra: Extra,
     name: str,
+    aspect_sigma: float,
 ) -> Network:
-    """The network of the photographs with measurements; image coordinates in pixels."""
+    """The network of the photographs with measurements; image coordinates in pixels.
+
+    **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed."""
     rows = np.unique(measured.image).tolist()
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
-    lenses = [cameras.lens[c] for c in of]
-    free = [_free(cameras.cameras[c], of.count(c), lenses.count(cameras.lens[c]), cameras.given)
+    free = [cameras.cameras[c] if cameras.given else
+            dataclasses.replace(cameras.cameras[c], free=FREE)
             for c in used]  # fmt: skip
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     named = extra.named.take(np.isin(extra.named.image, rows))
@@ -76,11 +80,12 @@ def tie_network(
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )  # fmt: skip
-    network = _with_ties(network, [cameras.lens[c] for c in used])
-    control = extra.control
-    if control is None or len(there & set(control.id)) < FEWEST_CONTROL:
-        return network
-    return with_control(network, control).replace(object_unit="m")
+    if not cameras.given:
+        stated = [cameras.stated[c] for c in used]
+        lens = [cameras.lens[c] for c in used]
+        of_lens = OF_THE_LENS if np.isfinite(aspect_sigma) else OF_THE_LENS[1:]
+        network = _with_ties(_observe(network, stated, lens, of_lens, aspect_sigma), lens, of_lens)
+    return network
 
 
 def track_name(track: int) -> str:
@@ -88,29 +93,54 @@ def track_name(track: int) -> str:
     return f"t{track}"
 
 
-def _with_ties(network: Network, lens: Sequence[int]) -> Network:
+def _observe(
+    network: Network,
+    stated: Sequence[StatedDistance | None],
+    lens: Sequence[int],
+    of_lens: Sequence[str],
+    aspect_sigma: float,
+) -> Network:
+    """The network with what is known of its unknown cameras as observations; what is common to the
+    cameras of one lens is observed once."""
+    rows = []
+    for k, (camera, file) in enumerate(zip(network.cameras, stated)):
+        side = max(camera.image_size or (1, 1))
+        for name, relative in PRIORS.items():
+            if name in of_lens and lens[k] in lens[:k]:
+                continue
+            if name == "fx" and file is not None:
+                rows.append((camera.id, name, file.value, file.sigma))
+                continue
+            value = camera.parameters.get(name, 0.0) if name in ("fx", "cx", "cy") else 0.0
+            unit = {"fx": value, "cx": side, "cy": side}.get(name, 1.0)
+            rows.append((camera.id, name, value, relative * unit))
+        if np.isfinite(aspect_sigma):
+            rows.append((camera.id, ASPECT, 1.0, aspect_sigma))
+    columns = dict(zip(("camera", "parameter", "value", "sigma"), map(list, zip(*rows))))
+    return network.replace(
+        further=(*network.further, *make_further({CameraParameters.TABLE: columns}, 1.0))
+    )
+
+
+def observed_parameters(network: Network) -> CameraParameters | None:
+    """The observed parameters of the cameras."""
+    return next((one for one in network.further if isinstance(one, CameraParameters)), None)
+
+
+def with_observed(network: Network, observed: CameraParameters) -> Network:
+    """The network with other observed parameters of its cameras."""
+    others = [one for one in network.further if not isinstance(one, CameraParameters)]
+    return network.replace(further=(*others, observed))
+
+
+def _with_ties(network: Network, lens: Sequence[int], of_lens: Sequence[str]) -> Network:
     """The network with common parameters of cameras with one lens."""
     first, columns = {}, {"camera": [], "other": [], "parameter": []}
     for camera, number in zip(network.cameras, lens):
         one = first.setdefault(number, camera)
-        for name in OF_THE_LENS if one is not camera else ():
-            if name in one.free and name in camera.free:
-                for column, value in zip(columns.values(), (one.id, camera.id, name)):
-                    column.append(value)
+        for name in of_lens if one is not camera else ():
+            for column, value in zip(columns.values(), (one.id, camera.id, name)):
+                column.append(value)
     if not columns["camera"]:
         return network
     return network.replace(further=(*network.further, *make_further({"ties": columns}, 1.0)))
-
-
-def _free(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
-    """A camera with free parameters, observed with their `PRIORS`; a calibrated one is held."""
-    if given:
-        return camera
-    free = tuple(PRIORS)
-    units = dict.fromkeys(free, 1.0) | dict.fromkeys(("cx", "cy"), max(camera.image_size or (1, 1)))
-    units["fx"] = camera.parameters["fx"]
-    sigma = {name: relative * units[name] for name, relative in PRIORS.items()}
-    if own >= FEWEST_PHOTOGRAPHS and own == of_lens:
-        camera, free = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:])
-        sigma["fy"] = sigma["fx"]
-    return dataclasses.replace(camera, free=free, sigma=sigma)

@@ -5,7 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.network.columns import count
-from jaxbundle.report.layout import clean, significant
+from jaxbundle.reconstruction.adjusting import LARGEST_MISFIT, WRONG_MISFIT
+from jaxbundle.reconstruction.control_table import HEADER
+from jaxbundle.report.head import count_points
+from jaxbundle.report.layout import clean, heading, significant, table
+from jaxbundle.report.layout import facts as text_facts
+from jaxbundle.report.layout import paragraph as text_paragraph
 from jaxbundle.report.page import (
     UNKNOWN,
     Addition,
@@ -17,7 +22,12 @@ from jaxbundle.report.page import (
 )
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
-from jaxbundle.report.page.verdict import DOUBTFUL, GOOD
+from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+
+WITHOUT = ("χ² test",)
+"""Findings of an adjustment that do not apply: σ are estimated from the residuals."""
+CONTROL = ("Control", "Check points")
+"""Findings of an adjustment in place of which those of the control table stand."""
 
 
 def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
@@ -25,18 +35,48 @@ def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
     return compose(part.adjustment, origin, also=_describe(found, part))
 
 
+def describe_part(found, part) -> str:
+    """What a surveyor asks of a part, as text: the block, control and check points."""
+    lines = heading(f"{found.name}, {part.name}" if found.name else part.name)[1:]
+    lines += text_facts(part.block.facts())
+    if part.no_control:
+        lines += ["", *text_paragraph(f"Control is not used: {part.no_control}")]
+    if part.control is not None:
+        unit = part.control.unit
+        lines += heading(f"Control and check points: adjusted − given, in {unit}")
+        # the reasons of verdicts are in the notes
+        rows = [(*row[:-1], row[-1].partition(":")[0]) for row in part.control.rows()]
+        lines += table(HEADER, rows, "lrrrrrrrrl")
+        lines += ["", *text_paragraph(f"{part.control.sigma}.")]
+        lines += [line for note in part.control.notes for line in text_paragraph(f"- {note}", 0, 2)]
+    return "\n".join([*lines, "", ""])
+
+
 def _describe(found, part) -> Addition:
-    sections = [_factors(part)] if part.factors else []
+    sections = [*_control(part), *_positions(part)]
+    sections += [_factors(part)] if part.factors else []
     if found.left_out:
         rows = grid(("photograph", "reason"), found.left_out.items(), "words")
         sections.append(Section("left-out", "Photographs left out", rows, "Left out"))
-    overview = f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
+    overview = f"<h3>Block {clean(found.name)}</h3>\n{facts(part.block.facts())}"
+    overview += f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
     if found.notes:
         overview += items(found.notes)
+    findings = (*([_fit(part)] if part.factors else []), _photographs(found, part))
     return Addition(
-        "reconstruction", (_photographs(found, part),), overview=overview,
-        sections=tuple(sections), tables={"pairs": _pairs(found)},
+        "reconstruction", (*findings, *_judge_control(part)), overview=overview,
+        warnings=found.warnings, sections=tuple(sections), tables={"pairs": _pairs(found)},
+        without=(*WITHOUT, *CONTROL) if part.control is not None or part.no_control else WITHOUT,
     )  # fmt: skip
+
+
+def _fit(part) -> Finding:
+    """The fit of the measurements, relative to their σ from matching."""
+    words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
+    worst = part.misfit
+    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
+    return Finding("Fit", state, f"residuals relative to their σ from matching: {words}; these "
+                   "factors are in all σ of the result")  # fmt: skip
 
 
 def _photographs(found, part) -> Finding:
@@ -50,6 +90,56 @@ def _photographs(found, part) -> Finding:
     return Finding("Photographs", GOOD if whole else DOUBTFUL, words)
 
 
+def _judge_control(part) -> list[Finding]:
+    """Control and check points in one line each."""
+    if part.no_control:
+        return [Finding("Control", BAD, f"not used: {part.no_control}")]
+    if part.control is None:
+        return []
+    given = [p for p in part.control.points if p.role != "check"]
+    checks = [p for p in part.control.points if p.role == "check"]
+    rms = lambda role: " ".join(f"{axis} {significant(x)}" for axis, x in
+                                zip("XYZ", part.control.rms(role)) if np.isfinite(x))  # fmt: skip
+    used, left = [p for p in given if p.used], part.control.left_out
+    words = (f"{len(used)} of {count(len(given), 'control point')} used, RMS {rms('control')} "
+             f"{part.control.unit}; {part.control.sigma}")  # fmt: skip
+    if left:
+        words += f"; left out: {', '.join(left)}"
+    wrong = sum("wrong measurement" in p.verdict for p in part.control.points)
+    if wrong:
+        words += f"; {count(wrong, 'point')} with a wrong measurement"
+    held = any(p.verdict.startswith("held exactly") for p in used)
+    found = [Finding("Control", DOUBTFUL if left or wrong or held else GOOD, words)]
+    if checks:
+        known = [p for p in checks if np.isfinite(p.residual).any()]
+        words = (f"{len(known)} of {count(len(checks), 'check point')} compared, RMS "
+                 f"{rms('check')} {part.control.unit}")  # fmt: skip
+        state = GOOD if len(known) == len(checks) else DOUBTFUL
+        found.append(Finding("Check points", state, words))
+    return found
+
+
+def _control(part) -> list[Section]:
+    """Control and check points."""
+    if part.control is None:
+        return []
+    points = grid(HEADER, part.control.rows())
+    said = items([part.control.sigma, *part.control.notes])
+    title = f"Control and check points: adjusted − given, in {clean(part.control.unit)}"
+    return [Section("control", title, points + said, "Control")]
+
+
+def _positions(part) -> list[Section]:
+    """Camera positions against the given ones."""
+    found = part.block.positions
+    if found is None:
+        return []
+    rows = [(id, *(significant(x) for x in d)) for id, d in found.difference.items()]
+    rows.append(("RMS", *(significant(x) for x in found.rms)))
+    title = f"Camera positions: adjusted − given, in {clean(part.block.unit)}"
+    return [Section("positions", title, grid(("photograph", "dX", "dY", "dZ"), rows), "Positions")]
+
+
 def _counts(found, part) -> list[tuple[str, str]]:
     """The parts, this one marked, and the pairs."""
     rows = []
@@ -57,7 +147,8 @@ def _counts(found, part) -> list[tuple[str, str]]:
         network = one.adjustment.network
         rows.append((
             clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
-            f"{count(len(network.images), 'photograph')}, {count(len(network.points), 'point')}, "
+            f"{count(len(network.images), 'photograph')}, "
+            f"{count(count_points(one.adjustment), 'point')}, "
             f"σ0 {significant(one.adjustment.sigma0, 4)}",
         ))  # fmt: skip
     return [*rows, ("Verified pairs", str(len(found.pairs)))]

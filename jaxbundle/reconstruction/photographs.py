@@ -8,8 +8,10 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera
-from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
-from jaxbundle.photographs.reading import SUFFIXES, photograph_size
+from jaxbundle.photographs.exif import UPRIGHT, Exif, StatedDistance, read_exif
+from jaxbundle.photographs.folders import describe_other_files, list_photographs
+from jaxbundle.photographs.formats import SUFFIXES
+from jaxbundle.photographs.reading import photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
 DEFAULT_RATIO = 1.2
@@ -68,13 +70,21 @@ def find_photographs(
     return found, left_out
 
 
+def name_other_files(given: Sequence[str | Path]) -> list[str]:
+    """Notes about files in the given folders that are no photographs."""
+    said = [describe_other_files(one) for one in map(Path, given) if one.is_dir()]
+    return [words for words in said if words]
+
+
 def _files(given) -> list[Path]:
     paths: list[Path] = []
     for one in map(Path, given):
         if one.is_dir():
-            inside = sorted(p for p in one.iterdir() if p.suffix.lower() in SUFFIXES)
+            inside = list_photographs(one)
             if not inside:
-                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})")
+                other = describe_other_files(one).removeprefix(f"{one}: ")
+                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})"
+                                 + (f"; {other}" if other else ""))  # fmt: skip
             paths += inside
         elif not one.exists():
             raise InputError(f"{one}: no such file")
@@ -93,14 +103,14 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """`cameras`, the camera of every photograph (`of`), whether its principal distance is `known`
-    as a start value, and whether it was `given` as calibrated; `notes`; `lens` of every camera:
+    """`cameras`, the camera of every photograph (`of`), the principal distance `stated` by its
+    files, and whether it was `given` as calibrated; `notes`; `lens` of every camera:
     photographs in portrait and landscape format share a lens, with the same principal
     distance and radial distortion."""
 
     cameras: tuple[Camera, ...]
     of: tuple[int, ...]
-    known: tuple[bool, ...]
+    stated: tuple[StatedDistance | None, ...]
     given: bool
     notes: tuple[str, ...]
     lens: tuple[int, ...] = (0,)
@@ -115,37 +125,38 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     """
     notes = _rotation_messages(photographs)
     if given is not None:
-        return Cameras((_fits(given, photographs),), (0,) * len(photographs), (True,), True, notes)
+        return Cameras((_fits(given, photographs),), (0,) * len(photographs), (None,), True, notes)
     groups: dict[tuple, list[int]] = {}
     for k, photograph in enumerate(photographs):
         exif = photograph.exif
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
         groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
-    cameras, known, of = [], [], [0] * len(photographs)
+    cameras, stated, of = [], [], [0] * len(photographs)
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
-        f = told[0] if told else DEFAULT_RATIO * max(exif.size)
+        f = told.value if told else DEFAULT_RATIO * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
         cameras.append(_new_camera(id, f, exif.size))
-        known.append(told is not None)
+        stated.append(told)
         for k in rows:
             of[k] = number
-        where = f"from {told[1]}" if told else "unknown: found from the photographs"
+        where = (f"{told.value:.0f} ± {told.sigma:.0f} px from {told.source}" if told
+                 else "unknown: found from the photographs")  # fmt: skip
         same = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
             lens[number] in lens[:number]
         )
         notes = (*notes, f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
                  f"{exif.size[1]} pixels, principal distance {where}{same}")  # fmt: skip
-    return Cameras(tuple(cameras), tuple(of), tuple(known), False, notes, tuple(lens))
+    return Cameras(tuple(cameras), tuple(of), tuple(stated), False, notes, tuple(lens))
 
 
 def _new_camera(id, f, size):
     columns, rows = size
     parameters = {"fx": f, "fy": f, "cx": (columns - 1) / 2, "cy": (rows - 1) / 2}
-    return Camera(id, "opencv", parameters, image_size=(columns, rows), tie=(("fx", "fy"),))
+    return Camera(id, "opencv", parameters, image_size=(columns, rows))
 
 
 def _fits(given: Camera, photographs) -> Camera:

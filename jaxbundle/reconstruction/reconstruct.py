@@ -19,26 +19,38 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
-from jaxbundle.photographs.places import map_positions
+from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.photographs.reading import read_photograph
-from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
+from jaxbundle.reconstruction import aspect_ratio
+from jaxbundle.reconstruction.adjusting import (
+    LARGEST_MISFIT,
+    WRONG_MISFIT,
+    Weighted,
+    adjust_weighted,
+)
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
+from jaxbundle.reconstruction.block import Block, describe_block
 from jaxbundle.reconstruction.control import Control
+from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
+from jaxbundle.reconstruction.georeferencing import ENOUGH_CONTROL, Given, georeference
 from jaxbundle.reconstruction.named import find_named, name_unused
-from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
+from jaxbundle.reconstruction.network import Extra, tie_network, track_name
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
     Photograph,
     assign_cameras,
     find_photographs,
+    name_other_files,
 )
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
+from jaxbundle.report.head import count_points
 from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.calibration import start_cameras
+from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
@@ -59,9 +71,12 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
-LARGEST_MISFIT = 4.0
-"""Factor of σ above which a result is called doubtful; right results of rendered facades have up to
-2.5."""
+FARTHEST_CONTROL = 10_000.0
+"""Metres between control in a system without a name and satellite positions in their UTM zone; a
+block from the air is smaller, another system is farther."""
+CONTRADICTS_FILE = 3.29
+"""Difference from the principal distance of the files, in σ, that chance explains in one of a
+thousand."""
 TEXTURE = 16
 """Minimum features of a photograph."""
 
@@ -69,36 +84,53 @@ TEXTURE = 16
 @dataclasses.dataclass(frozen=True)
 class Part:
     """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
-    kinds of measurements."""
+    kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
+    could not be used, with the reason in `no_control`."""
 
     name: str
     adjustment: Adjustment
     colours: Mapping[str, tuple[int, int, int]]
     factors: Mapping[str, float]
+    block: Block
+    control: ControlTable | None = None
+    no_control: str = ""
+
+    @property
+    def misfit(self) -> float:
+        """How many times worse than their σ from matching measurements of the worst kind fit."""
+        return max(self.factors.values(), default=1.0)
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
-    """`parts`, the largest first; photographs in none of them, with the reason; notes;
-    verified `pairs`, by the names of their photographs: matches, agreeing matches,
-    kind; `photographs`: the examined files, by name."""
+    """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
+    why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
+    matches, agreeing matches, kind; `photographs`: the examined files, by name;
+    `name` of the whole."""
 
     parts: tuple[Part, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
     photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    name: str = ""
 
     def __str__(self) -> str:
-        lines = [
+        lines = [f"warning: {said}" for said in self.warnings]
+        lines += [
             f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
-            f"{count(len(part.adjustment.network.points), 'point')}, "
+            f"{count(count_points(part.adjustment), 'point')}, "
             f"σ0 {part.adjustment.sigma0:.3f}{_distances_found(part.adjustment)}"
             for part in self.parts
         ]  # fmt: skip
         lines += [f"warning: {part.name}: {said}" for part in self.parts
                   for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
+        for part in self.parts:
+            if part.control is not None:
+                lines.append(part.control.sigma)
+                lines += [f"control: {said}" for said in part.control.notes]
         lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
         return "\n".join([*lines, *self.notes])
 
@@ -111,13 +143,15 @@ def reconstruct(
     tell: Tell = lambda stage, done, total: None,
     control: Control | None = None,
     distances: Sequence[dict] = (),
+    name: str = "",
 ) -> Reconstruction:
     """Orient photographs by their content, with self-calibration.
 
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
     all; `store`: folder for features and matches; `tell(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
-    `distances`: rows `from`, `to`, `value`, `sigma` between named points.
+    `distances`: rows `from`, `to`, `value`, `sigma` between named points; `name` of the result,
+    default: of the first folder.
 
     **Raises:** `InputError` if the photographs cannot be used; `NotSolvedError` if no two of
     them can be oriented.
@@ -127,21 +161,68 @@ def reconstruct(
     cameras = assign_cameras(photographs, camera)
     with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
         named, notes = find_named(photographs, settings.targets, control, pool.map)
-    notes += name_unused(named, control, distances, FEWEST_CONTROL)
-    positions = map_positions([p.exif.place for p in photographs]) if control is None else None
-    if positions is not None:
-        notes.append(f"satellite positions of the photographs: {positions.system}")
-    if control is not None and control.system:
-        notes.append(f"control in {control.system}")
+    notes += name_other_files(given)
+    positions, said = find_positions(photographs, control)
+    notes += said
+    framed = positions is not None and positions.define_frame
+    notes += name_unused(named, control, distances, 1 if framed else ENOUGH_CONTROL)
     attitudes = None
-    if positions is not None:
+    if positions is not None and framed:
         attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
-    extra = Extra(named, control and control.points, tuple(distances),
-                  positions and positions[:2], attitudes)  # fmt: skip
+    names = tuple(p.name for p in photographs)
+    frame = None
+    if control is not None:
+        points = control.points.take(~control.points.has_role("tie"))
+        frame = Given(points, named, names, control.system, positions and positions[:2])
+        checks = {id for id, role in zip(points.id, points.role) if role == "check"}
+        named = named.take(np.array([one not in checks for one in named.name], bool))
+    extra = Extra(named, tuple(distances), positions[:2] if positions and framed else None,
+                  attitudes)  # fmt: skip
+    system = "" if control is None else control.system
+    if positions is not None and (framed or control is not None):
+        system = positions.words if control is None else system or positions.system
+    first = Path(given[0])
+    name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)
     making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
     making.notes += notes
+    making.frame, making.system, making.title = frame, system, name
     return making.run()
+
+
+def find_positions(
+    photographs: Sequence[Photograph], control: Control | None
+) -> tuple[MapPositions | None, list[str]]:
+    """The satellite positions of the photographs in the system of control, else in their UTM zone,
+    and what is done with them."""
+    places = [p.exif.place for p in photographs]
+    there = sum(place is not None for place in places)
+    if control is None:
+        found = map_positions(places)
+        if found is None:
+            return None, [f"satellite positions of {there} photographs are not used: expected "
+                          "three or more with heights"] * bool(there)  # fmt: skip
+        if not found.define_frame:
+            return found, ["satellite positions of the photographs extend over less than 8 σ: they "
+                           "do not define the frame"]  # fmt: skip
+        return found, [f"satellite positions of the photographs: {found.words}"]
+    notes = [f"control in {control.system or 'a system that its file does not name'}"]
+    if not there:
+        return None, [*notes, "no satellite positions in the photographs: control alone gives the "
+                      "frame"]  # fmt: skip
+    found = map_positions(places, control.system)
+    if found is None:
+        return None, [*notes, f"satellite positions of {there} photographs are not used: they need "
+                      "heights, three photographs, and a system of control in metres"]  # fmt: skip
+    if not control.system:
+        away = np.nanmedian(found.X, 0) - np.median(control.points.position, axis=0)
+        distance = float(np.hypot(*away[:2]))
+        if distance > FARTHEST_CONTROL:
+            return None, [*notes, "satellite positions of the photographs are not used: they are "
+                          f"{distance / 1000:.0f} km from control in {found.system}; name the "
+                          "system of control in the first line of gcp_list.txt"]  # fmt: skip
+    return found, [*notes, f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
+                   f"photographs with their σ, in {found.words}"]  # fmt: skip
 
 
 class _Making:
@@ -155,7 +236,10 @@ class _Making:
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
+        self.warnings: list[tuple[float, str]] = []
         self.tried: set[tuple[int, int]] = set()
+        self.frame: Given | None = None
+        self.system = self.title = ""
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
@@ -173,7 +257,9 @@ class _Making:
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         files = {p.name: p.path for p in self.photographs}
-        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files)
+        warnings = [said for _, said in sorted(self.warnings, key=lambda one: -one[0])]
+        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files,
+                              tuple(warnings), self.title)  # fmt: skip
 
     def _matches(self):
         features = self._features()
@@ -182,8 +268,17 @@ class _Making:
         matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
                         self.tell)  # fmt: skip
         self.store.drop_unused()
+        sizes = [p.size for p in self.photographs]
+        again = find_duplicates(matches, features, sizes)
+        for k, (other, still, number) in again.items():
+            self.left_out.setdefault(
+                self.names[k], f"it shows the same as {self.names[other]} ({still} of {number} "
+                "matches are at the same place): saved again, or taken from the same place"
+            )
+        self._require_two()
+        matches = [m for m in matches if not {*m.images} & again.keys()]
         self.tried = {m.images for m in matches}
-        matches, marked = without_marks(matches, features, [p.size for p in self.photographs])
+        matches, marked = without_marks(matches, features, sizes)
         if marked:
             self.notes.append(
                 f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
@@ -201,10 +296,14 @@ class _Making:
             self.left_out.setdefault(
                 self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
             )
-        if len(features) - len(bad) < 2:
+        self._require_two()
+        return features
+
+    def _require_two(self) -> None:
+        """Refuse to go on with a single photograph."""
+        if sum(name not in self.left_out for name in self.names) < 2:
             said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
             raise InputError(f"fewer than two photographs can be used: {said}")
-        return features
 
     def _reader(self, photograph: Photograph):
         def read():
@@ -221,8 +320,8 @@ class _Making:
         if self.cameras.given:
             return
         cameras, notes = start_cameras(
-            self.cameras.cameras, self.cameras.of, self.cameras.lens, self.cameras.known, features,
-            matches,
+            self.cameras.cameras, self.cameras.of, self.cameras.lens,
+            [one is not None for one in self.cameras.stated], features, matches,
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
@@ -235,7 +334,7 @@ class _Making:
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
                               f"by others in triplets: {list_some(named, 3, str)}")  # fmt: skip
         if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
-            self.notes.append(
+            self._warn(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
                 "repeats itself, and parts of it may have been superimposed; compare the "
                 "result with the object, or take photographs with shorter bases"
@@ -278,6 +377,10 @@ class _Making:
             raise NotSolvedError(self._why_nothing(pairs, failed), self.names)
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
+    def _warn(self, said: str, weight: float = 1.0) -> None:
+        """Keep a warning; those of larger weight are shown first."""
+        self.warnings.append((weight, said))
+
     def _begin(self, stage: str) -> None:
         """Begin a stage of unknown length, after the end of the one before."""
         if self.stage:
@@ -297,7 +400,8 @@ class _Making:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         some = "no three photographs overlap one another" if pairs else "no photographs overlap"
-        return f"not solved: {some}: {said}"
+        return (f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
+                "to the next, on which the object or its surroundings have texture")  # fmt: skip
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
@@ -310,24 +414,61 @@ class _Making:
             tracks, features, lambda k: read_photograph(self.photographs[k].path, colour=True),
             lambda: self.tell("least squares matching", next(done), len(features)),
         )  # fmt: skip
-        network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
+        network = tie_network(self.photographs, self.cameras, measured, self.extra, name,
+                              self.settings.aspect_sigma)  # fmt: skip
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
+        weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
         refuse_folded(weighted, measured, self.names)
         doubts = refuse_superimposed(weighted.adjustment, network, self.tried, self.names)
         self.notes += [note] if note else []
-        self.notes += _name_unused(name, weighted) + _doubt_misfit(name, weighted)
-        self.notes += [f"{name}: {said}" for said in doubts]
-        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
+        self.notes += _name_unused(name, weighted)
+        control, no_control = None, ""
+        if self.frame is not None:
+            try:
+                weighted, control = georeference(
+                    weighted, self.frame, self.settings.significance, self._begin
+                )
+            except (InputError, NotSolvedError) as error:
+                no_control = str(error)
+                self._warn(f"{name}: control is not used: {error}", np.inf)
+            self._begin("")
+        exif = {photograph.name: photograph.exif for photograph in self.photographs}
+        # without control and positions the frame is an arbitrary one
+        absolute = control is not None or self.extra.positions is not None
+        block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
+        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors, block, control,
+                    no_control)  # fmt: skip
+        if part.misfit >= LARGEST_MISFIT:
+            self._warn(f"{name}: {_misfit_in_words(part)}", part.misfit)
+        for said in (*self._contradict_files(weighted.adjustment), *doubts):
+            self._warn(f"{name}: {said}")
         return part, dict(oriented.images)
+
+    def _contradict_files(self, result: Adjustment) -> list[str]:
+        """Principal distances that contradict those of the files, in words."""
+        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated)}
+        said = []
+        for id, found in _principal_distances(result).items():
+            file = stated.get(id)
+            if file is None or not found["sigma"]:
+                continue
+            sigma = np.hypot(file.sigma, found["sigma"])
+            if abs(found["value"] - file.value) > CONTRADICTS_FILE * sigma:
+                said.append(
+                    f"camera {id}: principal distance {found['value']:.0f} px contradicts the "
+                    f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
+                    "photographs were cropped or zoomed, or the result is wrong"
+                )
+        return said
 
     def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
-        guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
-                   if not known]  # fmt: skip
+        guessed = [camera.id for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
+                   if stated is None and not self.cameras.given]  # fmt: skip
         failed: NotSolvedError | None = None
         for oriented in start_values(network, guessed, pairs):
             try:
@@ -351,6 +492,35 @@ class _Making:
         assert failed is not None, "start values are there, or an error says why not"
         raise failed
 
+    def _check_ratios(
+        self, oriented: Oriented, weighted: Weighted, measured, note: str
+    ) -> tuple[Weighted, str]:
+        """The adjustment with square pixels, unless halves of the photographs agree that they are
+        not."""
+        contradicted = aspect_ratio.contradicted_ratios(weighted.adjustment)
+        if not contradicted:
+            return weighted, note
+        self._begin("ratio of the focal lengths")
+        halves = aspect_ratio.replicated_ratios(weighted.adjustment)
+        released = {}
+        for id, found in contradicted.items():
+            both = halves.get(id)
+            said = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(found)}, "
+            if both is None:
+                said += "halves of them none: "
+            else:
+                said += f"halves of them {' and '.join(map(_ratio_in_words, both))}: "
+            if both is not None and aspect_ratio.is_replicated(*both):
+                released[id] = found
+                self.notes.append(f"{said}the pixels are not square")
+            else:
+                self.notes.append(f"{said}not confirmed, the pixels are taken as square (fy/fx "
+                                  f"1 ± {self.settings.aspect_sigma:g})")  # fmt: skip
+        if not released:
+            return weighted, note
+        network = aspect_ratio.release(oriented.network, released)
+        return self._adjust(dataclasses.replace(oriented, network=network), measured)
+
     def _adjust(self, oriented: Oriented, measured) -> tuple[Weighted, str]:
         placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
         kinds, named = _kinds(placed, measured, self.names)
@@ -369,6 +539,10 @@ def _distances_found(result: Adjustment) -> str:
     return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
                    for id, c in _principal_distances(result).items()
                    if c["free"] and c["sigma"])  # fmt: skip
+
+
+def _ratio_in_words(ratio: aspect_ratio.Ratio) -> str:
+    return f"{1 + ratio.deviation:.5f} ± {ratio.sigma:.5f}"
 
 
 def _not_solved(result: Adjustment) -> NotSolvedError:
@@ -391,13 +565,14 @@ def _name_unused(name: str, weighted: Weighted) -> list[str]:
             "measurements contradict each other, as on an object that repeats itself"]  # fmt: skip
 
 
-def _doubt_misfit(name: str, weighted: Weighted) -> list[str]:
-    """A note on measurements that contradict each other by far more than their σ."""
-    if weighted.worst < LARGEST_MISFIT:
-        return []
-    return [f"{name}: measurements fit {weighted.worst:.1f} times worse than their σ from "
-            "matching: the object repeats itself or moves, or the camera model does not fit the "
-            "lens; compare the result with the object"]  # fmt: skip
+def _misfit_in_words(part: Part) -> str:
+    """Measurements that contradict each other by far more than their σ."""
+    wrong = part.misfit >= WRONG_MISFIT
+    return (
+        f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "
+        "worse than their σ from matching: the object repeats itself or moves, or the camera model "
+        "does not fit the lens; compare the result with the object"
+    )
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

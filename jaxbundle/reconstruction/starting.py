@@ -22,6 +22,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.sights import TOLERANCE
 from jaxbundle.reconstruction.misplaced import NamedPairs, find_misplaced
+from jaxbundle.reconstruction.network import observed_parameters, with_observed
 from jaxbundle.tiepoints.search import present_size
 
 START_TOLERANCE = 0.01
@@ -35,7 +36,7 @@ NEAR = 1.05
 """Ratio of principal distances below which verified pairs are still right."""
 FEWEST_RAYS = 12
 """Minimum image points of a photograph; of fewer most may be gross errors."""
-LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
+LEAST_OF_IMAGES, OF_OTHERS = 0.5, 1
 """Minimum share of photographs oriented by start values with another principal distance; and
 maximum number of such start values that are adjusted."""
 
@@ -110,16 +111,25 @@ def _with_other_distances(network: Network, guessed: Sequence[str]) -> Iterator[
         distances = {id: factor * max(present_size(c)) for id, c in of.items()}
         ratios = [of[id].parameters["fx"] / f for id, f in distances.items()]
         if any(max(r, 1 / r) > APART for r in ratios):
-            yield network.replace(cameras=tuple(
-                _with_distance(c, distances[c.id]) if c.id in of else c for c in network.cameras
-            ))
+            yield _with_distances(network, distances)
 
 
-def _with_distance(camera: Camera, f: float) -> Camera:
-    scale = f / camera.parameters["fx"]
-    parameters = {**camera.parameters, "fx": f, "fy": f, "k1": 0.0}
-    sigma = {n: s * scale if n in ("fx", "fy") else s for n, s in camera.sigma.items()}
-    return dataclasses.replace(camera, parameters=parameters, sigma=sigma)
+def _with_distances(network: Network, distances: Mapping[str, float]) -> Network:
+    """The network with principal distances of some cameras, also in their observations."""
+    changed = lambda c: dataclasses.replace(c, parameters={
+        **c.parameters, "fx": distances[c.id], "fy": distances[c.id], "k1": 0.0,
+    })  # fmt: skip
+    network = network.replace(
+        cameras=tuple(changed(c) if c.id in distances else c for c in network.cameras)
+    )
+    observed = observed_parameters(network)
+    if observed is None:
+        return network
+    value, sigma = observed.value.copy(), observed.sigma.copy()
+    for row, (id, name) in enumerate(zip(observed.camera, observed.parameter)):
+        if id in distances and name == "fx":
+            value[row], sigma[row] = distances[id], distances[id] * sigma[row] / value[row]
+    return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))
 
 
 def is_plausible(result: Adjustment) -> bool:

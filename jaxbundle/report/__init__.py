@@ -36,7 +36,7 @@ def text(
     - `test`: the test of the limit, `"pope"` (τ, σ a posteriori) or `"baarda"` (w, σ a priori).
     - `max_rows`: largest number of listed images, points, check points and distances.
     - `accuracy_unit`: points are counted by σ in classes of 0.1, 0.5, 1, 2 and 4 times this length
-      (object unit); None: times the RMS of all σ of the points.
+      (object unit); None: times the median of all σ of the points.
     - `budget`: the error budget of the adjustment (`jaxbundle.sensitivity`), a section at the end.
 
     **Returns:** text that ends with a line feed.

@@ -150,7 +150,8 @@ def counts(adjustment) -> list[str]:
 def count_rows(adjustment) -> list[tuple[str, str, str]]:
     """Label, count, and its parts."""
     network, n = adjustment.problem.network, adjustment.counts
-    roles = [(role, int(network.points.has_role(role).sum())) for role in ROLES]
+    there = ~adjustment.problem.excluded
+    roles = [(role, int((network.points.has_role(role) & there).sum())) for role in ROLES]
     kinds = [
         ("coordinates of control points", n.control),
         ("exterior orientation", n.exterior),
@@ -164,10 +165,12 @@ def count_rows(adjustment) -> list[tuple[str, str, str]]:
         ("object coordinates", free("point")),
     ]
     used = int((np.asarray(adjustment.problem.data.image_weight) > 0).any(1).sum())
+    points = count_points(adjustment)
+    excluded = len(network.points) - points
     rows = [
         ("Cameras", len(network.cameras), ""),
         ("Images", len(network.images), ""),
-        ("Points", len(network.points), _list(roles)),
+        ("Points", points, _list(roles) + (f"; {excluded} more excluded" if excluded else "")),
         ("Image points", used, ""),
         ("Observations", n.observations, "image coordinates"),
         ("Pseudo-observations", n.pseudo_observations, _list(kinds)),
@@ -176,6 +179,11 @@ def count_rows(adjustment) -> list[tuple[str, str, str]]:
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
     return [(name, str(n), detail) for name, n, detail in rows]
+
+
+def count_points(adjustment) -> int:
+    """The number of points without those that data snooping excluded: these have no coordinates."""
+    return int((~adjustment.problem.excluded).sum())
 
 
 def _list(groups) -> str:

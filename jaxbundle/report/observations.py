@@ -253,6 +253,8 @@ def check_points(adjustment, most: int) -> list[str]:
         ("largest", lambda x: x[np.abs(x).argmax()]),
     ):
         columns = (found[f"{kind}{axis}"] for kind in "ds" for axis in "XYZ")
+        columns = (x[np.isfinite(x)] if np.isfinite(x).any() else np.full(1, np.nan)
+                   for x in columns)  # fmt: skip
         rows.append((name, *(fixed(float(of(column)), places) for column in columns), ""))
     lines = [
         *heading(f"Check points: intersected − given, in {unit}"),

@@ -7,6 +7,7 @@ import numpy as np
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.report.head import (
     chi_squared,
+    count_points,
     image_precision,
     left_out_in_words,
     redundancy_in_words,
@@ -22,6 +23,9 @@ from jaxbundle.report.layout import (
 )
 
 MOST_CAMERAS, MOST_PARAMETERS = 3, 20
+WITHIN = 0.95
+"""Share of the σ of points below the second figure of the summary: a handful of hardly determined
+points would dominate their RMS and maximum."""
 
 
 def one_line(adjustment) -> str:
@@ -33,7 +37,7 @@ def one_line(adjustment) -> str:
     return (
         f"<{name}: converged, σ0 {sigma0_in_words(adjustment)}, redundancy "
         f"{adjustment.redundancy}, {count(len(network.images), 'image')}, "
-        f"{count(len(network.points), 'point')}>"
+        f"{count(count_points(adjustment), 'point')}>"
     )
 
 
@@ -45,7 +49,7 @@ def summary(adjustment) -> list[tuple[str, str]]:
         (
             "Network",
             f"{count(len(network.cameras), 'camera')}, {count(len(network.images), 'image')}, "
-            f"{count(len(network.points), 'point')}; datum {network.datum}, defect "
+            f"{count(count_points(adjustment), 'point')}; datum {network.datum}, defect "
             f"{adjustment.counts.datum}; residuals {network.residuals}",
         ),
         ("Redundancy", redundancy_in_words(adjustment)),
@@ -101,9 +105,11 @@ def _points(adjustment) -> str:
         sigma = adjustment.points[f"s{axis}"]
         sigma = sigma[np.isfinite(sigma) & (sigma > 0) & adjustment.located]
         if len(sigma):
-            rms, most = np.sqrt((sigma**2).mean()), sigma.max()
-            parts.append(f"σ{axis} {significant(rms)} (max {significant(most)})")
-    return f"RMS {', '.join(parts)} {unit}" if parts else "no coordinate is estimated with a σ"
+            middle, most = np.quantile(sigma, (0.5, WITHIN))
+            parts.append(f"σ{axis} {significant(middle)} ({significant(most)})")
+    if not parts:
+        return "no coordinate is estimated with a σ"
+    return f"median {', '.join(parts)} {unit}, in brackets {100 * WITHIN:g} % of them are smaller"
 
 
 def _far_points(adjustment):

@@ -183,6 +183,13 @@ def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[st
     return [*lines, *_list_of_points(adjustment, most)]
 
 
+SUMMARY = (
+    ("median", np.median), ("95 %", lambda s: np.quantile(s, 0.95)), ("max", np.max),
+    ("min", np.min),
+)  # fmt: skip
+"""Of the σ of the points. A handful of hardly determined points would make their mean and RMS."""
+
+
 def _precision(adjustment, accuracy_unit) -> list[str]:
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
@@ -196,10 +203,10 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     places = column_decimals(together)
     rows = [
         (name, *(fixed(float(of(s)), places) if len(s) else "–" for s in (*columns, together)))
-        for name, of in (("mean", np.mean), ("RMS", _rms), ("max", np.max), ("min", np.min))
+        for name, of in SUMMARY
     ]
-    scale = _rms(together) if accuracy_unit is None else float(accuracy_unit)
-    meaning = "the RMS of all" if accuracy_unit is None else "as chosen"
+    scale = float(np.median(together)) if accuracy_unit is None else float(accuracy_unit)
+    meaning = "the median of all" if accuracy_unit is None else "as chosen"
     rows.append(("points", *(str(len(s)) for s in columns), ""))
     header = (f"in {unit}", "σX", "σY", "σZ", "all")
     counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, together)]
@@ -213,10 +220,6 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     first, second = body[: len(rows)], body[len(rows) + 1 :]
     note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"
     return [head, *first, "", note, *second]
-
-
-def _rms(values) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _rays(rays) -> list[str]:

@@ -22,7 +22,8 @@ from jaxbundle.statistics.inspection import Inspection
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
-    """Intersected check points: coordinates, cofactors (times σ0² for variances), differences."""
+    """Intersected check points: coordinates, cofactors (times σ0² for variances), differences from
+    the given coordinates (NaN on axes with an infinite σ, which were not given)."""
 
     id: tuple[str, ...]
     position: Float[np.ndarray, "points 3"]
@@ -32,8 +33,10 @@ class CheckPoints:
 
     @property
     def rms(self) -> Float[np.ndarray, "3"]:
-        """RMS of the differences in X, Y, Z, in the object unit."""
-        return np.sqrt((self.difference**2).mean(0))
+        """RMS of the differences in X, Y, Z, in the object unit; NaN if none is known."""
+        known = np.isfinite(self.difference)
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(np.where(known, self.difference**2, 0.0).sum(0) / known.sum(0))
 
 
 def intersect_check_points(
@@ -57,7 +60,7 @@ def intersect_check_points(
     return CheckPoints(
         points.id,
         position,
-        position - points.position,
+        np.where(np.isposinf(points.sigma), np.nan, position - points.position),
         cofactor,
         np.bincount(observations.point, minlength=len(points)),
     )

@@ -18,10 +18,9 @@ from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.photographs.reading import SUFFIXES, read_photograph
+from jaxbundle.photographs.formats import SUFFIXES
+from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.surface.views import FrameView, frame_views
-
-IMAGES = (*SUFFIXES, ".bmp", ".ppm", ".pgm", ".webp", ".jp2")
 
 
 def read_views(
@@ -101,7 +100,7 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
 
 def _foremost(files):
     """Among files of one name the images, and of these those in the nearest folder."""
-    files = [p for p in files if p.suffix.lower() in IMAGES] or files
+    files = [p for p in files if p.suffix.lower() in SUFFIXES] or files
     near = min((len(p.parts) for p in files), default=0)
     return [p for p in files if len(p.parts) == near]
 

@@ -27,6 +27,10 @@ MOST_ALIKE = 5
 OF_THE_LENS = ("fx", "fy", "k1")
 LOOP_PAIRS = 60
 """Number of pairs for closing rotations."""
+BELIEVED_RATIO = 1.5
+"""Ratio to the principal distance stated by the files above which that of the matches is not
+believed: flat objects and nearly parallel views hardly determine it (half of it on a beach),
+whereas files are wrong by that much only if a photograph was cropped."""
 
 
 def start_cameras(
@@ -39,8 +43,8 @@ def start_cameras(
 ) -> tuple[list[Camera], list[str]]:
     """Cameras with the principal distance and K1 of consistent pairs of their lens, and notes.
 
-    **Arguments:** `lens` of every camera; `known`: whether its principal distance is a usable start
-    value.
+    **Arguments:** `lens` of every camera; `known`: whether its principal distance is stated by the
+    files: then it is also the result if that of the matches contradicts it (`BELIEVED_RATIO`).
     """
     better, notes = list(cameras), []
     for number in dict.fromkeys(lens):
@@ -52,14 +56,25 @@ def start_cameras(
         start = estimate_interior(begin, xy, told)
         better = with_lens(better, own, start.camera)
         if start.pairs:
-            better = _close(better, own, of, features, _choose_loops(found))
+            middle = first.parameters["fx"] if told else start.camera.parameters["fx"]
+            better = _close(better, own, of, features, _choose_loops(found), middle)
             p = better[own[0]].parameters
-            notes.append(f"camera {name}: start values from matches: principal distance "
-                         f"{p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
+            said = f"start values from matches: principal distance {p['fx']:.0f} px"
+            stated = first.parameters["fx"]
+            if told and not 1 / BELIEVED_RATIO < p["fx"] / stated < BELIEVED_RATIO:
+                better = with_lens(better, own, _without_distortion(first))
+                notes.append(f"camera {name}: {said}, but {stated:.0f} px by the files: that of "
+                             "the files is used")  # fmt: skip
+            else:
+                notes.append(f"camera {name}: {said}, k1 {p['k1']:.3f}")
         elif not told:
             notes.append(f"camera {name}: the principal distance is a guess: no two of its "
                          "photographs agree on one")  # fmt: skip
     return better, notes
+
+
+def _without_distortion(camera: Camera) -> Camera:
+    return dataclasses.replace(camera, parameters={**camera.parameters, "k1": 0.0})
 
 
 def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> list[Camera]:
@@ -69,8 +84,9 @@ def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> 
     return [with_it(c) if k in own else c for k, c in enumerate(cameras)]
 
 
-def _close(cameras, own, of, features, matches) -> list[Camera]:
-    """The cameras, a lens with the interior orientation with which rotations close."""
+def _close(cameras, own, of, features, matches, middle: float) -> list[Camera]:
+    """The cameras, a lens with the interior orientation with which rotations close, with a
+    principal distance near the `middle`."""
     lens = cameras[own[0]]
 
     def with_interior(x: Interior) -> list[Camera]:
@@ -84,7 +100,7 @@ def _close(cameras, own, of, features, matches) -> list[Camera]:
         return Oriented(pairs, _matches_of(pairs, own, of, features, with_interior))
 
     start = np.array([np.log(lens.parameters["fx"]), lens.parameters["k1"]])
-    return with_interior(close_rotations(orient, start))
+    return with_interior(close_rotations(orient, start, np.log(middle)))
 
 
 def _thin(pair: Pair) -> Pair:

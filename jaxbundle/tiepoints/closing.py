@@ -32,7 +32,7 @@ from jaxbundle.tiepoints.verification import Pair, rotation_angle, turn_pairs
 ANGLE = np.radians(0.3)
 """ω₀, the error of ω of right pairs."""
 SIGMA_C, SIGMA_K1 = 0.25, 0.15
-"""σ of ln c about the start value, and of K1 about zero."""
+"""σ of ln c about the value stated by the files, or else the start value, and of K1 about zero."""
 FIRST = (1.0, 1.25, 0.8)
 """First principal distances, relative to the start value."""
 STEP_C, STEP_K1 = 0.1, 0.04
@@ -55,15 +55,19 @@ class Oriented:
     ideal: Callable[[Interior], Sequence[tuple[np.ndarray, np.ndarray]]]
 
 
-def close_rotations(orient: Callable[[Interior], Oriented], start: Interior) -> Interior:
+def close_rotations(
+    orient: Callable[[Interior], Oriented], start: Interior, middle: float | None = None
+) -> Interior:
     """ln c and K1 with which rotations close; the start value if there are too few loops.
 
-    **Arguments:** `orient`: orients the pairs robustly with an interior orientation.
+    **Arguments:** `orient`: orients the pairs robustly with an interior orientation; `middle`: ln c
+    before; default: that of `start`.
     """
+    middle = float(start[0]) if middle is None else middle
     found = []
     for factor in FIRST:
         first = start + [np.log(factor), 0.0]
-        one = _search(orient(first), first, start[0])
+        one = _search(orient(first), first, middle)
         if one is not None:
             if one.sum < CLEAR:
                 return one.interior
@@ -72,7 +76,7 @@ def close_rotations(orient: Callable[[Interior], Oriented], start: Interior) -> 
         return start
     most = max(one.loops for one in found)
     best = min((one for one in found if 2 * one.loops > most), key=lambda one: one.sum).interior
-    again = _search(orient(best), best, start[0])
+    again = _search(orient(best), best, middle)
     return best if again is None else again.interior
 
 

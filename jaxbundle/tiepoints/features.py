@@ -20,6 +20,11 @@ CELLS = 16
 """Cells of the grid along the longer side."""
 SEARCH_FACTOR = 1.6
 """Searched features, as a multiple of those kept."""
+CONTRAST, FAINT_CONTRAST = 0.02, 0.008
+"""SIFT's threshold of contrast, and that for photographs with fewer than `FEW` of the features to
+keep: blurred ones, or of bare objects. At 800 × 600 pixels, with a blur of 2 pixels and a third of
+the contrast, 476 features became 3092, and 10 of 10 pairs were verified instead of 7."""
+FEW = 1 / 3
 TILE = 2400
 """Side of the tiles in which a large photograph is searched, reduced pixels."""
 OVERLAP = 64
@@ -68,10 +73,9 @@ def find_features(
     if factor < 1:
         size = max(round(columns * factor), 1), max(round(rows * factor), 1)
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    detector = _detector(cv2, settings)
-    found = [_in_tile(detector, grey, *tile) for tile in _tiles(*grey.shape)]
-    points = [p for part, _ in found for p in part]
-    descriptors = [d for _, d in found if d is not None and len(d)]
+    points, descriptors = _search(cv2, grey, settings, CONTRAST)
+    if settings.kind == "sift" and len(points) < FEW * settings.number:
+        points, descriptors = _search(cv2, grey, settings, FAINT_CONTRAST)
     if not points or not descriptors:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 1), np.uint8))
     xy, size, angle, response = _columns(points)
@@ -82,12 +86,20 @@ def find_features(
     return Features(xy, size[kept] * scale.mean(), np.deg2rad(angle[kept]), descriptor)
 
 
-def _detector(cv2, settings: Detection):
+def _search(cv2, grey, settings: Detection, contrast: float):
+    """Key points and descriptors, by tiles."""
+    detector = _detector(cv2, settings, contrast)
+    found = [_in_tile(detector, grey, *tile) for tile in _tiles(*grey.shape)]
+    points = [p for part, _ in found for p in part]
+    return points, [d for _, d in found if d is not None and len(d)]
+
+
+def _detector(cv2, settings: Detection, contrast: float):
     ample = int(SEARCH_FACTOR * settings.number)
     if settings.kind == "sift":
         # without precise upscaling, features are a quarter of a pixel too far right and down
         return cv2.SIFT_create(
-            nfeatures=ample, contrastThreshold=0.02, enable_precise_upscale=True
+            nfeatures=ample, contrastThreshold=contrast, enable_precise_upscale=True
         )
     if settings.kind == "orb":
         return cv2.ORB_create(nfeatures=ample)

@@ -19,7 +19,7 @@ from jaxbundle.tiepoints.features import Detection, Features
 LENGTH = 16
 ABANDONED_AFTER = 600.0
 """Seconds after which no process writes a file any more."""
-RULES = "5"
+RULES = "6"
 """Version of features and matches: files of others are not used."""
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.exchanges import contradiction
 
 RNG = np.random.default_rng(5)
@@ -49,3 +50,24 @@ def test_the_corners_of_a_square_have_two_explanations():
 
 def test_points_of_another_object_have_no_explanation():
     assert contradiction(POINTS[:8], POINTS[8:16]) is None
+
+
+def test_the_tolerance_is_that_of_the_sigma_of_control():
+    """Handheld control, σ a sixth of its extent, contradicts nothing; exact control would."""
+    source, target = lists(9)
+    target = target + 0.5 * np.random.default_rng(1).standard_normal(target.shape)
+    assert contradiction(source, target, np.full((9, 3), 0.5)) is None
+    exact = contradiction(source, target, np.full((9, 3), np.nan))
+    assert exact is None or exact.before > 0.5
+    far = target.copy()
+    far[[0, 2]] = far[[2, 0]] + [[30, 0, 0], [-30, 0, 0]]
+    assert contradiction(source, far, np.full((9, 3), 0.5)) is not None
+
+
+def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():
+    source, target = lists(9, wrong=[1, 4, 8])
+    A, t = similarity_of_most(source, target)
+    off = np.linalg.norm(source @ A.T + t - target, axis=1)
+    assert np.all(np.delete(off, [1, 4, 8]) < 0.01) and np.all(off[[1, 4, 8]] > 0.5)
+    on_a_line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
+    assert similarity_of_most(on_a_line, on_a_line) is None

@@ -389,3 +389,24 @@ def test_an_image_first_placed_by_repeated_parts_is_placed_again():
     true = network.images.position[[network.images.id.index(id) for id in images.id]]
     ratio = lambda X: np.linalg.norm(X[0] - X[1:], axis=1) / np.linalg.norm(X[1] - X[2])
     np.testing.assert_allclose(ratio(images.position), ratio(true), rtol=0.1)
+
+
+def test_handheld_control_is_not_refused(with_control):
+    """σ of control a twelfth of its extent, with one measurement under a wrong name: start values
+    are found, and the wrong measurement is named."""
+    network = with_control.network
+    control = np.flatnonzero(network.points.has_role("control"))
+    sigma, X = network.points.sigma.copy(), network.points.position.copy()
+    extent = np.ptp(X[control], axis=0).max()
+    sigma[control] = extent / 12
+    X[control] += extent / 12 * np.random.default_rng(2).standard_normal((len(control), 3))
+    points = dataclasses.replace(network.points, position=X, sigma=sigma)
+    rays = network.observations
+    xy = rays.xy.copy()
+    wrong = int(np.flatnonzero(rays.point == control[-1])[0])
+    xy[wrong] += [15.0, -9.0]
+    network = bare(network.replace(points=points, observations=dataclasses.replace(rays, xy=xy)))
+    found = orient(network)
+    assert not found.images and not found.finding
+    name = f"{points.id[control[-1]]} in {network.images.id[rays.image[wrong]]}"
+    assert found.left_out == (name,)

@@ -80,7 +80,8 @@ def test_exif(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "a.jpg", exif=head)
     found = read_exif(tmp_path / "a.jpg")
     assert found.camera == "NIKON D800" and found.time.minute == 11
-    assert found.principal_distance() == (pytest.approx(24 / 35.9 * 90), "focal length and sensor")
+    f = pytest.approx(24 / 35.9 * 90)
+    assert found.principal_distance()[::2] == (f, "focal length and sensor")
     assert found.place == Place(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
 
 
@@ -91,8 +92,22 @@ def test_resolution_in_the_focal_plane_is_that_of_the_photograph_as_it_was_taken
     details[0x920A], details[0xA20E], details[0xA210] = 8.0, 254.0, 3  # pixels for a centimetre
     details[0xA002], details[0xA003] = 180, 120
     Image.fromarray(GREY).save(tmp_path / "half.jpg", exif=head)
-    told = pytest.approx(8.0 * 25.4 / 2), "focal length and resolution"
-    assert read_exif(tmp_path / "half.jpg").principal_distance() == told
+    Image.fromarray(GREY[:, :60]).save(tmp_path / "square.jpg", exif=head)
+    assert read_exif(tmp_path / "square.jpg").principal_distance() is None  # of unknown scale
+    told = read_exif(tmp_path / "half.jpg").principal_distance()
+    assert told[::2] == (pytest.approx(8.0 * 25.4 / 2), "focal length and resolution")
+    assert told.sigma == pytest.approx(0.05 * told.value)
+
+
+def test_a_focal_length_equivalent_to_film_is_rounded_to_millimetres(tmp_path):
+    """By the diagonal of 43.27 mm, whatever the size; σ of a rounded number is 1/√12."""
+    head = Image.Exif()
+    head.get_ifd(0x8769)[0xA405] = 13
+    for name, grey in (("whole.jpg", GREY), ("half.jpg", GREY[::2, ::2])):
+        Image.fromarray(grey).save(tmp_path / name, exif=head)
+        told = read_exif(tmp_path / name).principal_distance()
+        assert told.value == pytest.approx(13 * np.hypot(*grey.shape) / np.hypot(36, 24))
+        assert told.sigma / told.value == pytest.approx(np.hypot(0.05, 12**-0.5 / 13))
 
 
 def test_sensors_are_not_mistaken():
@@ -105,12 +120,12 @@ def test_sensors_are_not_mistaken():
 def test_positions_in_a_map():
     assert utm_system(48.2, 16.4) == "EPSG:32633" and utm_system(-33.5, -70.7) == "EPSG:32719"
     places = [Place(48.0 + 1e-3 * k, 16.0, 200.0 + k) for k in range(4)]
-    X, sigma, _, said = map_positions([*places, None])
+    X, sigma, _, said, wide = map_positions([*places, None])
     # a thousandth of a degree of the meridian at 48° is 111.2 m, times the scale of UTM
     assert np.allclose(np.diff(X[:4, 1]), 111.2 * 0.9996, atol=0.15)
     assert np.isnan(X[4]).all() and np.allclose(sigma[0], [3, 3, 6]) and "EPSG:32633" in said
     near = [Place(48.0 + 1e-6 * k, 16.0, 200.0) for k in range(4)]
-    assert map_positions(near) is None
+    assert wide and not map_positions(near).define_frame
     moved, said = to_map(np.array([[16.0, 48.0, 200.0]]), "EPSG:4326", "gcp")
     assert np.allclose(moved, X[:1], atol=1e-3) and said == "EPSG:32633"
     with pytest.raises(InputError, match="gcp: coordinate system 'EPSG:1' is not known"):

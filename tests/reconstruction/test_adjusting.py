@@ -79,11 +79,22 @@ def test_points_that_gross_errors_leave_undetermined_are_left_out(monkeypatch, h
         return SimpleNamespace(converged=not undetermined, undetermined=undetermined)
 
     monkeypatch.setattr(adjusting, "adjust", adjust)
-    result, kept, rows = adjusting._adjust_determined(network)
+    result, kept, rows = adjusting.adjust_determined(network)
     assert result.converged and len(kept.points) == len(network.points) - 1
     left = np.array(network.points.id)[network.observations.point[rows]]
     assert list(left) == list(np.array(kept.points.id)[kept.observations.point])
     assert lost not in left and len(rows) == len(network.observations) - 4
+
+
+@pytest.mark.parametrize("image_points", [500, 3000, 15_000, 400_000])
+def test_a_search_without_end_costs_no_more_than_the_size_of_its_network(image_points):
+    """Several hundred iterations for two photographs; for more, a bounded number of evaluated image
+    points."""
+    network = SimpleNamespace(observations=range(image_points))
+    most = adjusting.limit_iterations(network)
+    assert 200 <= most <= 2000
+    assert most * image_points <= max(4_000_000, 200 * image_points)
+    assert image_points > 3000 or most > 1000
 
 
 def photographs_of_columns(share):

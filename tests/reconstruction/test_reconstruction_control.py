@@ -1,13 +1,22 @@
 """Control points with their measurements: files of OpenDroneMap, tables, errors by line."""
 
 import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from jaxbundle import read_network
 from jaxbundle.errors import InputError
-from jaxbundle.reconstruction.control import read_control_measurements
+from jaxbundle.io.networks.control import select_checks
+from jaxbundle.photographs.exif import Place
+from jaxbundle.photographs.places import map_positions
+from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
 from jaxbundle.reconstruction.named import Named, name_unused, read_distances
+from jaxbundle.reconstruction.reconstruct import find_positions
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def written(tmp_path, text):
@@ -74,6 +83,74 @@ def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
     with pytest.raises(InputError, match="1 control points are measured .* 3 are needed.*7"):
         name_unused(both, control, [], 3)
     assert name_unused(both, control, [], 1) == ["control points in no photograph: 7"]
+
+
+TABLE = ("id,X,Y,Z,sX,sY,sZ,image,u,v\nA,1,2,3,,,,a.jpg,10,20\nB,4,2,3,0.01,0.01,0.02,a.jpg,11,2\n"
+         "C,1,5,3,,,,a.jpg,1,2\nD,1,2,9,,,,a.jpg,1,9\n")  # fmt: skip
+
+
+def test_sigma_and_check_points_by_options(tmp_path):
+    control = read_control_measurements(written(tmp_path, TABLE))
+    sigma = with_sigma(control, "0.03,0.05").points.sigma
+    np.testing.assert_allclose(sigma[0], [0.03, 0.03, 0.05])
+    np.testing.assert_allclose(sigma[1], [0.01, 0.01, 0.02])  # the file's own
+    for text in ("-1", "a", "1,2,3", "nan"):
+        with pytest.raises(InputError, match="--control-sigma .*expected a positive number"):
+            with_sigma(control, text)
+    roles = lambda *given: select_checks(control.points, given).role
+    assert roles("A,C") == roles("A", "C") == ("check", "control", "check", "control")
+    assert roles("every 3rd") == ("control", "check", "control", "control")
+    assert roles("every 2nd") == ("control", "check", "control", "check")
+    with pytest.raises(InputError, match="--check E: expected a control point .*control.txt"):
+        roles("E")
+    with pytest.raises(InputError, match="all 4 control points are check points"):
+        roles("A,B,C,D")
+
+
+def test_options_of_control_need_control(tmp_path, command):
+    (tmp_path / "photos").mkdir()
+    done = command("reconstruct", tmp_path / "photos", "--check", "A", "--out", tmp_path / "out")
+    assert done.status == 2 and "--control-sigma and --check need --control" in done.err
+
+
+def test_check_points_of_a_project_are_control_points(command):
+    done = command("adjust", EXAMPLES / "bingo_indoor", "--check", "nowhere", "--json", "-")
+    assert done.status == 2 and "--check nowhere: expected a control point" in done.err
+    points = read_network(EXAMPLES / "bingo_indoor").points
+    chosen = select_checks(points, ["every 2nd"])
+    assert (chosen.has_role("check") <= points.has_role("control")).all()
+    assert chosen.has_role("check").sum() == points.has_role("control").sum() // 2
+
+
+PLACES = [Place(34.4064 + 2e-4 * k, -119.88 + 3e-4 * (k % 3), 100.0 + k) for k in range(6)]
+
+
+def test_positions_in_the_system_of_control():
+    """California, in its state plane in metres and in feet, and in the UTM zone."""
+    utm, state = map_positions(PLACES), map_positions(PLACES, "EPSG:26945")
+    assert utm.system == "EPSG:32611" and utm.define_frame
+    d = [np.linalg.norm(np.diff(p.X[:, :2], axis=0), axis=1) for p in (utm, state)]
+    np.testing.assert_allclose(d[0], d[1], rtol=1e-3)
+    assert np.linalg.norm(utm.X - state.X) > 1e5
+    assert map_positions(PLACES, "EPSG:2229") is None  # feet
+    near = [dataclasses.replace(p, latitude=34.4064) for p in PLACES[:1] * 6]
+    assert not map_positions(near).define_frame
+
+
+def test_what_is_done_with_positions_is_said(tmp_path):
+    photographs = [SimpleNamespace(exif=SimpleNamespace(place=p)) for p in PLACES]
+    control = read_control_measurements(written(tmp_path, TABLE))
+    found, notes = find_positions(photographs, control)
+    assert found is None and "km from control in EPSG:32611" in notes[-1]
+    X = control.points.position + [235_300.0, 3_811_200.0, 0.0]
+    near = dataclasses.replace(
+        control, points=dataclasses.replace(control.points, position=X), system="EPSG:32611"
+    )
+    found, notes = find_positions(photographs, near)
+    assert found is not None and "satellite positions of 6 photographs with their σ" in notes[-1]
+    nothing = [SimpleNamespace(exif=SimpleNamespace(place=None))] * 4
+    found, notes = find_positions(nothing, near)
+    assert found is None and "no satellite positions in the photographs" in notes[-1]
 
 
 def test_distances(tmp_path):

@@ -247,6 +247,18 @@ def test_features_lie_at_the_centres_of_blobs():
     assert np.abs(np.median(e, axis=0)).max() < 0.05
 
 
+def test_faint_features_are_searched_where_there_are_few():
+    """Blobs of six grey values: below the contrast of distinct features."""
+    true = np.stack(np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20)), -1).reshape(-1, 2)
+    v, u = np.indices((240, 320))
+    grey = np.full((240, 320), 60.0)
+    for x, y in true:
+        grey += 6 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 3.0**2))
+    found = find_features(np.rint(grey).astype(np.uint8))
+    near = np.linalg.norm(found.xy[:, None] - true[None], axis=2)
+    assert (near.min(0) < 1.0).mean() > 0.9
+
+
 def test_tracks_without_contradictions():
     spread = [np.random.default_rng(k).uniform(0, 100, (6, 2)) for k in range(3)]
     features = [features_at(xy) for xy in spread]

@@ -23,7 +23,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Pose, PoseValue, Result
-from jaxbundle.network.kinds import exterior
+from jaxbundle.network.further.exterior_priors import exterior
 from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
 from jaxbundle.statistics.inspection import OfNetwork

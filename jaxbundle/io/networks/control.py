@@ -15,6 +15,7 @@ import csv
 import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,8 @@ which it is none: of points in random order it is about 1."""
 LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
+EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
+"""A selection of check points, such as `every 3rd`."""
 
 
 def read_control(path: str | Path) -> Points:
@@ -145,6 +148,34 @@ def _points(table: Columns) -> Points:
             "number is expected, or nothing for a point that is held"
         )
     return Points(ids, roles, position, sigma, table.source)
+
+
+def select_checks(points: Points, selection: Sequence[str]) -> Points:
+    """Points with some of the control and fixed ones as check points.
+
+    **Arguments:** `selection`: names, several with commas, or `every 3rd` (of the control points in
+    the order of the table the second, fifth, …).
+
+    **Raises:** `InputError` for a name that is not a control point, or if no control is left."""
+    rows = np.flatnonzero(points.has_role("control", "fixed", "check"))
+    known = [points.id[k] for k in rows]
+    chosen: set[str] = set()
+    for text in selection:
+        every = EVERY.match(text.strip())
+        if every and (step := int(every[1])) > 1:
+            chosen |= {*known[step // 2 :: step]}
+            continue
+        for name in [text] if text in known else [part.strip() for part in text.split(",")]:
+            if name not in known:
+                raise InputError(
+                    f"--check {name}: expected a control point of {points.source.name}, or every "
+                    f"3rd{did_you_mean(name, known)}"
+                )
+            chosen.add(name)
+    roles = tuple("check" if id in chosen else role for id, role in zip(points.id, points.role))
+    if chosen and not {"control", "fixed"} & set(roles):
+        raise InputError(f"--check: all {len(known)} control points are check points; none is left")
+    return dataclasses.replace(points, role=roles)
 
 
 def with_control(network: Network, control: Points, datum: bool = True) -> Network:

@@ -1,16 +1,18 @@
-"""The adjusted network as a project, for other programs."""
+"""The adjusted network as a project: for other programs, and to be adjusted again."""
 
 import dataclasses
 
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.network.sightings import keep_points
+from jaxbundle.network.further import CameraParameters, ExteriorPriors, Further, RollingShutter
+from jaxbundle.network.further.base import among
+from jaxbundle.network.sightings import keep_points, without_distances
 from jaxbundle.network.tables import Images, Network, Observations, Points
 
 
 def adjusted_network(adjustment) -> Network:
-    """The network of a solved `Adjustment` at its solution.
+    """The network of a solved `Adjustment` at its solution, for other programs.
 
     Cameras, orientations and points have their adjusted values; observations removed by data
     snooping are left out. Control points with σ are tie points here; priors and observations of
@@ -46,3 +48,132 @@ def adjusted_network(adjustment) -> Network:
         datum="inner", datum_points=(), further=(), warnings=("the adjusted network",),
     )  # fmt: skip
     return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+
+
+def readjustable_network(adjustment) -> Network:
+    """The network of a solved `Adjustment` with adjusted start values and all observations that
+    took part: adjusted again it gives the same values, σ and σ0.
+
+    Priors of orientations and cameras become rows of `exterior_priors` and `camera_parameters`,
+    because what was observed differs from the start values; control points have their given
+    coordinates.
+    σ are the final ones, after variance components and robust weights. Observations removed by data
+    snooping, points without coordinates and check points are left out.
+    """
+    problem = adjustment.problem
+    network, data = problem.network, problem.data
+    images, rays = network.images, network.observations
+    values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
+    cameras = tuple(
+        dataclasses.replace(
+            camera, parameters=adjustment.camera_parameters(camera.id), sigma={},
+            free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
+        )
+        for camera in network.cameras
+    )  # fmt: skip
+    weight = np.asarray(data.image_weight)
+    used = (weight > 0).any(1)
+    adjusted = network.replace(
+        cameras=cameras,
+        images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
+                      np.where(images.sigma == 0, 0.0, np.nan), images.source),
+        points=_given_points(adjustment),
+        observations=Observations(rays.image, rays.point, rays.xy, _sigma(weight, np.nan),
+                                  rays.source).take(used),
+        distances=dataclasses.replace(
+            network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
+        ),
+        further=_joined(*_further(adjustment), *_priors(adjustment)),
+        warnings=("the adjusted network",),
+    )  # fmt: skip
+    adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
+    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+
+
+def _sigma(weight, otherwise: float):
+    """σ of weights."""
+    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), otherwise)
+
+
+def _given_points(adjustment) -> Points:
+    """Points at their adjusted coordinates, controlled axes at the given ones; a control point of
+    which no axis is used any more is a tie point."""
+    problem = adjustment.problem
+    points, data = problem.network.points, problem.data
+    control = problem.layout.given["control"]
+    weight, given = np.asarray(data.control_weight), np.asarray(data.control) + problem.origin
+    position, sigma = adjustment.point_values.copy(), np.full_like(points.sigma, np.nan)
+    sigma[control] = _sigma(weight, np.inf)
+    position[control] = np.where(weight > 0, given, position[control])
+    roles = np.array(points.role, dtype=object)
+    roles[control[~(weight > 0).any(1)]] = "tie"
+    sigma[roles == "tie"] = np.nan
+    return Points(points.id, tuple(roles.tolist()), position, sigma, points.source)
+
+
+def _priors(adjustment) -> list[Further]:
+    """What was observed of orientations and cameras."""
+    problem = adjustment.problem
+    network, data, given = problem.network, problem.data, problem.layout.given
+    found: list[Further] = []
+    if len(given["exterior"]):
+        value = np.asarray(data.exterior) + np.concatenate([problem.origin, np.zeros(3)])
+        image = tuple(network.images.id[k] for k in given["exterior"])
+        sigma = _sigma(np.asarray(data.exterior_weight), np.inf)
+        found.append(ExteriorPriors(image=image, value=value, sigma=sigma))
+    gone = {(name.id, name.parameter) for name in adjustment.eliminated}
+    rows = []
+    for row, c in enumerate(given["interior"]):
+        camera = network.cameras[c]
+        for j, name in enumerate(get_model(camera.model).parameters):
+            weight = float(data.interior_weight[row, j])
+            if weight > 0 and name in camera.unknowns and (camera.id, name) not in gone:
+                rows.append((camera.id, name, float(data.interior[row, j]), 1 / weight))
+    if rows:
+        camera, parameter, value, sigma = zip(*rows)
+        found.append(CameraParameters(
+            camera=camera, parameter=parameter, value=np.array(value), sigma=np.array(sigma)
+        ))  # fmt: skip
+    return found
+
+
+def _joined(*given: Further) -> tuple[Further, ...]:
+    """One table of each kind: priors follow the rows of the same kind that the network had."""
+    tables: dict[str, Further] = {}
+    for one in given:
+        first = tables.get(one.TABLE)
+        if first is None:
+            tables[one.TABLE] = one
+            continue
+        names = [f.name for f in dataclasses.fields(one) if f.name not in ("settings", "source")]
+        join = lambda a, b: np.concatenate([a, b]) if isinstance(a, np.ndarray) else (*a, *b)
+        both: dict = {name: join(getattr(first, name), getattr(one, name)) for name in names}
+        tables[one.TABLE] = type(one)(**both, settings=first.settings)
+    return tuple(tables.values())
+
+
+def _further(adjustment) -> list[Further]:
+    """The observations of further kinds without those removed by data snooping, with their final σ:
+    a kind with one observation per row of its table is followed row by row."""
+    problem = adjustment.problem
+    network, system = problem.network, problem.system
+    # the engine's sets in the order of declaration, the user's own before those of the network
+    kinds = sorted(among(network), key=lambda one: not isinstance(one, RollingShutter))
+    numbers = [len(one.declare(network, problem.origin).observations) for one in kinds]
+    at, found = len(system.observations) - sum(numbers), []
+    for one, number in zip(kinds, numbers):
+        if not number:
+            found.append(one)
+            continue
+        first = system.observations[at]
+        factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
+        for name, power in (("sigma", 1), ("covariance", 2)):
+            if factor != 1 and hasattr(one, name):
+                changed: dict = {name: getattr(one, name) * factor**power}
+                one = dataclasses.replace(one, **changed)
+        if first.number == len(one):
+            whole = np.abs(np.asarray(system.weights(at))).reshape(len(one), -1).max(1)
+            one = one.take(whole > 0)
+        at += number
+        found += [one] if len(one) else []
+    return found

@@ -5,8 +5,10 @@ from jaxbundle.network.further import attitudes, differences
 from jaxbundle.network.further.antennas import Antennas as Antennas
 from jaxbundle.network.further.attitudes import Attitudes as Attitudes
 from jaxbundle.network.further.base import Further as Further
+from jaxbundle.network.further.camera_parameters import CameraParameters as CameraParameters
 from jaxbundle.network.further.differences import Angles as Angles
 from jaxbundle.network.further.differences import Differences as Differences
+from jaxbundle.network.further.exterior_priors import ExteriorPriors as ExteriorPriors
 from jaxbundle.network.further.figures import Figures as Figures
 from jaxbundle.network.further.figures import Shapes as Shapes
 from jaxbundle.network.further.lines import Edges as Edges
@@ -18,7 +20,7 @@ KINDS = {
     kind.TABLE: kind
     for kind in (
         Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
-        Ties,
+        Ties, CameraParameters, ExteriorPriors,
     )  # fmt: skip
 }
 """By the name of their table."""

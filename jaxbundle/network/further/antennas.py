@@ -16,7 +16,8 @@ ts: the mean time of the strip; V: the velocity, from the measured positions bef
 | `t` | seconds, for drifts and a time offset |
 
 Section: `lever_arm = [ax, ay, az]` (0 if not given), or by camera `{ left = [...], … }`;
-`free`: of `ax`, `ay`, `az`, `shift`, `drift`, `time_offset`; `sigma`: a table of their prior σ.
+`free`: of `ax`, `ay`, `az`, `shift` (or `shift_X`, `shift_Y`, `shift_Z`), `drift`, `time_offset`;
+`sigma`: a table of their prior σ.
 """
 
 import dataclasses
@@ -41,7 +42,8 @@ from jaxbundle.network.further.base import (
 )
 
 ARM = ("ax", "ay", "az")
-FREE = (*ARM, "shift", "drift", "time_offset")
+SHIFTS = ("shift_X", "shift_Y", "shift_Z")
+FREE = (*ARM, "shift", *SHIFTS, "drift", "time_offset")
 AXES = ("X", "Y", "Z")
 PAIRS = ((0, 1), (0, 2), (1, 2))
 SECTION = "antenna"
@@ -129,7 +131,7 @@ class Antennas(Further):
         image = rows_of(self.image, images)
         camera, of_camera = np.unique(images.camera[image], return_inverse=True)
         strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
-        parameters = Parameters.of(SECTION, self.settings, FREE)
+        parameters = _by_axis(Parameters.of(SECTION, self.settings, FREE))
         cameras = [network.cameras[c].id for c in camera]
         given = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
@@ -139,7 +141,7 @@ class Antennas(Further):
         since, velocity = _track(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
             raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
-        groups = ["shift"] * 3 + ["drift"] * 3
+        groups = [*SHIFTS, *["drift"] * 3]
         names = ("shift X", "shift Y", "shift Z", "drift X", "drift Y", "drift Z")
         shift = Table("GNSS strip", np.zeros((len(strips), 6)), Vector(6), parameters.mask(groups),
                       list(strips), names)  # fmt: skip
@@ -155,6 +157,14 @@ class Antennas(Further):
             *parameters.priors(clock, ["time_offset"]),
         )
         return Declared((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))
+
+
+def _by_axis(given: Parameters) -> Parameters:
+    """The parameters with a shift of all axes as one of each."""
+    names = lambda name: SHIFTS if name == "shift" else (name,)
+    free = tuple(dict.fromkeys(n for name in given.free for n in names(name)))
+    sigma = {n: s for name, s in given.sigma.items() for n in names(name)}
+    return Parameters(FREE, free, sigma)
 
 
 def _shift_back(motion, strip):

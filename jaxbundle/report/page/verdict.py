@@ -63,13 +63,28 @@ def _control(adjustment) -> Finding:
     parts = [count(n, f"{role} point") for role, n in number.items() if n]
     tau = np.abs(adjustment.residuals["tau"][adjustment.residuals["kind"] == "control"])
     tau = tau[np.isfinite(tau)]
-    if not len(tau):
-        state = GOOD if sum(number.values()) > 3 else DOUBTFUL
-        return Finding("Control", state, f"{', '.join(parts)}; no residuals to test them by")
     limit = critical_value(adjustment)
+    if not len(tau):
+        return _held_control(adjustment, ", ".join(parts), limit)
     words = f"{', '.join(parts)}; largest |τ| {significant(tau.max())}, critical value at 0.1 % "
     state = GOOD if tau.max() <= limit else BAD
     return Finding("Control", state, words + significant(limit))
+
+
+def _held_control(adjustment, parts: str, limit: float) -> Finding:
+    """Points without σ are exact: their errors are in the image residuals, and three of them fit
+    any network."""
+    rows, points = adjustment.residuals, adjustment.problem.network.points
+    ids = [id for id, fixed in zip(points.id, points.has_role("fixed")) if fixed]
+    own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
+    tau = np.abs(rows["tau"][own])
+    tau = tau[np.isfinite(tau)]
+    words = f"{parts} held exactly, because no σ is stated; "
+    if len(ids) <= 3 or not len(tau):
+        return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ")
+    words += (f"largest |τ| of their image points {significant(tau.max())}, critical value at "
+              f"0.1 % {significant(limit)}")  # fmt: skip
+    return Finding("Control", GOOD if tau.max() <= limit else DOUBTFUL, words)
 
 
 def _checks(adjustment) -> list[Finding]:
@@ -80,7 +95,8 @@ def _checks(adjustment) -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table, limit = adjustment.table("checks"), critical_value(adjustment)
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    largest = np.fmax.reduce(np.abs(d[s > 0]) / s[s > 0], initial=np.nan)
+    known = (s > 0) & np.isfinite(d)
+    largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)
     words = (
         f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
         f"difference {significant(largest)} times the σ of its intersection"

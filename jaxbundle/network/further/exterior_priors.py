@@ -1,0 +1,74 @@
+"""Given exterior orientations that differ from the start values: table `exterior_priors`.
+
+A σ in the table of images is that of the start value. Where the observed value is another one, such
+as in the adjusted network of a result, it has a row here (cameras: `camera_parameters`).
+
+Columns: `image`, `X0`, `Y0`, `Z0`, `omega`, `phi`, `kappa` and their σ; both empty: not given.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import omega_phi_kappa_near
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.tables import EXTERIOR
+
+
+def exterior(pose, given):
+    """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
+    [6]."""
+    angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
+    return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
+
+
+EXTERIOR_PRIOR = Kind("exterior orientation", exterior, ("image",), EXTERIOR, snooped="")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExteriorPriors(Further):
+    """Given exterior orientations [n, 6], angles in radians; σ is infinite where none is given."""
+
+    image: tuple[str, ...]
+    value: Float[np.ndarray, "n 6"]
+    sigma: Float[np.ndarray, "n 6"]
+
+    TABLE, IMAGES, MEASURED = "exterior_priors", ("image",), "value"
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "ExteriorPriors":
+        sigmas = [f"s{name}" for name in EXTERIOR]
+        table.check_names(("image", *EXTERIOR, *sigmas))
+        unit = np.array([1, 1, 1, radians, radians, radians])
+        value = np.stack([table.numbers(name) for name in EXTERIOR], 1) * unit
+        sigma = np.stack([positive_sigma(table, s, required=False) for s in sigmas], 1) * unit
+        for row, k in np.argwhere(np.isnan(value) != np.isnan(sigma))[:1]:
+            raise InputError(f"{table.source(row)}: {EXTERIOR[k]} and s{EXTERIOR[k]}: give both or "
+                             "neither")  # fmt: skip
+        return cls(image=table.ids("image"), value=np.nan_to_num(value),
+                   sigma=np.where(np.isnan(sigma), np.inf, sigma), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        unit = np.array([1, 1, 1, radians, radians, radians])
+        given = np.isfinite(self.sigma)
+        value, sigma = (np.where(given, x, np.nan) / unit for x in (self.value, self.sigma))
+        columns: dict[str, Any] = {"image": self.image}
+        columns |= {name: value[:, k] for k, name in enumerate(EXTERIOR)}
+        return columns | {f"s{name}": sigma[:, k] for k, name in enumerate(EXTERIOR)}
+
+    def number_of_equations(self) -> int:
+        return int(np.isfinite(self.sigma).sum(1).min(initial=len(EXTERIOR)))
+
+    def declare(self, network, origin) -> Declared:
+        shift = np.concatenate([origin, np.zeros(3)])
+        value = np.where(np.isfinite(self.sigma), self.value - shift, 0.0)
+        return Declared((), (
+            EXTERIOR_PRIOR((rows_of(self.image, network.images),), value, sigma=self.sigma),
+        ))  # fmt: skip

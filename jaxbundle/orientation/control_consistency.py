@@ -1,0 +1,255 @@
+"""Control points that contradict the others, by leave-one-out prediction; σ of control estimated.
+
+Photographs, tie points and satellite positions determine the control points; d: their coordinates
+minus the given ones, C: the joint covariance of these determined coordinates (with the offset of
+the system), Σ: the covariance of control. With S = C + Σ, and W = S⁻¹ without what the columns of
+G leave open (position, orientation, scale of a block without positions),
+
+    W = S⁻¹ − S⁻¹·G·(Gᵀ·S⁻¹·G)⁻¹·Gᵀ·S⁻¹,
+
+the error of the prediction of points D from all others, and its covariance, are
+
+    e = W_DD⁻¹·(W·d)_D,        Σ_e = W_DD⁻¹,        T = eᵀ·Σ_e⁻¹·e
+
+(the deletion residual of generalised least squares; Cook and Weisberg 1982, 2.2), tested for the
+plane and for heights, of which the smaller probability counts twice. With given σ, T is χ²
+distributed. Unknown σ are restricted maximum likelihood estimates (Förstner 1979): the fixed
+point of σ² ← σ²·(dᵀ·W·D·W·d)/tr(W·D), from the points not tested; T then follows F.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
+
+SIGNIFICANCE = 0.05
+"""Probability of suspecting any point of control without contradictions."""
+PAIRS_UP_TO = 20
+"""With at most this many points two are also tested together: two errors of one size, as of
+exchanged names, hide each other in the estimated σ of a few points."""
+FEWEST_AGREEING = 4
+"""Control points that remain at least: three of a similarity always nearly agree."""
+LEAST_REDUNDANCY = 3.0
+"""Least redundancy of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %."""
+ROUNDS, SETTLED = 200, 1e-3
+"""Largest number of iterations of estimated σ; relative change at which they end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Discrepancies:
+    """Determined minus given coordinates of control points.
+
+    **Fields:** `difference` [n, 3]; `cofactor` [n, 3, n, 3], their covariance without that of
+    control; `sigma` [n, 3] of control: NaN where it is to be estimated, infinite on axes that are
+    not controlled; `open` [n, 3, k], what the block leaves open."""
+
+    difference: Float[np.ndarray, "n 3"]
+    cofactor: Float[np.ndarray, "n 3 n 3"]
+    sigma: Float[np.ndarray, "n 3"]
+    open: Float[np.ndarray, "n 3 k"]
+
+    def __len__(self) -> int:
+        return len(self.difference)
+
+
+@dataclasses.dataclass(frozen=True)
+class Assessment:
+    """Which points are `used`; the σ of control [n, 3], estimated where it was not given, with its
+    `redundancy` in the plane and in height; for every point the error of its prediction from the
+    others used, its σ [n, 3] and the probability of a larger one (NaN if it cannot be predicted).
+    `assumed`: whether σ is the assumed one, in the plane and in height.
+
+    `factor`: given σ were multiplied by it, because hardly any
+    point agrees with them."""
+
+    used: Bool[np.ndarray, " n"]
+    sigma: Float[np.ndarray, "n 3"]
+    redundancy: tuple[float, float]
+    error: Float[np.ndarray, "n 3"]
+    error_sigma: Float[np.ndarray, "n 3"]
+    probability: Float[np.ndarray, " n"]
+    assumed: tuple[bool, bool]
+    factor: float = 1.0
+
+
+def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICANCE) -> Assessment:
+    """Find the control points that contradict the others.
+
+    The most improbable point, or pair of points, is left out while its probability is below the
+    level for as many tests; finally those that the remaining ones predict well are used again. At
+    least half of the points stay: if more contradict their given σ, these are wrong, and all are
+    multiplied by one factor.
+
+    **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one.
+    """
+    if not len(found):
+        nothing, lacking = np.zeros((0, 3)), (True, True)
+        return Assessment(np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0),
+                          lacking)  # fmt: skip
+    used = _search(found, assumed, significance)
+    factor = 1.0
+    if 2 * (~used).sum() >= len(found) and np.isfinite(found.sigma).any():
+        everything = np.ones(len(found), bool)
+        sigma, *_ = _resolve(found, everything, assumed)
+        W, d, rows = _weight_matrix(found, sigma, everything)
+        redundancy = len(rows) - found.open.shape[2]
+        factor = float(np.sqrt(max(d @ W @ d / max(redundancy, 1), 1.0)))
+        scaled = np.where(np.isfinite(found.sigma), found.sigma * factor, found.sigma)
+        found = dataclasses.replace(found, sigma=scaled)
+        used = _search(found, assumed, significance)
+    sigma, redundancy, guessed = _resolve(found, used, assumed)
+    error, spread = np.full((2, len(found), 3), np.nan)
+    probability = np.full(len(found), np.nan)
+    common = _Model.of(found, used, used, assumed) if used.sum() > PAIRS_UP_TO else None
+    for i in range(len(found)):
+        test = _predict(found, used, [i], assumed, common if used[i] else None)
+        if test is not None:
+            error[i], spread[i], probability[i] = test
+    return Assessment(used, sigma, redundancy, error, spread, probability, guessed, factor)
+
+
+def _search(found: Discrepancies, assumed: float, significance: float) -> Bool[np.ndarray, " n"]:
+    """Which points do not contradict the others."""
+    used = np.ones(len(found), bool)
+    fewest = max(FEWEST_AGREEING, (len(found) + 1) // 2)
+    while worst := _most_improbable(found, used, assumed, significance, used.sum() - fewest):
+        used[worst] = False
+    left_out = np.flatnonzero(~used).tolist()
+    for i in sorted(left_out, key=lambda i: -_probability(found, used, [i], assumed)):
+        if _probability(found, used, [i], assumed) > level_of_one(significance, len(found)):
+            used[i] = True
+    return used
+
+
+def _most_improbable(
+    found: Discrepancies, used, assumed: float, significance: float, most: int
+) -> list[int]:
+    """The point, or else the two points, of at most this number, that are most improbable; none if
+    chance explains all."""
+    rows = np.flatnonzero(used).tolist()
+    few = len(rows) <= PAIRS_UP_TO
+    # of many points one changes the estimated σ by too little to matter
+    common = None if few else _Model.of(found, used, used, assumed)
+    for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
+        if tests and len(tests[0]) <= most:
+            p = [_probability(found, used, test, assumed, common) for test in tests]
+            if min(p) < level_of_one(significance, len(tests)):
+                return tests[int(np.argmin(p))]
+    return []
+
+
+def _probability(
+    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: "_Model | None" = None
+) -> float:
+    test = _predict(found, used, tested, assumed, model)
+    return 1.0 if test is None else test[2]
+
+
+class _Model(NamedTuple):
+    """σ [n, 3] and its redundancy in the plane and in height; W and W·d of the controlled axes of
+    some points, their `rows` among all axes."""
+
+    sigma: Float[np.ndarray, "n 3"]
+    redundancy: tuple[float, float]
+    W: Float[np.ndarray, "m m"]
+    Wd: Float[np.ndarray, " m"]
+    rows: Int[np.ndarray, " m"]
+
+    @staticmethod
+    def of(found: Discrepancies, others, all_, assumed: float) -> "_Model":
+        """With σ estimated from `others`, W of `all_`."""
+        sigma, redundancy, _ = _resolve(found, others, assumed)
+        W, d, rows = _weight_matrix(found, sigma, all_)
+        return _Model(sigma, redundancy, W, W @ d, rows)
+
+
+def _predict(
+    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: _Model | None = None
+):
+    """Error of the prediction of the first tested point, its σ, and the probability of a larger T
+    of all of them; None if the others do not predict them.
+
+    **Arguments:** `model`: of all used points, instead of one with σ from the others."""
+    if model is None:
+        others, all_ = used.copy(), used.copy()
+        others[list(tested)], all_[list(tested)] = False, True
+        model = _Model.of(found, others, all_, assumed)
+    rows = model.rows
+    mine = np.flatnonzero(np.isin(rows // 3, tested))
+    if not len(mine):
+        return None
+    own = model.W[np.ix_(mine, mine)]
+    scale = np.abs(np.diag(own)).max(initial=0.0)
+    if not scale or np.linalg.eigvalsh(own)[0] < 1e-9 * scale:
+        return None
+    covariance = np.linalg.inv(own)
+    e = covariance @ model.Wd[mine]
+    unknown, p = np.isnan(found.sigma).ravel()[rows[mine]], []
+    for height, freedom in enumerate(model.redundancy):
+        part = np.flatnonzero((rows[mine] % 3 == 2) == height)
+        if not len(part) or (unknown[part].any() and freedom < LEAST_REDUNDANCY):
+            continue  # an assumed σ tests nothing
+        T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
+        p.append(f_tail(T / len(part), len(part), freedom) if unknown[part].any()
+                 else chi2_tail(T, len(part)))  # fmt: skip
+    p = min(1.0, len(p) * min(p, default=1.0))
+    error, spread = np.full(3, np.nan), np.full(3, np.nan)
+    first = rows[mine] // 3 == tested[0]
+    axes = rows[mine][first] % 3
+    error[axes], spread[axes] = e[first], np.sqrt(np.diag(covariance))[first]
+    return error, spread, p
+
+
+def _weight_matrix(found: Discrepancies, sigma, used):
+    """W and d of the controlled axes of the used points; their rows among all axes."""
+    rows = np.flatnonzero((used[:, None] & np.isfinite(sigma)).ravel())
+    n = 3 * len(found)
+    S = found.cofactor.reshape(n, n)[np.ix_(rows, rows)] + np.diag(sigma.ravel()[rows] ** 2)
+    W = np.linalg.inv(S)
+    G = found.open.reshape(n, -1)[rows]
+    if G.shape[1]:
+        U = W @ G
+        W = W - U @ np.linalg.pinv(G.T @ U, hermitian=True) @ U.T
+    return W, found.difference.ravel()[rows], rows
+
+
+def _resolve(found: Discrepancies, used, assumed: float):
+    """σ of control with the unknown ones estimated from the used points, their redundancy in the
+    plane and in height, and whether they had to be assumed."""
+    unknown = np.isnan(found.sigma)
+    groups = [unknown & np.array([True, True, False]), unknown & np.array([False, False, True])]
+    sigma = np.where(unknown, assumed, found.sigma)
+    here = [g for g in groups if (g & used[:, None]).any()]
+    redundancy = [0.0, 0.0]
+    if not here:
+        return sigma, (0.0, 0.0), (bool(groups[0].any()), bool(groups[1].any()))
+    start = np.abs(found.difference - np.median(found.difference[used], axis=0))
+    for group in here:
+        sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
+    for number in range(ROUNDS):
+        W, d, rows = _weight_matrix(found, sigma, used)
+        Wd, before = W @ d, sigma.copy()
+        for group in here:
+            mine = group.ravel()[rows]
+            trace = np.diag(W)[mine].sum()
+            if trace > 0:
+                s = sigma[group][0] * np.sqrt((Wd[mine] ** 2).sum() / trace)
+                sigma[group] = max(s, assumed)
+            if number == 0:
+                # with a σ that dominates C; where the estimate is small, its share is hardly any
+                redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
+        if np.abs(sigma[unknown] / before[unknown] - 1).max() < SETTLED:
+            break
+    plane, height = (
+        bool(g.any()) and (r < LEAST_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
+        for g, r in zip(groups, redundancy)
+    )
+    for group, few in zip(groups, (plane, height)):
+        if few:
+            sigma[group] = assumed
+    return sigma, (redundancy[0], redundancy[1]), (plane, height)

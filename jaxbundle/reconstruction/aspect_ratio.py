@@ -1,0 +1,145 @@
+"""Pixels that are not square: observed ratios fy/fx that the photographs contradict.
+
+fy/fx of a camera is observed as 1 with a small σ. Errors of tie points are correlated over a
+photograph (reflections, occlusions, light), so that the photographs alone determine the ratio many
+times worse than its σ says: one camera in five sets of photographs had ratios 4 to 8 σ apart. A
+contradiction is therefore believed only if it repeats itself: the photographs are divided into two
+halves, each is adjusted alone without the observed ratio, and both must deviate from 1 by more than
+chance explains, to the same side, and by more than they differ from each other.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.further import Ties
+from jaxbundle.network.sightings import keep_images, keep_points
+from jaxbundle.network.tables import Images, Network, Observations, Points
+from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
+
+CRITICAL = 3.29
+"""Normalised deviation beyond which chance (one in a thousand) does not explain it."""
+MIN_HALF = 4
+"""Minimum photographs in a half. Fewer hardly determine a camera."""
+
+
+class Ratio(NamedTuple):
+    """fy/fx − 1 and its σ."""
+
+    deviation: float
+    sigma: float
+
+
+def contradicted_ratios(result: Adjustment) -> dict[str, Ratio]:
+    """By camera, the ratio of the photographs alone where it contradicts the observed one.
+
+    With the adjusted deviation d, its cofactor q and the σ of the observation, the redundancy
+    number is r = 1 − q/σ², the normalised residual d/(σ·√r), and without the observation the ratio
+    would be d/r with cofactor q/r.
+    """
+    observed, found = observed_parameters(result.problem.network), {}
+    if observed is None:
+        return {}
+    columns = observed.camera, observed.parameter, observed.value.tolist(), observed.sigma.tolist()
+    for id, name, value, sigma in zip(*columns):
+        if name == ASPECT:
+            d, q = _deviation(result, id, value)
+            r = 1 - q / sigma**2
+            if r > 0 and abs(d) > CRITICAL * sigma * np.sqrt(r):
+                found[id] = Ratio(d / r, result.sigma0 * np.sqrt(q / r))
+    return found
+
+
+def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
+    """By camera, the ratios of two halves of the photographs, each adjusted alone; none if a half
+    does not determine them."""
+    network = _without_ratios(_at_solution(result))
+    number = np.arange(len(network.images))
+    of_halves = []
+    for half in (0, 1):
+        one = keep_images(network, number % 2 == half)
+        rays = np.bincount(one.observations.point, minlength=len(one.points))
+        one = keep_points(one, (rays > 1) | ~one.points.has_role("tie")).replace(datum_points=())
+        if len(one.images) < MIN_HALF:
+            return {}
+        try:
+            alone = adjust(one)
+        except (InputError, NotSolvedError):
+            return {}
+        if not alone.converged:
+            return {}
+        used = {one.cameras[c].id for c in np.unique(one.images.camera)}
+        of_halves.append({id: _ratio(alone, id) for id in used})
+    both = of_halves[0].keys() & of_halves[1].keys()
+    return {id: (of_halves[0][id], of_halves[1][id]) for id in both}
+
+
+def is_replicated(one: Ratio, other: Ratio) -> bool:
+    """Whether two halves confirm each other that a ratio is not 1."""
+    apart = abs(one.deviation - other.deviation)
+    clear = all(abs(r.deviation) > max(CRITICAL * r.sigma, apart) for r in (one, other))
+    return clear and one.deviation * other.deviation > 0
+
+
+def release(network: Network, cameras) -> Network:
+    """The network without the observed ratios of some cameras. Their fx is no longer that of
+    photographs of the same lens in the other format."""
+    observed = observed_parameters(network)
+    if observed is None:
+        return network
+    keep = [name != ASPECT or id not in cameras
+            for id, name in zip(observed.camera, observed.parameter)]  # fmt: skip
+    network = with_observed(network, observed.take(np.array(keep)))
+    return network.replace(further=tuple(
+        _without_focal_lengths(one, cameras) if isinstance(one, Ties) else one
+        for one in network.further
+    ))  # fmt: skip
+
+
+def _without_focal_lengths(ties: Ties, cameras) -> Ties:
+    columns = zip(ties.camera, ties.other, ties.parameter)
+    keep = [name != "fx" or not {one, other} & {*cameras} for one, other, name in columns]
+    return ties.take(np.array(keep))
+
+
+def _without_ratios(network: Network) -> Network:
+    return release(network, [camera.id for camera in network.cameras])
+
+
+def _at_solution(result: Adjustment) -> Network:
+    """The network with adjusted values as start values, without removed observations."""
+    network, values = result.problem.network, result.image_values
+    images, points, rays = network.images, network.points, network.observations
+    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    tie = points.has_role("tie")[:, None]
+    position = np.where(tie, result.point_values, points.position)
+    cameras = tuple(
+        dataclasses.replace(c, parameters=result.camera_parameters(c.id)) for c in network.cameras
+    )
+    given = np.isfinite(images.sigma[:, :3])  # observed positions stay what was observed
+    start = np.concatenate([np.where(given, images.position, values[:, :3]), values[:, 3:]], 1)
+    images = Images(images.id, images.camera, start[:, :3], start[:, 3:], images.sigma,
+                    images.source)  # fmt: skip
+    points = Points(points.id, points.role, position, points.sigma, points.source)
+    rays = Observations(rays.image, rays.point, rays.xy, rays.sigma, rays.source).take(used)
+    found = network.replace(cameras=cameras, images=images, points=points, observations=rays)
+    return keep_points(found, np.all(np.isfinite(position), axis=1))
+
+
+def _deviation(result: Adjustment, camera: str, value: float) -> tuple[float, float]:
+    """fy/fx minus a value, and its cofactor."""
+    names, Q = result.camera_cofactor(camera)
+    p = result.camera_parameters(camera)
+    ratio = p["fy"] / p["fx"]
+    slope = np.zeros(len(names))
+    slope[names.index("fx")], slope[names.index("fy")] = -ratio / p["fx"], 1 / p["fx"]
+    return ratio - value, float(slope @ Q @ slope)
+
+
+def _ratio(result: Adjustment, camera: str) -> Ratio:
+    d, q = _deviation(result, camera, 1.0)
+    return Ratio(d, result.sigma0 * np.sqrt(q))

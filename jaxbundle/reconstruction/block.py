@@ -1,0 +1,246 @@
+"""What a surveyor asks of a reconstructed block: scale, height, area, overlap, camera positions."""
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.network.further import Antennas
+from jaxbundle.network.tables import Camera
+from jaxbundle.network.units import from_image_unit
+from jaxbundle.orientation import many
+from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.photographs.exif import Exif
+from jaxbundle.report.layout import significant
+
+DOWNWARD = 0.7
+"""Least cosine between the viewing directions and the vertical of a block with a flying height and
+an area: 45 degrees."""
+CONTRADICTORY = 3.0
+"""Offset and RMS of satellite positions, in σ, above which they contradict control or photographs.
+"""
+RANGE = 0.01
+"""Share of the points beyond each side of the area: they may be far away by a gross error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraPositions:
+    """Given positions of photographs: adjusted minus given without the `offset` of their system,
+    by photograph; the offset against control with its σ (NaN: none was estimated); `sigma`, the
+    median of those given."""
+
+    difference: Mapping[str, Float[np.ndarray, "3"]]
+    sigma: Float[np.ndarray, "3"]
+    offset: Float[np.ndarray, "3"]
+    offset_sigma: Float[np.ndarray, "3"]
+
+    @property
+    def rms(self) -> Float[np.ndarray, "3"]:
+        """RMS of the differences."""
+        return np.sqrt(np.mean(np.square([*self.difference.values()]), 0))
+
+    def contradictions(self, prior: Float[np.ndarray, "3"], unit: str) -> list[str]:
+        """How the positions contradict control and their own σ, in words; `prior`: σ of the
+        offset before the adjustment."""
+        said = []
+        for axis, value, s in zip("XYZ", self.offset, prior):
+            if np.isfinite(value) and abs(value) > CONTRADICTORY * s:
+                said.append(f"satellite positions and control contradict each other: their offset "
+                            f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
+                            "their coordinate systems")  # fmt: skip
+        for axis, value, s in zip("XYZ", self.rms, self.sigma):
+            if value > CONTRADICTORY * s:
+                numbers = f"{significant(value)} {unit}, their σ {significant(s)} {unit}"
+                said.append(f"satellite positions contradict the photographs: RMS in {axis} "
+                            f"{numbers}")  # fmt: skip
+        return said
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Facts about an adjusted block. Lengths in the object unit; None: not defined, without a
+    vertical or in an oblique block."""
+
+    photographs: int
+    taken: tuple[datetime.datetime, datetime.datetime] | None
+    computed: datetime.datetime
+    system: str
+    unit: str
+    ground_sample_distance: float
+    object_distance: float
+    flying_height: float | None
+    area: float | None
+    rays_per_point: float
+    points_per_photograph: float
+    photographs_per_place: float | None
+    positions: CameraPositions | None
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Names and values in words."""
+        area = self.unit + "²"
+        rows = [("Photographs", str(self.photographs))]
+        if self.taken is not None:
+            first, last = (t.strftime("%Y-%m-%d %H:%M") for t in self.taken)
+            rows.append(("Taken", first if first == last else f"{first} to {last}"))
+        rows += [
+            ("Computed", self.computed.strftime("%Y-%m-%d %H:%M")),
+            ("Coordinate system", self.system),
+            ("Ground sample distance", f"{significant(self.ground_sample_distance)} {self.unit} a "
+             "pixel, median"),
+            ("Distance to the object", f"{significant(self.object_distance)} {self.unit}, median"),
+        ]  # fmt: skip
+        if self.flying_height is not None:
+            height = significant(self.flying_height)
+            rows.append(("Flying height", f"{height} {self.unit} above the ground, median"))
+        if self.area is not None:
+            rows.append(("Area covered", f"{significant(self.area)} {area}, of the tie points"))
+        overlap = (f"{self.rays_per_point:.1f} rays a tie point, "
+                   f"{self.points_per_photograph:.0f} tie points a photograph")  # fmt: skip
+        if self.photographs_per_place is not None:
+            overlap += f", each place in {self.photographs_per_place:.1f} photographs"
+        rows.append(("Overlap", overlap))
+        return rows + self._position_facts()
+
+    def _position_facts(self) -> list[tuple[str, str]]:
+        if self.positions is None:
+            return [("Camera positions", "none in the files were used")]
+        axes = lambda values, sign="": " ".join(
+            f"{a} {significant(v) if not sign else f'{v:+.3g}'}"
+            for a, v in zip("XYZ", values) if np.isfinite(v)
+        )
+        found = self.positions
+        rows = [("Camera positions",
+                 f"{len(found.difference)} in the files, RMS of adjusted − given {axes(found.rms)} "
+                 f"{self.unit} (σ {axes(found.sigma)})")]  # fmt: skip
+        if np.isfinite(found.offset).any():
+            offset = " ".join(f"{a} {v:+.3g} ± {significant(s, 2)}" for a, v, s in
+                              zip("XYZ", found.offset, found.offset_sigma)
+                              if np.isfinite(v))  # fmt: skip
+            rows.append(("Their offset", f"{offset} {self.unit}, positions minus control"))
+        return rows
+
+    def as_dict(self) -> dict:
+        """The facts for JSON."""
+        number = lambda x: None if x is None or not np.isfinite(x) else float(x)
+        axes = lambda values: dict(zip("XYZ", map(number, values)))
+        found = {
+            "photographs": self.photographs,
+            "taken": None if self.taken is None else [t.isoformat() for t in self.taken],
+            "computed": self.computed.isoformat(timespec="seconds"), "system": self.system,
+        }  # fmt: skip
+        names = ("ground_sample_distance", "object_distance", "flying_height", "area",
+                 "rays_per_point", "points_per_photograph", "photographs_per_place")  # fmt: skip
+        found |= {name: number(getattr(self, name)) for name in names}
+        if self.positions is None:
+            return found | {"camera_positions": None}
+        of = self.positions
+        return found | {"camera_positions": {
+            "rms": axes(of.rms), "sigma": axes(of.sigma), "offset": axes(of.offset),
+            "offset_sigma": axes(of.offset_sigma),
+            "difference": {id: axes(d) for id, d in of.difference.items()},
+        }}  # fmt: skip
+
+
+def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) -> Block:
+    """The facts of an adjusted block.
+
+    **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
+    network, values = result.problem.network, result.image_values
+    X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
+    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    image, point = result.problem.image[used], result.problem.point[used]
+    X = result.point_values
+    known = np.isfinite(X[point]).all(1)
+    image, point = image[known], point[known]
+    depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
+    of_image = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan
+                         for k in range(len(X0))])  # fmt: skip
+    pixel = np.array([_pixel_angle(camera) for camera in network.cameras])[network.images.camera]
+    down = bool(system) and float(np.median(M[:, 2, 2])) > DOWNWARD
+    height = area = places = None
+    tie = network.points.has_role("tie")
+    ground = X[np.unique(point[tie[point]])]
+    if down and len(ground) > 3:
+        above = [X0[k, 2] - np.median(X[point[image == k], 2]) for k in range(len(X0))
+                 if (image == k).any()]  # fmt: skip
+        height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
+        footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
+        places = sum(footprints) / area if area else None
+    times = [exif[id].time for id in network.images.id if id in exif]
+    taken = sorted(t for t in times if t is not None)
+    on_ties = tie[point]
+    return Block(
+        len(X0), (taken[0], taken[-1]) if taken else None, datetime.datetime.now(),
+        system or ("local, to scale" if network.object_unit == "m" else
+                   "arbitrary: neither control, satellite positions nor scale bars"),
+        network.object_unit, float(np.nanmedian(of_image * pixel)), float(np.nanmedian(of_image)),
+        height, area, on_ties.sum() / max(len(ground), 1), on_ties.sum() / len(X0), places,
+        camera_positions(result),
+    )  # fmt: skip
+
+
+def _pixel_angle(camera: Camera) -> float:
+    """The angle of a pixel in the middle of the image."""
+    columns, rows = camera.image_size or (1, 1)
+    middle = np.array([[columns - 1, rows - 1]]) / 2 + [[0.0, 0.0], [1.0, 0.0]]
+    xy, _ = from_image_unit((camera,), np.zeros(2, int), middle, np.ones((2, 2)), "px")
+    return float(np.linalg.norm(np.diff(ideal_points(camera, xy), axis=0)))
+
+
+def _inner(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """The points within the quantiles of both coordinates."""
+    if len(xy) < 4:
+        return xy
+    low, high = np.quantile(xy, [RANGE, 1 - RANGE], axis=0)
+    return xy[((xy >= low) & (xy <= high)).all(1)]
+
+
+def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
+    """The area of the convex hull (monotone chain; Andrew 1979)."""
+    if len(xy) < 3:
+        return 0.0
+    ordered = sorted(map(tuple, xy.tolist()))
+
+    def half(points):
+        chain: list = []
+        for p in points:
+            while len(chain) > 1 and (
+                (chain[-1][0] - chain[-2][0]) * (p[1] - chain[-2][1])
+                <= (chain[-1][1] - chain[-2][1]) * (p[0] - chain[-2][0])
+            ):
+                chain.pop()
+            chain.append(p)
+        return chain[:-1]
+
+    x, y = np.array([*half(ordered), *half(ordered[::-1])]).T
+    x, y = x - x[0], y - y[0]
+    return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+
+
+def camera_positions(result: Adjustment) -> CameraPositions | None:
+    """Given positions against the adjusted ones: antennas with the shift of their system, or
+    priors of the images."""
+    network, X0 = result.problem.network, result.image_values[:, :3]
+    nothing = np.full(3, np.nan)
+    antennas = next((one for one in network.further if isinstance(one, Antennas)), None)
+    if antennas is not None:
+        row = {id: k for k, id in enumerate(network.images.id)}
+        (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
+        found = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]
+        shift = np.array([one.get("value", 0.0) for one in found])
+        sigma = np.array([one.get("sigma") or np.nan for one in found])
+        offset = np.where(np.isfinite(sigma), shift, np.nan)
+        given = zip(antennas.image, antennas.position)
+        difference = {id: X0[row[id]] + shift - X for id, X in given if id in row}
+        s = np.median(np.sqrt(np.diagonal(antennas.covariance, axis1=1, axis2=2)), axis=0)
+        return CameraPositions(difference, s, offset, sigma) if difference else None
+    images = network.images
+    given = (np.isfinite(images.sigma[:, :3]) & (images.sigma[:, :3] > 0)).all(1)
+    if not given.any():
+        return None
+    difference = {images.id[k]: X0[k] - images.position[k] for k in np.flatnonzero(given)}
+    s = np.median(images.sigma[given, :3], axis=0)
+    return CameraPositions(difference, s, nothing, nothing)

@@ -1,0 +1,129 @@
+"""The table of control and check points of a reconstruction."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.orientation.control_consistency import Assessment
+from jaxbundle.report.layout import column_decimals, fixed, significant
+
+HEADER = ("point", "rays", "dX", "dY", "dZ", "σX", "σY", "σZ", "px", "verdict")
+"""The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
+its measurements."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlPoint:
+    """A control or check point: `role` as given, whether it was `used`; rays that were used; given
+    coordinates and their σ (NaN: exact, infinite: not controlled); adjusted minus given; RMS image
+    residual, pixels; `verdict` in words. Lengths in the object unit, NaN: not there."""
+
+    id: str
+    role: str
+    used: bool
+    rays: int
+    given: Float[np.ndarray, "3"]
+    sigma: Float[np.ndarray, "3"]
+    residual: Float[np.ndarray, "3"]
+    image_residual: float
+    verdict: str
+
+    def cells(self, places: int) -> tuple[str, ...]:
+        """The row of the table as text, in the order of `HEADER`; decimal `places` of lengths."""
+        sigma = ("free" if np.isinf(s) else fixed(s, places) for s in self.sigma)
+        return (self.id, str(self.rays), *(fixed(d, places) for d in self.residual), *sigma,
+                fixed(self.image_residual, 2), self.verdict)  # fmt: skip
+
+    def numbers(self) -> dict:
+        """The row as numbers by name; None: not there."""
+        axes = lambda values: {a: float(v) if np.isfinite(v) else None
+                               for a, v in zip("XYZ", values)}  # fmt: skip
+        return {
+            "role": self.role, "used": self.used, "rays": self.rays, "given": axes(self.given),
+            "sigma": axes(self.sigma), "residual": axes(self.residual),
+            "image_residual": self.image_residual if np.isfinite(self.image_residual) else None,
+            "verdict": self.verdict,
+        }  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlTable:
+    """The `points`, where their σ come from (`sigma`, in words), further `notes`; `unit` of
+    lengths."""
+
+    points: tuple[ControlPoint, ...]
+    sigma: str
+    notes: tuple[str, ...]
+    unit: str
+
+    def rms(self, role: str) -> Float[np.ndarray, "3"]:
+        """RMS residual in X, Y, Z of the used control points, or of the check points; NaN without
+        any."""
+        if role == "check":
+            chosen = [p.residual for p in self.points if p.role == "check"]
+        else:
+            chosen = [p.residual for p in self.points if p.used]
+        there = np.array(chosen).reshape(-1, 3)
+        number = np.isfinite(there).sum(0)
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(np.where(np.isfinite(there), there**2, 0).sum(0) / number)
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """The table as text, the RMS last."""
+        places = column_decimals(np.concatenate([point.sigma for point in self.points]), 2, 4)
+        rows = [point.cells(places) for point in self.points]
+        for role, words in (("control", "RMS, used control"), ("check", "RMS, check points")):
+            found = self.rms(role)
+            if np.isfinite(found).any():
+                rows.append((words, "", *(fixed(x, places) for x in found), *[""] * 5))
+        return rows
+
+    def as_dict(self) -> dict:
+        """The table for JSON."""
+        rms = lambda role: {a: float(v) if np.isfinite(v) else None
+                            for a, v in zip("XYZ", self.rms(role))}  # fmt: skip
+        return {
+            "sigma": self.sigma, "notes": list(self.notes), "rms": rms("control"),
+            "rms_check": rms("check"), "points": {p.id: p.numbers() for p in self.points},
+        }  # fmt: skip
+
+    @property
+    def left_out(self) -> list[str]:
+        """The control points that are not used."""
+        return [p.id for p in self.points if p.role != "check" and not p.used]
+
+
+def describe_sigma(
+    given: Float[np.ndarray, "n 3"], assessed: Assessment, fixed: Sequence[str], unit: str
+) -> str:
+    """Where the σ of control come from, in one line.
+
+    **Arguments:** `given` σ, NaN: not given; `fixed`: ids of points that are held."""
+    words = []
+    unknown = np.isnan(given)
+    stated = given[np.isfinite(given)]
+    if len(stated):
+        ends = dict.fromkeys(significant(s, 2) for s in (stated.min(), stated.max()))
+        said = f"σ of control as stated ({' to '.join(ends)} {unit})"
+        if assessed.factor > 1:
+            said += (f", multiplied by {significant(assessed.factor)}: most points contradict "
+                     "each other by more than the stated σ")  # fmt: skip
+        words.append(said)
+    for k, name in ((0, "in the plane"), (2, "in height")):
+        part = unknown[:, [0, 1]] if k == 0 else unknown[:, [2]]
+        if not part.any():
+            continue
+        sigma = float(assessed.sigma[:, k][unknown[:, k]][0])
+        r = assessed.redundancy[0 if k == 0 else 1]
+        if assessed.assumed[0 if k == 0 else 1]:
+            how = ("assumed, 2 pixels on the ground, because its residuals do not show a larger "
+                   "one (state it with --control-sigma)")  # fmt: skip
+        else:
+            how = f"estimated from the residuals of control (redundancy {r:.1f})"
+        words.append(f"control without σ: {significant(sigma, 2)} {unit} {name}, {how}")
+    if fixed:
+        words.append(f"held exactly, as stated by the role fixed: {', '.join(fixed[:5])}"
+                     + (" …" if len(fixed) > 5 else ""))  # fmt: skip
+    return "; ".join(words)

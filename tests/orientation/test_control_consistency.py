@@ -1,0 +1,96 @@
+"""Leave-one-out prediction of control points, against dense elimination and on simulated blocks."""
+
+import numpy as np
+import pytest
+
+from jaxbundle.orientation.control_consistency import Discrepancies, _predict, assess
+
+ASSUMED = 0.05
+
+
+def block(n, seed, sigma=0.5, open_columns=True, planimetric=False, stated=np.nan):
+    """Discrepancies of n points of a block, 60 m wide, with 0.02 m of its own, and a shift."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(0, 60, (n, 3)) * [1, 1, 0.1]
+    d = sigma * rng.standard_normal((n, 3)) + [3.0, -2.0, 1.0]
+    C = np.einsum("ij,ab->iajb", np.eye(n), 4e-4 * np.eye(3))
+    G = np.tile(np.eye(3), (n, 1, 1))
+    if not open_columns:
+        C = C + np.einsum("a,ab->ab", np.full(3, 100.0), np.eye(3))[None, :, None, :]
+        G = np.zeros((n, 3, 0))
+    s = np.full((n, 3), stated)
+    if planimetric:
+        s[:, 2] = np.inf
+    return X, Discrepancies(d, C, s, G)
+
+
+@pytest.mark.parametrize("open_columns", [True, False])
+def test_prediction_is_that_of_an_adjustment_without_the_point(open_columns):
+    _, found = block(6, 1, open_columns=open_columns, stated=0.5)
+    e, s, _ = _predict(found, np.ones(6, bool), [2], ASSUMED)
+    keep = [k for k in range(6) if k != 2]
+    S = (found.cofactor.reshape(18, 18) + 0.25 * np.eye(18)).reshape(6, 3, 6, 3)
+    A = S[keep][:, :, keep].reshape(15, 15)
+    d = found.difference[keep].ravel()
+    c = S[2][:, keep].reshape(3, 15)
+    shift, more = np.zeros(3), 0.0
+    if open_columns:  # kriging with an unknown shift
+        G = np.tile(np.eye(3), (5, 1))
+        N = np.linalg.inv(G.T @ np.linalg.solve(A, G))
+        shift = N @ G.T @ np.linalg.solve(A, d)
+        d = d - G @ shift
+        R = np.eye(3) - c @ np.linalg.solve(A, G)
+        more = R @ N @ R.T
+    predicted = shift + c @ np.linalg.solve(A, d)
+    covariance = S[2][:, 2] - c @ np.linalg.solve(A, c.T) + more
+    np.testing.assert_allclose(e, found.difference[2] - predicted, atol=1e-9)
+    np.testing.assert_allclose(s, np.sqrt(np.diag(covariance)), rtol=1e-9)
+
+
+def test_sigma_is_estimated_and_good_points_are_kept():
+    kept, sigmas = 0, []
+    for seed in range(30):
+        _, found = block(9, seed)
+        result = assess(found, ASSUMED)
+        kept += result.used.all()
+        sigmas.append(result.sigma[0])
+    # at 5 %: 25 or fewer of 30 have a probability of 0.3 %
+    assert kept > 25
+    mean = np.sqrt(np.mean(np.square(sigmas), 0))
+    np.testing.assert_allclose(mean, 0.5, rtol=0.12)
+
+
+@pytest.mark.parametrize("planimetric, stated", [(True, np.nan), (False, np.nan), (False, 0.5)])
+def test_a_bad_point_is_named_and_hardly_ever_a_good_one(planimetric, stated):
+    others = 0
+    for seed in range(12):
+        _, found = block(9, seed, planimetric=planimetric, stated=stated)
+        found.difference[5, :2] += [4.5, -3.0]
+        result = assess(found, ASSUMED)
+        left = np.flatnonzero(~result.used).tolist()
+        assert 5 in left and result.probability[5] < 5e-3 and not any(result.assumed)
+        assert abs(result.error[5, 0] - 4.5) < 3 * 0.6
+        others += len(left) > 1
+    assert others <= 2  # at 5 %: more than 2 of 12 have a probability of 2 %
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_exchanged_points_do_not_hide_each_other(seed):
+    X, found = block(9, seed, sigma=0.3)
+    i, j = 2, 6
+    X[j] = X[i] + [4.0, 3.0, 0.2]
+    found.difference[i] += X[i] - X[j]
+    found.difference[j] += X[j] - X[i]
+    assert np.flatnonzero(~assess(found, ASSUMED).used).tolist() == [i, j]
+
+
+def test_sigma_that_nothing_agrees_with_is_multiplied():
+    _, found = block(8, 3, sigma=1.0, stated=0.02)
+    result = assess(found, ASSUMED)
+    assert result.used.sum() >= 7 and result.factor > 20
+
+
+def test_few_points_have_an_assumed_sigma():
+    _, found = block(2, 0)
+    result = assess(found, ASSUMED)
+    assert all(result.assumed) and result.used.all() and np.all(result.sigma == ASSUMED)

@@ -1,0 +1,214 @@
+"""Control and satellite positions of a simulated drone block: what is used, named and written."""
+
+import csv
+import datetime
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block, swapped
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.cli.outputs import write_targets
+from jaxbundle.cli.reconstruct_files import write_reconstruction
+from jaxbundle.errors import InputError
+from jaxbundle.photographs.exif import Exif
+from jaxbundle.reconstruction import georeferencing
+from jaxbundle.reconstruction.block import CameraPositions, describe_block
+from jaxbundle.reconstruction.georeferencing import georeference
+from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+
+SIGMA = 0.5
+"""Of handheld control, metres."""
+
+
+def controlled(drone, given):
+    """The final adjustment, the table by name, and the whole table."""
+    block = drone.block(given.positions is not None)
+    final, table = georeference(block, given, 0.001, lambda stage: None)
+    return final.adjustment, {p.id: p for p in table.points}, table
+
+
+@pytest.fixture(scope="module")
+def drone():
+    return drone_block(4)
+
+
+@pytest.fixture(scope="module")
+def handheld(drone):
+    return drone.truth + SIGMA * np.random.default_rng(8).standard_normal((CONTROL, 3))
+
+
+@pytest.fixture(scope="module")
+def good(drone, handheld):
+    return controlled(drone, drone.given(handheld))
+
+
+def test_positions_are_observed_with_an_offset(drone, good):
+    result, _, table = good
+    assert isinstance(result, Adjustment) and result.network.datum == "control"
+    positions = describe_block(result, {}, "EPSG:32611").positions
+    assert len(positions.difference) == 9
+    # three σ of the offset; the RMS of nine positions
+    assert np.all(np.abs(positions.offset - OFFSET) < 3 * positions.offset_sigma + 0.3)
+    assert np.all(positions.rms / SATELLITE < 1.8) and np.all(positions.rms / SATELLITE > 0.4)
+    assert "estimated from the residuals" in table.sigma
+
+
+def test_sigma_of_control_is_estimated_and_used(good):
+    _, points, _ = good
+    assert all(p.used for p in points.values())
+    sigma = points["gcp00"].sigma
+    # its own relative σ is 1/√(2·redundancy), about 0.2 in the plane and 0.3 in height
+    assert 0.25 < sigma[0] < 0.9 and 0.2 < sigma[2] < 1.1
+
+
+def test_the_ground_is_within_its_sigma(drone, good):
+    result, points, _ = good
+    X = np.array([result.point_values[result.problem.network.points.id.index(n)] for n in NAMES])
+    sigma = np.sqrt(np.diagonal(result.point_covariance, axis1=1, axis2=2))
+    rows = [result.problem.network.points.id.index(n) for n in NAMES]
+    assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["positions", "no positions"])
+def spoilt(drone, handheld, request):
+    """With a wrong name, a bad point and a check point."""
+    named, row = swapped(drone.named, "gcp04", "gcp00")
+    X = handheld.copy()
+    X[6] += [2.9, -2.6, 0.0]
+    roles = tuple("check" if k == 8 else "control" for k in range(CONTROL))
+    given = drone.given(X, roles=roles, positions=request.param, named=named)
+    return drone.images[named.image[row]], *controlled(drone, given)
+
+
+def test_a_wrong_name_and_a_bad_point_are_named(spoilt):
+    image, _, points, table = spoilt
+    assert table.left_out == ["gcp06"]
+    assert "the other points and the photographs put it" in points["gcp06"].verdict
+    assert points["gcp04"].used and image in points["gcp04"].verdict
+    assert "the place of gcp00: a wrong name" in points["gcp04"].verdict
+    others = [p.verdict for id, p in points.items() if id not in ("gcp04", "gcp06", "gcp08")]
+    assert set(others) == {"used"}
+    # compared although not used: the error of the point, with that of the others
+    assert np.linalg.norm(points["gcp06"].residual[:2] + [2.9, -2.6]) < 3 * SIGMA
+
+
+def test_stated_sigma_is_not_refused(drone, handheld):
+    named, _ = swapped(drone.named, "gcp04", "gcp00")
+    X = handheld.copy()
+    X[6] += [4.9, -4.6, 0.0]
+    _, points, table = controlled(drone, drone.given(X, SIGMA, named=named))
+    assert table.left_out == ["gcp06"] and "as stated (0.50 m)" in table.sigma
+    np.testing.assert_allclose(points["gcp01"].sigma, SIGMA)
+
+
+def test_exchanged_coordinates_are_named(drone, handheld, monkeypatch):
+    X = handheld.copy()
+    X[[2, 7]] = X[[7, 2]]
+    block = drone.block()
+    # only what is chosen: the adjustment with control is left out
+    monkeypatch.setattr(georeferencing, "adjust_determined",
+                        lambda network, **_: (block.adjustment, network, None))  # fmt: skip
+    _, points, table = controlled(drone, drone.given(X))
+    assert table.left_out == ["gcp02", "gcp07"]
+    assert "it fits the coordinates of gcp07" in points["gcp02"].verdict
+
+
+def test_heights_of_zero_are_unknown(drone, handheld):
+    X = handheld * [1, 1, 0]
+    result, points, table = controlled(drone, drone.given(X))
+    assert "the heights of all control points are 0" in table.notes[0]
+    assert "unknown" in table.notes[0]
+    assert all(p.used and np.isnan(p.residual[2]) for p in points.values())
+    positions = describe_block(result, {}, "x").positions
+    # the heights are those of the satellite positions: no offset is estimated
+    assert np.isnan(positions.offset[2]) and np.isfinite(positions.offset[:2]).all()
+    k = result.problem.network.points.id.index("gcp01")
+    assert abs(result.point_values[k, 2] - drone.truth[1, 2] - OFFSET[2]) < 3 * SATELLITE[2]
+
+
+def test_check_points_are_compared_and_never_used(drone, handheld):
+    X = handheld.copy()
+    X[3] += [40.0, 0.0, 0.0]
+    roles = tuple("check" if k in (3, 8) else "control" for k in range(CONTROL))
+    result, points, table = controlled(drone, drone.given(X, roles=roles))
+    assert {"gcp03", "gcp08"}.isdisjoint(result.problem.network.points.id)
+    assert points["gcp03"].residual[0] == pytest.approx(-40.0, abs=4 * SIGMA)
+    assert points["gcp03"].verdict == "check" and not points["gcp03"].used
+    assert np.isfinite(table.rms("check")).all() and table.rms("check")[0] > 20
+
+
+def test_positions_that_contradict_control_are_told_with_numbers():
+    difference = {str(k): np.array([0.5, -9.0 + 18 * (k % 2), 1.0]) for k in range(4)}
+    sigma, nothing = np.array([1.0, 1.0, 2.0]), np.full(3, np.nan)
+    positions = CameraPositions(difference, sigma, np.array([154.0, 2.0, 31.0]), sigma)
+    offset, rms = positions.contradictions(np.array([10.0, 10.0, 100.0]), "m")
+    assert "offset in X is +154.0 m, its prior σ 10 m" in offset
+    assert "RMS in Y 9.00 m, their σ 1.00 m" in rms
+    good = CameraPositions({"1": sigma}, sigma, nothing, nothing)
+    assert good.contradictions(np.array([10.0, 10.0, 100.0]), "m") == []
+
+
+def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
+    roles = ("control", "control", *["check"] * (CONTROL - 2))
+    with pytest.raises(InputError, match="expected 3, got 2"):
+        controlled(drone, drone.given(handheld, roles=roles, positions=False))
+
+
+def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
+    image, result, _, table = spoilt
+    positions = any(one.TABLE == "antennas" for one in result.network.further)
+    time = datetime.datetime(2026, 5, 4, 10, 30)
+    exif = {id: Exif((2000, 1500), time=time) for id in drone.images}
+    facts = describe_block(result, exif, "EPSG:32611")
+    part = Part("part 1", result, {}, {}, facts, table)
+    found = Reconstruction((part,), {}, ("a note",), (), {}, "quarry")
+    folder = tmp_path / "out"
+    write_reconstruction(found, "", folder, True, False, False)
+    text = (folder / "report.txt").read_text()
+    page = (folder / "report.html").read_text()
+    told = json.loads((folder / "result.json").read_text())["reconstruction"]
+    for said in ("quarry", "2026-05-04", "EPSG:32611", "Ground sample distance", "Flying height",
+                 "Area covered", "Overlap", "Camera positions", "gcp06", "a wrong name",
+                 image, "estimated from the residuals"):  # fmt: skip
+        assert said in " ".join(text.split()) and said in page, said
+    assert told["name"] == "quarry"
+    (one,) = told["parts"]
+    assert one["block"]["ground_sample_distance"] == pytest.approx(60.0 / 1500.0, rel=0.1)
+    assert one["block"]["flying_height"] == pytest.approx(60.0, rel=0.1)
+    # 36 × 28 m of stations, and half a footprint of 80 × 60 m in any direction around them
+    assert 36 * 28 < one["block"]["area"] < 116 * 108
+    control = one["control"]["points"]
+    assert not control["gcp06"]["used"] and control["gcp08"]["verdict"] == "check"
+    assert control["gcp01"]["residual"]["X"] is not None
+    if positions:
+        assert set(one["block"]["camera_positions"]["difference"]) == set(drone.images)
+    with (folder / "control.csv").open() as file:
+        rows = {row["id"]: row for row in csv.DictReader(file)}
+    assert rows["gcp06"]["used"] == "False" and "left out" in rows["gcp06"]["verdict"]
+
+
+def test_the_written_network_gives_the_same_numbers(good, tmp_path):
+    result, _, _ = good
+    write_targets(result, "", tmp_path / "out", brief=True, plots=False)
+    tables = {p.name for p in (tmp_path / "out" / "network").iterdir()}
+    assert {"antennas.csv", "camera_parameters.csv"} <= tables
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxbundle", "adjust", tmp_path / "out" / "network", "--json",
+         tmp_path / "again.json", "--quiet"], capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    again = json.loads((tmp_path / "again.json").read_text())
+    before = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert again["redundancy"] == before["redundancy"] and again["datum"] == "control"
+    assert again["sigma0"] == pytest.approx(before["sigma0"], rel=1e-8)
+    pairs = [(row[n], again["further_unknowns"]["GNSS strip"]["all"][n])
+             for row in before["further_unknowns"]["GNSS strip"].values() for n in row]  # fmt: skip
+    pairs += [(point[axis], again["points"][id][axis]) for id, point in before["points"].items()
+              for axis in "XYZ"]  # fmt: skip
+    for one, other in pairs:
+        assert other["value"] == pytest.approx(one["value"], abs=1e-5)
+        assert other["sigma"] == pytest.approx(one["sigma"], rel=1e-5)
