@@ -16,7 +16,7 @@ from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
 from jaxbundle.statistics.further import estimates
-from jaxbundle.statistics.inspection import OfNetwork
+from jaxbundle.statistics.inspection import Tested
 
 
 def cameras(adjustment) -> dict[str, dict]:
@@ -136,7 +136,7 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     found = adjustment.reliability
     parts = observations(adjustment.problem, *found)
     return concatenate([
-        residual_rows(adjustment, kind, image, point, axes, weight, OfNetwork(*tested))
+        residual_rows(adjustment, kind, image, point, axes, weight, Tested(*tested))
         for kind, image, point, axes, weight, *tested in parts
     ])  # fmt: skip
 
@@ -208,10 +208,10 @@ def checks(adjustment) -> dict[str, np.ndarray]:
     return table | {"rays": found.rays}
 
 
-def residual_rows(adjustment, kind, image, point, axes, weight, tested):
+def residual_rows(adjustment, kind, image, point, axes, weight, tested: Tested):
     """The rows of one kind of observation [observations × axes] as columns, without weightless
-    rows. `weight`: 1/σ; `tested`: its columns of `Reliability`, by name."""
-    v, gain, r, w, hat = (np.asarray(getattr(tested, name)) for name in OfNetwork._fields)
+    rows. `weight`: 1/σ."""
+    v, gain, r, w, hat = map(np.asarray, tested)
     weight = np.asarray(weight)
     free = np.clip(1 - hat, 0, 1)
     unit = np.ones(weight.shape[1])

@@ -24,6 +24,16 @@ class OfNetwork(NamedTuple):
     hat: Rows
 
 
+class Tested(NamedTuple):
+    """The same columns for one kind of observation, [observations, axes]."""
+
+    residual: np.ndarray
+    gain: np.ndarray
+    redundancy: np.ndarray
+    w: np.ndarray
+    hat: np.ndarray
+
+
 class _OfTables(eqx.Module):
     """A function of a network's values as one of the engine's tables."""
 

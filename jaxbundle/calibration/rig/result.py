@@ -26,7 +26,7 @@ from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.further.exterior_priors import exterior
 from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
-from jaxbundle.statistics.inspection import OfNetwork
+from jaxbundle.statistics.inspection import Tested
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -133,13 +133,13 @@ class RigCalibration:
         parts = [result_tables.residual_rows(
             self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
             rows([weight(o) for o in range(len(rig.sets))]),
-            OfNetwork(*(rows(getattr(found, name)) for name in OfNetwork._fields)),
+            Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
         )]  # fmt: skip
         if rig.point_sigma is not None:
             o, blank = len(rig.sets), np.full(len(ids), "", dtype=object)
             parts.append(result_tables.residual_rows(
                 self, "control", blank, ids, tuple("XYZ"), weight(o),
-                OfNetwork(*(getattr(found, name)[o] for name in OfNetwork._fields)),
+                Tested(*(getattr(found, name)[o] for name in Tested._fields)),
             ))  # fmt: skip
         return result_tables.concatenate(parts)
 
