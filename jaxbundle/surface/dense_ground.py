@@ -163,7 +163,8 @@ def _to_other(base, other, X) -> Float[np.ndarray, "n 2 2"]:
 def _parameter(base, found: Intersected, matched):
     """q of points on their lines of sight in the base, and its σ; NaN: none."""
     X = np.where(matched[:, None], found.X, np.nan)
-    known = np.isfinite(np.concatenate([X, found.covariance.reshape(-1, 9)], 1)).all(1)
+    everything = np.concatenate([X, found.covariance.reshape(-1, 9)], 1)
+    known = np.all(np.isfinite(everything), axis=1)
     safe = np.where(known[:, None], X, found.X[known][:1] if known.any() else 0.0)
     d = line_of_sight(base.derivative(safe))
     with np.errstate(invalid="ignore"):
