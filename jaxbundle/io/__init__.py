@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from jaxbundle.io.results.dxf import write_dxf as write_dxf
     from jaxbundle.io.results.ply import write_ply as write_ply
     from jaxbundle.io.results.result_project import adjusted_network as adjusted_network
+    from jaxbundle.io.results.result_project import readjustable_network as readjustable_network
 
 _HOME = {
     "jaxbundle.io.boards.corners": ("read_corners", "write_corners"),
@@ -65,6 +66,6 @@ _HOME = {
     "jaxbundle.io.results.coordinates": ("write_coordinates",),
     "jaxbundle.io.results.dxf": ("write_dxf",),
     "jaxbundle.io.results.ply": ("write_ply",),
-    "jaxbundle.io.results.result_project": ("adjusted_network",),
+    "jaxbundle.io.results.result_project": ("adjusted_network", "readjustable_network"),
 }
 __getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)  # pyright: ignore[reportUnsupportedDunderAll]

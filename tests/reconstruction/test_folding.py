@@ -78,11 +78,14 @@ def test_photographs_from_other_directions_and_distances_are_not_compared(whole)
 
 
 def test_a_blurred_photograph_with_few_points_is_no_contradiction(whole):
-    """Its points are those of its neighbours, but it lacks most of theirs: of five pairs of 15."""
+    """Its points are those of its neighbours, but it lacks most of theirs. Of both directions
+    together five pairs of 15 have too few, which would refuse the result."""
     rays = whole.network.observations
-    kept = (rays.image != 0) | (rays.point % 12 == 0)
+    kept = (rays.image != 0) | (rays.point % 20 == 0)
     blurred = adjust(whole.network.replace(observations=rays.take(kept)))
     expected, shared = count_shared_points(blurred, blurred.network)
-    assert (shared[1:, 0] < 0.1 * expected[1:, 0]).all() and expected[0, 1] == 16
+    assert expected[0, 1] == shared[0, 1] == 10
+    common, number = (a + a.T for a in (shared, expected))
+    assert (common[1:, 0] < 0.1 * number[1:, 0]).all()
     names = blurred.network.images.id
     assert refuse_superimposed(blurred, blurred.network, ALL, names) == []

@@ -165,7 +165,7 @@ def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     exif = {id: Exif((2000, 1500), time=time) for id in drone.images}
     facts = describe_block(result, exif, "EPSG:32611")
     part = Part("part 1", result, {}, {}, facts, table)
-    found = Reconstruction((part,), {}, ("a note",), (), {}, "quarry")
+    found = Reconstruction((part,), {}, ("a note",), (), {}, name="quarry")
     folder = tmp_path / "out"
     write_reconstruction(found, "", folder, True, False, False)
     text = (folder / "report.txt").read_text()
