@@ -146,7 +146,7 @@ def test_results_can_be_printed_in_python(project):
 
 
 def test_utf8_is_not_changed(convergent4, monkeypatch):
-    text = "σ0 0.631 µm, χ², vᵀPv, é, \udcff"
+    text = "σ̂0 0.631 µm, χ², vᵀPv, é, \udcff"
     monkeypatch.setattr(sys, "stdout", Recorder("utf-8", []))
     assert terminals.for_output(text) == text and "σ0" in str(convergent4)
     monkeypatch.setattr(sys, "stdout", Recorder("latin-1", []))
