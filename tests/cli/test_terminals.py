@@ -35,6 +35,7 @@ for command in sys.argv[1].split():
 PRINTED = """
 import sys, jaxbundle
 jaxbundle.enable_x64(compile_quickly=True)
+jaxbundle.keep_programs()
 result = jaxbundle.adjust(jaxbundle.read_network(sys.argv[1]))
 assert sys.stdout.errors == "strict"
 print(result)
