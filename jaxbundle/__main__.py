@@ -9,7 +9,6 @@ import os
 import sys
 
 from jaxbundle.system.interrupts import handle_interrupts, set_status
-from jaxbundle.system.terminals import write_everywhere
 
 GC_THRESHOLDS = 50_000, 20, 100
 """Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
@@ -19,6 +18,8 @@ permanent: with the default thresholds the collector takes a sixth of the tracin
 def main() -> None:
     """Run the command line, as the whole of this process."""
     handle_interrupts()
+    from jaxbundle.system.terminals import write_everywhere
+
     write_everywhere()
     gc.set_threshold(*GC_THRESHOLDS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -15,7 +15,7 @@ ASCII = {
     "σ": "s", "µ": "u", "μ": "u", "·": "*", "−": "-", "–": "-", "—": "-", "─": "-", "━": "-",
     "×": "x", "±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "√": "sqrt", "∞": "inf",
     "→": "->", "←": "<-", "°": "deg", "′": "'", "⁄": "/", "∂": "d", "∇": "grad", "∠": "angle",
-    "λ": "lambda",
+    "λ": "lambda", "ŝ": "s",
 }  # fmt: skip
 """As `sX` is the column of σX in tables: one letter, so that columns stay aligned."""
 
@@ -87,5 +87,7 @@ def _in_ascii(letter: str) -> str:
     name = unicodedata.name(letter, "")
     if name.startswith("GREEK"):
         return name.split(" WITH ")[0].split()[-1].lower()
-    is_letter = unicodedata.category(letter)[0] in "LMNC"
-    return letter.encode("ascii", "backslashreplace").decode() if is_letter else "?"
+    category = unicodedata.category(letter)
+    if category == "Mn":  # the ̂ of an estimate
+        return ""
+    return letter.encode("ascii", "backslashreplace").decode() if category[0] in "LMNC" else "*"

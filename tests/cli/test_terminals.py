@@ -35,6 +35,7 @@ for command in sys.argv[1].split():
 PRINTED = """
 import sys, jaxbundle
 jaxbundle.enable_x64(compile_quickly=True)
+jaxbundle.keep_programs()
 result = jaxbundle.adjust(jaxbundle.read_network(sys.argv[1]))
 assert sys.stdout.errors == "strict"
 print(result)
@@ -146,7 +147,7 @@ def test_results_can_be_printed_in_python(project):
 
 
 def test_utf8_is_not_changed(convergent4, monkeypatch):
-    text = "σ0 0.631 µm, χ², vᵀPv, é, \udcff"
+    text = "σ̂0 0.631 µm, χ², vᵀPv, é, \udcff"
     monkeypatch.setattr(sys, "stdout", Recorder("utf-8", []))
     assert terminals.for_output(text) == text and "σ0" in str(convergent4)
     monkeypatch.setattr(sys, "stdout", Recorder("latin-1", []))
