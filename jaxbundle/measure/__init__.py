@@ -4,9 +4,11 @@ Pixel (0, 0) is the centre of the upper-left pixel, u to the right, v down; a ph
 [rows, columns] of grey values.
 """
 
+from jaxbundle.measure.board_points import BoardPoints as BoardPoints
 from jaxbundle.measure.boards import Board as Board
 from jaxbundle.measure.clouds import filter_cloud as filter_cloud
 from jaxbundle.measure.corners import find_board as find_board
+from jaxbundle.measure.corners import find_board_points as find_board_points
 from jaxbundle.measure.ellipses import Ellipse as Ellipse
 from jaxbundle.measure.ellipses import circle_centre_shift as circle_centre_shift
 from jaxbundle.measure.ellipses import fit_ellipse as fit_ellipse

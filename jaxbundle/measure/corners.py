@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
+from jaxbundle.measure.board_points import BoardPoints, make_points
 from jaxbundle.measure.boards import MARKER, SMALLEST_SIDE, Board
 from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
-from jaxbundle.measure.tag_grids import BoardPoints, find_tags, get_dictionary, make_points
+from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.photographs.opencv import need_opencv
 

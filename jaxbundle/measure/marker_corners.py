@@ -70,6 +70,8 @@ def fit_marker_corners(
     for coarse in (True, False):
         edges, fits, xy, covariance = _fit_sides(grey, xy, cells, border, blur, curvature, coarse)
         before, blur = blur, _blur_of(fits)
+        lost = ~_is_near(xy, near)
+        xy[lost] = near[lost]
     # where the cells are narrow, or the blur was not the expected one, once more from there
     strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
     again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < SURE * blur)).any(1)
@@ -79,6 +81,8 @@ def fit_marker_corners(
         _put(edges, of, parts[0])
         _put(fits, of, parts[1])
         xy[again], covariance[again] = parts[2:]
+        lost |= ~_is_near(xy, near)
+        xy[lost] = near[lost]
     shift = edge_shift(grey, xy, cells, fits, curvature)
     if shift is not None:
         fits = _shifted(fits, *shift)
@@ -91,10 +95,16 @@ def fit_marker_corners(
     why[~(solved & np.roll(solved, 1, 1))] = NO_EDGE
     narrow = (strip < NARROWEST).reshape(number, 4)
     why[narrow | np.roll(narrow, 1, 1)] = TOO_SMALL
-    side = np.linalg.norm(near - np.roll(near, 1, 1), axis=2).min(1)
-    moved = np.linalg.norm(xy - near, axis=2)
-    why[~(moved < np.maximum(0.15 * side, 2.5)[:, None])] = NO_EDGE
+    why[~_is_near(xy, near)] = NO_EDGE
+    why[lost] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
+
+
+def _is_near(xy, near):
+    """Whether corners are where the marker was found: within 2.5 pixels or a seventh of its side,
+    less than a cell."""
+    side = np.linalg.norm(near - np.roll(near, 1, 1), axis=2).min(1)
+    return np.linalg.norm(xy - near, axis=2) < np.maximum(side / 7, 2.5)[:, None]
 
 
 def _fit_sides(grey, xy, cells, border, blur, curvature, coarse):

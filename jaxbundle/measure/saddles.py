@@ -35,8 +35,8 @@ FIRST_BLUR = 1.0
 """τ before it is estimated."""
 SHARPEST, SOFTEST = 0.35, 4.0
 """Limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29."""
-SOFT = 2.8
-"""τ from which the image is reduced."""
+SOFT, SMALLEST_IMAGE = 2.8, 64
+"""τ from which the image is reduced, and the rows or columns that it must have."""
 NARROWEST = 1.5
 """Narrowest strip or window, in τ: below, blurred edges are one."""
 WIDE = 4.5
@@ -80,7 +80,7 @@ def fit_saddles(
     found, blur = _fit(grey, near, lines, strips, LARGEST_HALF)
     if COMPLETE * np.median(blur) > LARGEST_HALF:
         found, blur = _fit(grey, near, lines, strips, COMPLETE * np.median(blur))
-    if np.median(blur) < SOFT:
+    if np.median(blur) < SOFT or min(grey.shape) < SMALLEST_IMAGE:
         return found
     # an image blurred over several pixels loses nothing in half the pixels, and the windows then
     # contain the whole change

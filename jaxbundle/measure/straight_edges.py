@@ -306,10 +306,12 @@ def _consistent_parts(J, r, weight, part):
     shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
     freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
     noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))[:, None]
-    z = np.where(known, shift * np.sqrt(information) / noise, np.nan)
-    with np.errstate(all="ignore"):
-        spread = 1.4826 * np.nanmedian(np.abs(z), axis=1, keepdims=True)
-    good = known & (np.abs(z) < OUTLIER * np.maximum(np.nan_to_num(spread), 1.0))
+    z = shift * np.sqrt(information) / noise
+    # the median over the known parts: unknown ones come last
+    order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)
+    middle = np.maximum(known.sum(1) - 1, 0) // 2
+    spread = 1.4826 * np.take_along_axis(order, middle[:, None], 1)
+    good = known & (np.abs(z) < OUTLIER * np.maximum(spread, 1.0))
     spare = good.sum(1) - 3
     chi2 = np.where(good, z, 0.0) ** 2
     excess = np.sqrt(chi2.sum(1) / np.maximum(spare, 1))

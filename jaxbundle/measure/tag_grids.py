@@ -8,16 +8,15 @@ left, and borders of one bit, are recognised.
 Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
 """
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.errors import InputError
+from jaxbundle.measure.board_points import BoardPoints, make_points
 from jaxbundle.measure.boards import MARKER, Board
-from jaxbundle.measure.corner_quality import TOO_SMALL
-from jaxbundle.measure.saddles import Saddles, fit_saddles
+from jaxbundle.measure.saddles import fit_saddles
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
@@ -29,29 +28,6 @@ NEIGHBOURS = 9
 """Tags whose middles give the places of the corners of a tag."""
 LARGEST_OFFSET = 0.25
 """Largest distance of a corner from its place by the homography, in sides of its tag."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BoardPoints:
-    """The points of a board in a photograph, in the order of `Board.ids`: pixels and their
-    covariance, NaN for missing points; `negative`: light squares on dark ground."""
-
-    xy: Float[np.ndarray, "points 2"]
-    covariance: Float[np.ndarray, "points 2 2"]
-    negative: bool = False
-
-
-def make_points(fits: Saddles, rows, board: Board) -> BoardPoints:
-    """The points in these rows of a board; those that could not be measured are missing.
-
-    **Raises:** `InputError` if fewer than four are left."""
-    good = fits.why == ""
-    if good.sum() < min(4, len(board.ids)):
-        reasons = sorted({why for why in fits.why if why}) or [TOO_SMALL]
-        raise InputError(f"the points of the {board} cannot be measured: {' or '.join(reasons)}")
-    xy, covariance = np.full((len(board.ids), 2), np.nan), np.full((len(board.ids), 2, 2), np.nan)
-    xy[rows[good]], covariance[rows[good]] = fits.xy[good], fits.covariance[good]
-    return BoardPoints(xy, covariance)
 
 
 def get_dictionary(name: str) -> Any:

@@ -227,6 +227,31 @@ def test_a_view_in_the_wrong_order_is_left_out():
     assert held.parameters["fy"] == 621.0 and held.parameters["k2"] == 0
 
 
+@pytest.mark.parametrize("tilt, distances, said", [
+    (0, (0.5, 0.5), "all photographs look straight at the board"),
+    (25, (0.5, 0.8), "all photographs show the board tilted alike"),
+])  # fmt: skip
+def test_views_that_determine_no_camera_say_why(tilt, distances, said):
+    """Weak, and why; never "iteration limit" with an RMS of NaN."""
+    kappa = np.arange(12) * 30 if tilt == 0 else np.zeros(12)
+    poses = [render.pose(tilt, 0, k, (0.12, 0.075), d)
+             for k, d in zip(kappa, np.linspace(*distances, 12))]  # fmt: skip
+    xy = taken.corners(render.LENS, poses)
+    xy = xy + 0.05 * np.random.default_rng(0).normal(size=xy.shape)
+    views = dataclasses.replace(simulated(), xy=xy)
+    with pytest.raises(NotSolvedError, match=said) as error:
+        calibrate(views, cross_validation=False)
+    assert "iteration limit" not in str(error.value)
+
+
+def test_a_board_seen_as_in_a_mirror_in_every_photograph_is_reported():
+    views = simulated()
+    xy = views.xy.reshape(12, 6, 9, 2)[:, :, ::-1].reshape(12, 54, 2)
+    found = calibrate(dataclasses.replace(views, xy=xy), cross_validation=False)
+    assert any("from behind, as in a mirror" in said for said in found.adjustment.warnings)
+    assert found.parameters["fx"] == pytest.approx(620, abs=3)
+
+
 def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     board = taken.BOARD
     good, bad = sorted(folder.glob("photo_*.png")), [folder / "text.jpg", folder / "grey.png"]
