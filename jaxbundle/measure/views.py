@@ -4,7 +4,7 @@ import dataclasses
 import glob
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -21,7 +21,10 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
+from jaxbundle.types import Progress
 
+SEARCHING = "searching the board"
+"""The stage in reports of progress."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
 """Suffixes of photographs in a folder."""
 SAME, ALIKE = 0.05, 0.8
@@ -121,11 +124,11 @@ def photographs(given: Sequence[str | Path]) -> list[Path]:
 def measure_boards(
     paths: Sequence[str | Path],
     board: Board,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> BoardViews:
     """Find a board in photographs.
 
-    **Arguments:** `paths`: files, patterns, folders; `progress(done, total)`.
+    **Arguments:** `paths`: files, patterns, folders; `progress(stage, done, total)`.
 
     **Returns:** the views of the board with the most frequent image size.
 
@@ -142,7 +145,7 @@ def measure_boards(
         for done, (name, look) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
             looks[name] = look
             if progress is not None:
-                progress(done, len(file_of))
+                progress(SEARCHING, done, len(file_of))
     views = collect_views(file_of, looks, board)
     return dataclasses.replace(views, warnings=_part_of_a_larger(file_of, views.names, board))
 

@@ -42,7 +42,6 @@ from jaxbundle.tiepoints.calibration import start_cameras
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
-    Tell,
     detect,
     match,
     prepare,
@@ -53,6 +52,7 @@ from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
+from jaxbundle.types import Progress
 
 DEFAULT = Settings()
 NAMED = 99
@@ -108,14 +108,14 @@ def reconstruct(
     camera: Camera | None = None,
     settings: Settings = DEFAULT,
     store: Path | None = None,
-    tell: Tell = lambda stage, done, total: None,
+    progress: Progress = lambda stage, done, total: None,
     control: Control | None = None,
     distances: Sequence[dict] = (),
 ) -> Reconstruction:
     """Orient photographs by their content, with self-calibration.
 
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
-    all; `store`: folder for features and matches; `tell(stage, done, total)`;
+    all; `store`: folder for features and matches; `progress(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
     `distances`: rows `from`, `to`, `value`, `sigma` between named points.
 
@@ -139,7 +139,7 @@ def reconstruct(
     extra = Extra(named, control and control.points, tuple(distances),
                   positions and positions[:2], attitudes)  # fmt: skip
     kept = Store(store, settings.detection)
-    making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
+    making = _Making(photographs, left_out, cameras, settings, kept, progress, extra)
     making.notes += notes
     return making.run()
 
