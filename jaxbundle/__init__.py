@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from jaxbundle.system.configuration import join_processes as join_processes
     from jaxbundle.system.configuration import keep_programs as keep_programs
     from jaxbundle.system.configuration import use_cores as use_cores
+    from jaxbundle.system.progress import show_progress as show_progress
 
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
@@ -87,6 +88,7 @@ _HOME = {
     ),
     "jaxbundle.cameras": ("CameraModel",),
     "jaxbundle.system.configuration": ("join_processes", "keep_programs", "use_cores"),
+    "jaxbundle.system.progress": ("show_progress",),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.float64": ("enable_x64",),
     "jaxbundle.adjustment.gradients": ("check_gradients",),

@@ -12,7 +12,7 @@ cameras.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -50,6 +50,7 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import Progress
 
 OF_A_START = ("quaternion", "shift")
 """Poses in the form of the solver, only for data snooping."""
@@ -74,7 +75,7 @@ def calibrate_batch(
     snooping: str | None = None,
     significance: float = 0.001,
     threads: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> BatchCalibration:
     """Calibrate many cameras independently from views of points with known coordinates.
 
@@ -97,7 +98,7 @@ def calibrate_batch(
       probability of removing anything from a camera without blunders; before that, points more than
       one image size outside the image.
     - `threads`: portions solved at the same time on a CPU; default: the number of cores.
-    - `progress(done, total)`: called after every portion.
+    - `progress(stage, done, total)`: called after every portion.
 
     **Returns:** a `BatchCalibration`; check `status` first.
 
@@ -130,7 +131,7 @@ def calibrate_batch(
             parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
             done += len(portion.cameras)
             if progress is not None:
-                progress(done, len(batch))
+                progress("calibrating", done, len(batch))
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     if snooping is not None:

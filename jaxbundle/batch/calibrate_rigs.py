@@ -1,7 +1,7 @@
 """`calibrate_rigs`: many rigs, moving cameras, or cameras of any model, each its own network."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.build import make_further
 from jaxbundle.network.columns import did_you_mean
+from jaxbundle.types import Progress
 
 SECTIONS = ("rolling_shutter", "rig")
 """Sections of a project that the rigs of a batch may have."""
@@ -78,7 +79,7 @@ def calibrate_rigs(
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> RigBatch:
     """Calibrate many rigs from simultaneous views of points with known coordinates.
 
@@ -98,7 +99,7 @@ def calibrate_rigs(
     - `sigma_image`: a priori σ of an image coordinate, pixels; it matters beside the priors of
       velocities and splines, whose σ are multiplied by σ0 as all others.
     - `snooping`: `"pope"`: exclude epochs that contradict the mounting, then blunders, rig by rig.
-    - `progress(part)`: the fraction done.
+    - `progress(stage, done, total)`: rigs done.
 
     **Returns:** a `RigBatch`; check `status` first.
 
@@ -117,7 +118,12 @@ def calibrate_rigs(
         expected = "true or false [rigs, cameras, epochs, points]"
         visible = numeric_array("visible", visible, expected, truths=True)
     rigs = rigs_of_arrays(points, xy.astype(float), image_size, visible, cameras)
-    solved = solve_rigs(rigs, settings, progress or (lambda part: None))
+
+    def tell(part: float) -> None:
+        if progress is not None:
+            progress("calibrating", round(part * len(rigs)), len(rigs))
+
+    solved = solve_rigs(rigs, settings, tell)
     return RigBatch(tuple(row for row, _ in solved), tuple(found for _, found in solved))
 
 

@@ -10,7 +10,7 @@ and the fingerprint of its `data`; lines with other ones are not accepted as res
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.measure.boards import Board
+from jaxbundle.types import Progress
 
+STAGE = "calibrating"
+"""The stage in reports of progress."""
 CAMERAS_A_WRITE = 256
 NETWORKS_A_CACHE = 50
 """Compiled programs are dropped after this number of networks, to free memory."""
@@ -51,7 +54,7 @@ def run_batch(
     portion: int = CAMERAS_A_WRITE,
     known: str | Path | None = None,
     compute: bool = True,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda stage, done, total: None,
 ) -> Counter:
     """Calibrate the cameras and rigs of `.npz` files and of folders of photographs, and adjust all
     other inputs as networks.
@@ -76,7 +79,7 @@ def run_batch(
     - `portion`: cameras between two writes.
     - `known`: another file of results; inputs in it are skipped.
     - `compute`: False: only check, drop and count the lines of the file.
-    - `progress(done, total)`: called after every write, and while photographs are searched;
+    - `progress(stage, done, total)`: called after every write, and while photographs are searched;
       skipped inputs count as done.
 
     **Returns:** the number of inputs by status in the file, and of those `"skipped"` because they
@@ -111,14 +114,14 @@ def run_batch(
             chosen = np.array([i for i in share if work.keys[i] not in have], int)
             counts["skipped"] += len(share) - len(chosen)
             done += len(share) - len(chosen)
-            progress(done, total)
+            progress(STAGE, done, total)
             step = min(portion, work.portion)
             for first in range(0, len(chosen), step):
                 some = chosen[first : first + step].tolist()
                 rows = _rows(work, some, partial(_tell, progress, done, len(some), total))
                 lines.append(rows)
                 done += len(rows)
-                progress(done, total)
+                progress(STAGE, done, total)
                 networks += work.is_network
                 if work.is_network and networks % NETWORKS_A_CACHE == 0:
                     jax.clear_caches()
@@ -164,7 +167,7 @@ def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
 
 def _tell(progress, done: int, number: int, total: int, part: float) -> None:
     """Report that a fraction `part` of `number` inputs is done."""
-    progress(done + int(part * number), total)
+    progress(STAGE, done + int(part * number), total)
 
 
 def _rows(work: Work, chosen: Sequence[int], tell: Tell) -> list[dict]:

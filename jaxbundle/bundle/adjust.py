@@ -1,7 +1,7 @@
 """`adjust`: from a network to an `Adjustment`."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -61,7 +61,7 @@ from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_robust
-from jaxbundle.types import present
+from jaxbundle.types import Progress, present
 
 LARGEST_START_MISFIT = 0.1
 """Radians, RMS: no start values in the right convention predict image points so badly that an
@@ -92,7 +92,7 @@ def adjust(
     eliminate: bool = False,
     critical_t: float = 2.0,
     estimate_components: bool = False,
-    progress: Callable | None = None,
+    progress: Progress | None = None,
 ) -> Adjustment:
     """Adjust a network by least squares, with self-calibration of all free parameters.
 
@@ -121,8 +121,9 @@ def adjust(
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance component
       is 1; the factors are `Adjustment.sigma_factors`.
-    - `progress(step, cost, λ)`: called for every evaluation; up to 200 000 observations at the end
-      of the iterations.
+    - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
+      the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
+      shows bars).
 
     **Returns:** an `Adjustment`; check `converged` first.
 
@@ -136,7 +137,9 @@ def adjust(
     )  # fmt: skip
     given = require_network(network)
     oriented = _place(orient(given)) if lacks_start_values(given) else None
-    options = {"search": SEARCHES[method], "max_steps": max_iterations + 1, "progress": progress}
+    options = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
+    if progress is not None:
+        options["progress"] = partial(_tell, progress, max_iterations)
     first = _First(reduction, also, oriented, options)
     problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **options)
@@ -328,6 +331,12 @@ class _Found:
             findings=_likely_causes(problem, minimum, inspection), **self.said,
         )  # fmt: skip
 
+
+
+def _tell(progress: Progress, total: int, step, cost, damping) -> None:
+    """An evaluation as `progress(stage, done, total)`."""
+    stage = f"adjusting: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}"
+    progress(stage, int(step), total)
 
 def check_options(
     *,

@@ -14,7 +14,7 @@
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import Progress, present
 
 SIGMA = 0.1
 """A priori σ of an image coordinate in pixels; σ0 of the result shows the actual one."""
@@ -63,7 +63,7 @@ def calibrate(
     cross_validation: bool = True,
     camera: str = "cam",
     object_unit: str = "m",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     **options,
 ) -> Calibration:
     """Calibrate a camera from photographs of a board.
@@ -82,7 +82,7 @@ def calibrate(
       removed; `snooping`: the test for removal, None: no removal. Both, and further `options`
       (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
     - `cross_validation`: False: do not calibrate from halves of the photographs.
-    - `camera`: its name. `progress(done, total)`: photographs searched.
+    - `camera`: its name. `progress(stage, done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; check `converged` first.
 

@@ -22,7 +22,7 @@ section 3.4.3, the rule of one standard error.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -43,6 +43,7 @@ from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.difference import expected_difference
+from jaxbundle.types import Progress
 
 FAINT = 1e3
 FEWEST = 4
@@ -168,7 +169,7 @@ def compare_models(
     *,
     models: Sequence[str | CameraModel],
     folds: int = 4,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     **options,
 ) -> ModelComparison:
     """Calibrate one camera with several models and choose the sufficient one.

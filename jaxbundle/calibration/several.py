@@ -1,7 +1,8 @@
 """Several cameras calibrated from one board: separately, and as a rig if they are mounted."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from jaxbundle.arguments import show
@@ -12,6 +13,7 @@ from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.types import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,12 +37,16 @@ class Calibrations:
         return "\n\n".join(parts)
 
 
+def _tell(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
+    progress(f"{stage} of {name}", done, total)
+
+
 def calibrate_cameras(
     photographs: Mapping[str, Sequence[str | Path] | BoardViews],
     board: Board | None = None,
     *,
     rig: bool = False,
-    progress: Callable[[], None] | None = None,
+    progress: Progress | None = None,
     **options,
 ) -> Calibrations:
     """Calibrate several cameras from photographs of one board.
@@ -48,8 +54,8 @@ def calibrate_cameras(
     **Arguments:** `photographs` by the name of the camera; `rig`: rigidly mounted cameras with
     simultaneous photographs (`calibration.rig`), the first is the reference; epochs that contradict
     the mounting are excluded, then single points (`snooping`, also if the cameras were estimated
-    robustly); with `snooping=None` such epochs are only listed; `progress()`: after every
-    photograph; `options`: those of `calibrate`.
+    robustly); with `snooping=None` such epochs are only listed; `progress(stage, done, total)`:
+    photographs searched, a stage for every camera; `options`: those of `calibrate`.
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera if there are several.
     """
@@ -62,7 +68,9 @@ def calibrate_cameras(
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     found = {}
     for name, given in photographs.items():
-        tell = None if progress is None else lambda *_: progress()
+        tell = progress if progress is None or len(photographs) == 1 else partial(
+            _tell, progress, name
+        )
         try:
             found[name] = calibrate(given, board, camera=name, progress=tell, **options)
         except (InputError, NotSolvedError) as error:

@@ -163,7 +163,7 @@ def batch(
             snooping=None if snooping == "none" else snooping, significance=significance,
             board=known, rig=rig, pixel_size=pixel_size, settings=set or (),
             portion=portion, brief=brief, retry=retry, renew=renew,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=lambda _, done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     if asked:
         found = Population(result_rows(inputs, json_lines))

@@ -130,7 +130,7 @@ def calibrate(
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
-        def tell():
+        def tell(*_):
             bar.advance(task)
             if bar.tasks[task].finished:
                 bar.update(task, description="adjusting")
@@ -146,7 +146,7 @@ def calibrate(
                 ((name, photographed),) = cameras.items()
                 choice = compare_models(
                     photographed, known, models=compared, folds=folds, camera=name,
-                    progress=lambda *_: tell(), **options,
+                    progress=tell, **options,
                 )  # fmt: skip
                 found = Calibrations({name: choice.suffices.calibration})
             else:

@@ -14,6 +14,7 @@ from rich.progress import (
 
 from jaxbundle.cli.habits import verbose
 from jaxbundle.cli.verbose import Stages, say
+from jaxbundle.system.progress import show_progress
 
 
 class _Staged(Progress):
@@ -81,17 +82,15 @@ class iterating:
         monitoring.register_event_duration_secs_listener(self._hear)
         return self.tell
 
-    def tell(self, step, cost, damping) -> None:
+    def tell(self, stage: str, done: int, total: int) -> None:
         """Show the iteration."""
-        self.line = f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
+        self.line = f"iteration {done}:{stage.partition(':')[2]}"
         self.bar.update(self.task, description=self.line)
 
-    def tell_line(self, step, cost, damping) -> None:
+    def tell_line(self, stage: str, done: int, total: int) -> None:
         """Print the iteration and the elapsed time."""
-        say(
-            f"iteration {int(step)}: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}, "
-            f"{time.perf_counter() - self.begun:.2f} s"
-        )
+        detail = stage.partition(":")[2]
+        say(f"iteration {done}:{detail}, {time.perf_counter() - self.begun:.2f} s")
 
     def _hear(self, event: str, *_, **__) -> None:
         if event == REQUEST_EVENT:
@@ -106,22 +105,6 @@ class iterating:
             self.bar.stop()
 
 
-class staging:
-    """A bar for every stage of long work; as a context it yields `tell(stage, done, total)`."""
-
-    def __init__(self, silent: bool):
-        self.bar = counting(silent)
-        self.tasks: dict = {}
-
-    def __enter__(self):
-        self.bar.start()
-        return self.tell
-
-    def tell(self, stage: str, done: int, total: int) -> None:
-        """Advance the bar of a stage."""
-        if stage not in self.tasks:
-            self.tasks[stage] = self.bar.add_task(stage, total=total)
-        self.bar.update(self.tasks[stage], completed=done, total=total)
-
-    def __exit__(self, *_):
-        self.bar.stop()
+def staging(silent: bool) -> show_progress:
+    """A bar for every stage of long work; as a context it yields `progress(stage, done, total)`."""
+    return show_progress(counting(silent))

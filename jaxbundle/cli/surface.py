@@ -94,7 +94,7 @@ def surface(
     given = read_cloud(check).X if check else np.zeros((0, 3))
     check_folder(out, "surface", FILES, input, force)
     with counting(quiet or json == "-") as bar:
-        options = {"points": points, "step": step, "dense": dense, "tell": report_stages(bar)}
+        options = {"points": points, "step": step, "dense": dense, "progress": report_stages(bar)}
         if len(input) > 1 or is_ground_image(input[0]):
             made = make_of_ground(input, photos, heights, pairs, crs, options)
         else:

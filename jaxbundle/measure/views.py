@@ -4,7 +4,7 @@ import dataclasses
 import glob
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,8 +23,10 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
+from jaxbundle.types import Progress
 
-"""Suffixes of photographs in a folder."""
+SEARCHING = "searching the board"
+"""The stage in reports of progress."""
 SAME, ALIKE = 0.02, 0.8
 """Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
 the board. JPEG at quality 70 moves corners by 0.015; two photographs of one pose, with noise of
@@ -123,11 +125,11 @@ def photographs(given: Sequence[str | Path]) -> list[Path]:
 def measure_boards(
     paths: Sequence[str | Path],
     board: Board,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> BoardViews:
     """Find a board in photographs.
 
-    **Arguments:** `paths`: files, patterns, folders; `progress(done, total)`.
+    **Arguments:** `paths`: files, patterns, folders; `progress(stage, done, total)`.
 
     **Returns:** the views of the board with the most frequent image size.
 
@@ -147,7 +149,7 @@ def measure_boards(
         for done, (name, found) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
             looks[name], negatives[name] = found
             if progress is not None:
-                progress(done, len(file_of))
+                progress(SEARCHING, done, len(file_of))
     views = collect_views(file_of, looks, board)
     of_negatives = sum(negatives[name] for name in views.names)
     notes = (

@@ -54,7 +54,6 @@ from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
-    Tell,
     detect,
     match,
     prepare,
@@ -65,6 +64,7 @@ from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
+from jaxbundle.types import Progress
 
 DEFAULT = Settings()
 NAMED = 99
@@ -140,7 +140,7 @@ def reconstruct(
     camera: Camera | None = None,
     settings: Settings = DEFAULT,
     store: Path | None = None,
-    tell: Tell = lambda stage, done, total: None,
+    progress: Progress = lambda stage, done, total: None,
     control: Control | None = None,
     distances: Sequence[dict] = (),
     name: str = "",
@@ -148,7 +148,7 @@ def reconstruct(
     """Orient photographs by their content, with self-calibration.
 
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
-    all; `store`: folder for features and matches; `tell(stage, done, total)`;
+    all; `store`: folder for features and matches; `progress(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
     `distances`: rows `from`, `to`, `value`, `sigma` between named points; `name` of the result,
     default: of the first folder.
@@ -184,7 +184,7 @@ def reconstruct(
     first = Path(given[0])
     name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)
-    making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
+    making = _Making(photographs, left_out, cameras, settings, kept, progress, extra)
     making.notes += notes
     making.frame, making.system, making.title = frame, system, name
     return making.run()

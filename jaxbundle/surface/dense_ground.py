@@ -136,7 +136,7 @@ def _points(base, found: Sequence[_Matches], uv, rows) -> Cloud:
         covariance = np.concatenate([at_base[:, None], own], 1)
         return intersect(views, np.nan_to_num(places), covariance, used, start)
 
-    known = np.isfinite(sigma)
+    known = np.asarray(np.isfinite(sigma))
     if len(found) > 1:
         q, spread = (np.full(sigma.shape, np.nan) for _ in range(2))
         for k in range(len(found)):
@@ -163,9 +163,8 @@ def _to_other(base, other, X) -> Float[np.ndarray, "n 2 2"]:
 def _parameter(base, found: Intersected, matched):
     """q of points on their lines of sight in the base, and its σ; NaN: none."""
     X = np.where(matched[:, None], found.X, np.nan)
-    everything = np.concatenate([X, found.covariance.reshape(-1, 9)], 1)
-    known = np.all(np.isfinite(everything), axis=1)
-    safe = np.where(known[:, None], X, found.X[known][:1] if known.any() else 0.0)
+    known = np.isfinite(X).all(1) & np.isfinite(found.covariance).all((1, 2))
+    safe = np.where(np.expand_dims(known, 1), X, found.X[known][:1] if known.any() else 0.0)
     d = line_of_sight(base.derivative(safe))
     with np.errstate(invalid="ignore"):
         along = np.sqrt(np.einsum("ni,nij,nj->n", d, found.covariance, d))

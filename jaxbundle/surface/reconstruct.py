@@ -2,7 +2,7 @@
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from jaxbundle.surface.orientation import is_uncertain
 from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
 from jaxbundle.surface.views import FrameView, OrientedImage
+from jaxbundle.types import Progress
 
 MOST_PYRAMIDS = 6
 """Maximum pyramids in memory."""
@@ -33,8 +34,6 @@ MOST_POINTS = 16_000_000
 """Maximum points of a dense cloud by default; they take 2.5 GB."""
 SAMPLED_PIXELS = 1 << 20
 """Number of pixels sampled for the darkest and the brightest."""
-
-Tell = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,13 +127,13 @@ def reconstruct(
     step: int | None = None,
     dense: bool = False,
     settings: Settings | None = None,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> Surface:
     """The cloud of all base images.
 
     **Arguments:** `partners`: indices of the matching partners of each base, by default selected;
     `points`, `step`: see `interest_points`; `dense`: every pixel (or every `step`-th), by rectified
-    pairs; `tell(stage, done, total)`.
+    pairs; `progress(stage, done, total)`.
 
     **Raises:** `NotSolvedError` if no images overlap, or nothing matches.
     """
@@ -144,7 +143,7 @@ def reconstruct(
             "no two images show the same part of the surface from different directions: check the "
             "orientation and its units, --zmin and --zmax"
         )
-    tell = tell or (lambda *_: None)
+    tell = progress or (lambda *_: None)
     levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
     pyramids = _Pyramids(views, levels)
     guides = _guides(views, bounds, partners, pyramids, tell, dense)

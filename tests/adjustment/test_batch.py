@@ -323,7 +323,7 @@ def test_progress_is_told_and_portions_keep_the_order(three, solved):
     told = []
     xy = np.concatenate([three[0]] * 12)
     found = jaxbundle.calibrate_batch(
-        BOARD, xy, SIZE, progress=lambda done, total: told.append((done, total))
+        BOARD, xy, SIZE, progress=lambda stage, done, total: told.append((done, total))
     )
     assert told == [(32, 36), (36, 36)]
     for camera in range(36):

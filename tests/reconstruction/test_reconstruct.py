@@ -49,7 +49,8 @@ def made(tmp_path_factory):
                  for a, b in bars]  # fmt: skip
     found = reconstruct(
         [folder], settings=dataclasses.replace(SETTINGS, targets="aruco"), store=store,
-        tell=lambda stage, done, total: stages.update({stage: (done, total)}), distances=distances,
+        progress=lambda stage, done, total: stages.update({stage: (done, total)}),
+        distances=distances,
     )  # fmt: skip
     return truth, found, stages, store
 

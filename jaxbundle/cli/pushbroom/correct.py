@@ -70,13 +70,13 @@ def correct(
         task = bar.add_task("blocks", total=None)
         write_corrected(
             image, out, file.image, search, surface, system, grid, kind,
-            lambda done, total: bar.update(task, completed=done, total=total), occlusion,
+            lambda _, done, total: bar.update(task, completed=done, total=total), occlusion,
         )  # fmt: skip
         if truth is not None and error_map is not None:
             task = bar.add_task("errors", total=None)
             rms = write_error_map(
                 error_map, file.image, search, true, make_search(true, file.earth), surface, system,
-                grid, lambda done, total: bar.update(task, completed=done, total=total),
+                grid, lambda _, done, total: bar.update(task, completed=done, total=total),
             )  # fmt: skip
     if not quiet:
         print(f"{out}: {grid.rows} × {grid.columns} pixels of {grid.size:g}")

@@ -58,7 +58,7 @@ def simulate(
                 write_taken(
                     new / IMAGE, truth, surface, jnp.asarray(shown.bands), shown.place,
                     np.dtype(shown.dtype), kind,
-                    lambda done, total: bar.update(task, completed=done, total=total),
+                    lambda _, done, total: bar.update(task, completed=done, total=total),
                 )  # fmt: skip
     if not quiet:
         print(out / path.name)

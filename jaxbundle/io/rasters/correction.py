@@ -2,7 +2,6 @@
 
 import itertools
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import Progress
 
 MARGIN = 3
 """Pixels that resampling may require beyond the outermost position."""
@@ -82,7 +82,7 @@ def write_corrected(
     system: MapSystem,
     grid: MapGrid,
     resampling: Resampling = "bilinear",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     occlusion: bool = False,
 ) -> None:
     """Write the raster `source`, taken by the image, as the map `target`.

@@ -1,6 +1,6 @@
 """Errors as rasters: of a map relative to a known truth, and over an image."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.types import Progress
 
 BANDS = "east [m]", "north [m]", "error [m]"
 
@@ -27,7 +28,7 @@ def write_error_map(
     surface: Surface,
     system: MapSystem,
     grid: MapGrid,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> float:
     """Write the position error of every pixel of a map relative to the true image: three bands.
 

@@ -11,6 +11,7 @@ from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.types import Progress
 
 
 def write_map(
@@ -21,7 +22,7 @@ def write_map(
     count: int,
     dtype: str,
     block: Callable[[Nodes], np.ndarray | None],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     names: Sequence[str] = (),
 ) -> None:
     """Write the map of `grid`, `count` bands of the type `dtype`.
@@ -54,4 +55,4 @@ def write_map(
         with ThreadPoolExecutor(2) as workers:
             for done, _ in enumerate(workers.map(one, corners), 1):
                 if progress:
-                    progress(done, len(corners))
+                    progress("blocks", done, len(corners))

@@ -16,6 +16,7 @@ from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.simulate import take_image
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.types import Progress
 
 PORTION = 64
 """Lines simulated together."""
@@ -62,7 +63,7 @@ def write_taken(
     place: Callable,
     dtype: np.dtype,
     resampling: Resampling,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> None:
     """Write the image of a scene, some lines at a time; 0 or NaN outside the scene.
 
@@ -78,6 +79,6 @@ def write_taken(
             seen |= bool(np.isfinite(values).any())
             target.write(as_type(values, dtype), first)
             if progress:
-                progress(first + values.shape[1], image.lines)
+                progress("lines", first + values.shape[1], image.lines)
         if not seen:
             raise InputError("the image shows nothing of the scene: check track and coordinates")
