@@ -1,7 +1,7 @@
 """`adjust`: from a network to an `Adjustment`."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
