@@ -3,13 +3,13 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
+from jaxbundle.bundle.exclusions import Undetermined, carry, find_undetermined, take_back
 from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_infinity
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
@@ -35,10 +35,11 @@ from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.quality.snooping import check_test
+from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import Camera, Network, require_network
+from jaxbundle.network.tables import Network, require_network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
@@ -51,6 +52,9 @@ from jaxbundle.types import present
 
 MISFIT = 5.0
 """For a larger σ0, likely causes are searched for."""
+MOST_RETRIES = 5
+"""Repeated adjustments with what start values excluded: each brings back what agrees with a better
+orientation, most of it the first."""
 Begun = tuple[Problem, Minimum, tuple]
 """A problem, where its iterations ended, check points and their image points."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
@@ -114,10 +118,10 @@ def adjust(
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
     given = require_network(network)
-    network, finding = _with_start_values(given)
+    oriented = _place(orient(given)) if lacks_start_values(given) else None
     options = {"search": SEARCHES[method], "max_steps": max_iterations + 1, "progress": progress}
-    first = _First(reduction, also, finding, options)
-    problem, minimum, check = first.find(given, network, outliers=bool(robust or snooping))
+    first = _First(reduction, also, oriented, options)
+    problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **options)
     found = _Found(problem.network, problem.with_factor(), minimum, method, problem.reduction)
     if robust:
@@ -134,16 +138,17 @@ def adjust(
 
 @dataclasses.dataclass(frozen=True)
 class _First:
-    """How the first minimum is found; `finding`: the message about computed start values."""
+    """How the first minimum is found; `oriented`: computed start values, if they were needed."""
 
     reduction: str | None
     also: Sequence[Table | Observations]
-    finding: str
+    oriented: Oriented | None
     options: Mapping[str, Any]
 
-    def find(self, given: Network, network: Network, outliers: bool) -> Begun:
-        """Adjust from the start values of `network`, a part of `given` that may contain
-        `outliers`."""
+    def find(self, given: Network, outliers: bool) -> Begun:
+        """Adjust from the start values of `given`, which may contain `outliers`, or those computed
+        for it."""
+        network = given if self.oriented is None else self.oriented.network
         found = self._minimise(network)
         while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
             # Observations excluded by a wrong principal distance may agree with the adjusted one.
@@ -151,24 +156,69 @@ class _First:
             network = orient_again(given, fewer, cameras)
             if network is fewer:
                 break
-            found = self._minimise(network, cameras)
+            found = self._minimise(network, partial(start_with, cameras=cameras))
         if outliers and not inspect_solution(found[0].with_factor(), found[1]):
             screened = screen(network)
             if len(screened.observations) < len(network.observations):
-                found = self._minimise(screened)
-        return found
+                found, network = self._minimise(screened), screened
+        left_out = network is not given and network.left_out[len(given.left_out) :]
+        return self._try_again(given, found) if left_out or found[3] else found[:3]
 
-    def _minimise(
-        self, network: Network, cameras: Mapping[str, Camera] = MappingProxyType({})
-    ) -> Begun:
-        network, *check = split_check_points(check_network(network))
-        make = partial(make_problem, network, reduction=self.reduction, also=self.also)
-        try:
-            problem = make()
-        except InputError as error:  # The datum, if control points were excluded.
-            raise InputError(f"{error} {self.finding}".strip()) from None
-        start = start_with(problem, cameras)
-        return *minimise_at_any_distance(problem, start, make, **self.options), tuple(check)
+    def _try_again(self, given: Network, found: Begun) -> Begun:
+        """Adjust again, with everything left out because of start values that agrees with the
+        adjusted orientation, until nothing more does."""
+        if self.oriented is not None:
+            said = (f"start values found, {self.oriented.frame}", self.oriented.finding)
+            given = given.warn(*filter(None, said))
+        rounds = 0
+        while inspect_solution(found[0].with_factor(), found[1]):
+            problem, minimum, check, _, current = found
+            whole = take_back(given, current, problem, minimum.values, _sigma0(problem, minimum))
+            try:
+                whole = check_network(whole)
+                gained = len(whole.observations) - len(current.observations)
+                if gained <= 0 or rounds == MOST_RETRIES:
+                    if gained > 0:
+                        whole = whole.warn(
+                            f"{count(gained, 'image point')} left out because of start values "
+                            f"would still come back after {rounds} repeated adjustments"
+                        )
+                    network = problem.network.replace(
+                        warnings=whole.warnings, left_out=whole.left_out
+                    )
+                    return dataclasses.replace(problem, network=network), minimum, check
+                carried = partial(carry, before=problem, values=minimum.values)
+                again = self._minimise(whole, carried)
+            except (InputError, NotSolvedError):
+                break
+            if not inspect_solution(again[0].with_factor(), again[1]):
+                break
+            found, rounds = again, rounds + 1
+        return found[:3]
+
+    def _minimise(self, network: Network, begin: Callable[[Problem], Values] | None = None):
+        """The minimum of a network without what its rays do not determine, the check points, what
+        was left out, and the network with its check points."""
+        gone, factor = Undetermined(), None
+        while True:
+            current = check_network(gone.leave_out(network))
+            used, *check = split_check_points(current)
+            make = partial(make_problem, used, reduction=self.reduction, also=self.also)
+            try:
+                problem = make()
+            except InputError as error:  # The datum, if control points were excluded.
+                finding = "" if self.oriented is None else self.oriented.finding
+                raise InputError(f"{error} {finding}".strip()) from None
+            start = problem.data.start if begin is None else begin(problem)
+            more = find_undetermined(problem, start, factor)
+            if not more:
+                problem, minimum = minimise_at_any_distance(problem, start, make, **self.options)
+                factor = _sigma0(problem, minimum)
+                more = find_undetermined(problem, minimum.values, factor)
+                begin = partial(carry, before=problem, values=minimum.values)
+                if not more:
+                    return problem, minimum, tuple(check), gone, current
+            gone += more
 
 
 @dataclasses.dataclass
@@ -283,16 +333,17 @@ def _likely_causes(
     return tuple(filter(None, causes))
 
 
-def _with_start_values(network: Network) -> tuple[Network, str]:
-    """The network with missing start values computed, and the message about them."""
-    if not lacks_start_values(network):
-        return network, ""
-    found = orient(network)
-    return _place(found), found.finding
+def _sigma0(problem: Problem, minimum: Minimum) -> float:
+    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
+    cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
+    accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
+    vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy
+    known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
+    return float(np.sqrt(vtpv[0] / redundancy)) if known else 1.0
 
 
-def _place(found: Oriented) -> Network:
-    """The network with start values; refused if half or more is excluded.
+def _place(found: Oriented) -> Oriented:
+    """Found start values; refused if half or more is excluded.
 
     **Raises:** `NotSolvedError`."""
     network = found.network
@@ -308,4 +359,4 @@ def _place(found: Oriented) -> Network:
                 + (f"; {cause}" if cause else ""),
                 [f"{thing} {id}" for id in reasons],
             )
-    return network
+    return found

@@ -104,6 +104,9 @@ def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " point
     rays = (np.asarray(problem.data.image_weight) > 0).any(1)
     point, image = problem.point[rays], problem.image[rays]
     ray = _unit_vectors(np.asarray(values.point)[point] - np.asarray(values.position)[image])
+    first = np.zeros((len(values.point), 3))
+    first[point[::-1]] = ray[::-1]  # Lines: a point between two images has opposite rays.
+    ray *= np.where((ray * first[point]).sum(1) < 0, -1.0, 1.0)[:, None]
     middle = np.zeros((len(values.point), 3))
     np.add.at(middle, point, ray)
     off = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)

@@ -22,6 +22,7 @@ from jaxbundle.network.tables import (
     Camera,
     Distances,
     Images,
+    LeftOut,
     Network,
     Observations,
     Points,
@@ -29,7 +30,9 @@ from jaxbundle.network.tables import (
 )
 from jaxbundle.statistics.blunders import Removed, Suspect
 
-NETWORK = (Network, Camera, Images, Points, Observations, Distances, Source, *KINDS.values())
+NETWORK = (
+    Network, LeftOut, Camera, Images, Points, Observations, Distances, Source, *KINDS.values()
+)  # fmt: skip
 FORMAT = "jaxbundle adjustment 1"
 """Its number changes when older files cannot be read any more."""
 
@@ -77,7 +80,7 @@ CLASSES = (*NETWORK, Stored, State, Removed, Suspect, Name)
 def network_fingerprint(network: Network) -> str:
     """16 hex digits of a network's content: cameras, start values, measurements, settings; not of
     where it was read."""
-    network = with_named_models(network).replace(warnings=(), name="")
+    network = with_named_models(network).replace(warnings=(), left_out=(), name="")
     return fingerprint(network, NETWORK, without=(Source,))
 
 

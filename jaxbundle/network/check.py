@@ -10,6 +10,7 @@ from typing import SupportsIndex
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.repetitions import warn_of_repetitions
@@ -22,7 +23,6 @@ from jaxbundle.network.rules import (
     check_unique,
 )
 from jaxbundle.network.sightings import (
-    check_images,
     check_parts,
     check_redundancy,
     leave_out_undetermined,
@@ -47,15 +47,13 @@ from jaxbundle.network.units import ANGLE_UNITS
 def check_network(network: Network) -> Network:
     """The adjustable network, or an error that tells the user what to do.
 
-    Control points without σ become fixed; unused cameras, points with too few rays and
-    distances between fixed points are removed, each with a warning on the network. Check points
-    are kept but not counted: remove them with `split_check_points`.
+    Control points without σ become fixed; unused cameras, points with too few rays, images with too
+    few points and distances between fixed points are removed, each with a warning on the network.
+    Check points are kept but not counted: remove them with `split_check_points`.
 
     **Raises:** `InputError`, one line with file, row, cause and remedy.
     """
-    everything = network = check_tables(network)
-    network = leave_out_undetermined(network)
-    check_images(everything, network)
+    network = leave_out_undetermined(check_tables(network))
     _check_start_values(network)
     check_parts(network)
     check_redundancy(network)
@@ -325,12 +323,15 @@ def _refuse_missing(table, values, names, thing):
 
 
 def _warn_of_points_behind(network: Network) -> Network:
-    """A warning if a start value puts a point behind the camera that sees it (q ≥ 0)."""
+    """A warning if a start value puts a point behind the camera that sees it (q ≥ 0); fisheyes may
+    see behind them."""
     images, rays = network.images, network.observations
+    plain = [get_model(camera.model).image == "perspective" for camera in network.cameras]
     omega, phi, _ = images.angles.T
     axis = np.stack([np.sin(phi), -np.cos(phi) * np.sin(omega), np.cos(phi) * np.cos(omega)], 1)
     ray = network.points.position[rays.point] - images.position[rays.image]
-    behind = np.flatnonzero((axis[rays.image] * ray).sum(1) >= 0)
+    before = (axis[rays.image] * ray).sum(1) < 0
+    behind = np.flatnonzero(~before & np.array(plain)[images.camera[rays.image]])
     if not len(behind):
         return network
     first = "; ".join(_sighting(network, row) for row in behind[:3])

@@ -6,6 +6,7 @@ network each need their own datum.
 """
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -13,7 +14,14 @@ from jaxtyping import Bool, Int
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further.base import among, rows_of
-from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
+from jaxbundle.network.tables import (
+    EXTERIOR,
+    Distances,
+    LeftOut,
+    Network,
+    Observations,
+    Points,
+)
 
 
 def split_check_points(network: Network) -> tuple[Network, Points, Observations]:
@@ -97,81 +105,100 @@ def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
     return number
 
 
+def leave_out(network: Network, thing: str, names: Iterable[str], why: str) -> Network:
+    """The network with a note, also among its warnings, that these were left out; see `LeftOut`."""
+    names = tuple(names)
+    if not names:
+        return network
+    text = f"left out {count(len(names), thing)} {why}: {list_some(names)}"
+    return network.replace(
+        warnings=(*network.warnings, text),
+        left_out=(*network.left_out, LeftOut(thing, names, why)),
+    )
+
+
 def leave_out_undetermined(network: Network) -> Network:
-    """The network without points with too few rays, with warnings that list them."""
-    points, distances = network.points, network.distances
+    """The network without points with too few rays and images with too few points, with warnings
+    that list them.
+
+    **Raises:** `InputError` or `NotSolvedError` if that is half of the images or more."""
+    points, images, distances = network.points, network.images, network.distances
+    image, point = network.observations.image, network.observations.point
     fixed, check = points.has_role("fixed"), points.has_role("check")
-    rays = np.bincount(network.observations.point, minlength=len(points))
     known = count_controlled_axes(points) + equations_of(network, "POINTS")
-    keep = np.ones(len(points), bool)
+    given = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
+    keep, used = np.ones(len(points), bool), np.ones(len(images), bool)
+    first = None
     while True:
+        rays = np.bincount(point[used[image]], minlength=len(points))
         ends = distances.points[keep[distances.points].all(1)]
         tied = np.bincount(ends.ravel(), minlength=len(points))
         determined = fixed | (2 * rays + tied + known >= 3)
         kept = keep & np.where(check, rays >= 2, (rays + tied > 0) & determined)
-        if (kept == keep).all():
+        taking_part = (kept & ~check)[point]
+        seen = np.bincount(image[taking_part], minlength=len(images))
+        still = used & (seen > 0) & (2 * seen + given >= 6)
+        if (kept == keep).all() and (still == used).all():
             break
-        keep = kept
-    out = ~keep
-    messages = [
-        f"left out {count(mask.sum(), thing)} {why}: "
-        f"{list_some(points.id[row] for row in np.flatnonzero(mask))}"
-        for mask, thing, why in (
-            (out & ~check & (rays == 0), "point", "without any ray"),
-            (out & ~check & (rays > 0), "tie point", "with a single ray"),
-            (out & check, "check point", "with fewer than two rays"),
-        )
-        if mask.any()
-    ]
+        if first is None and (still != used).any():
+            measured = np.bincount(image, minlength=len(images))
+            first = _too_few_points(network, np.where(still, np.inf, measured).argmin(), seen)
+        keep, used = kept, still
+    if first is not None and 2 * (~used).sum() >= len(images):
+        raise first
+    out, notes = ~keep, []
+    for mask, thing, why in (
+        (out & ~check & (rays == 0), "point", "without any ray"),
+        (out & ~check & (rays > 0), "tie point", "with a single ray"),
+        (out & check, "check point", "with fewer than two rays"),
+    ):
+        notes.append((thing, [points.id[row] for row in np.flatnonzero(mask)], why))
+    names = [images.id[row] for row in np.flatnonzero(~used)]
+    notes.append(("image", names, "with fewer than three points that other images determine"))
+    left = keep_images(keep_points(network, keep), used)
+    for note in notes:
+        left = leave_out(left, *note)
+    messages = []
     for one in network.further:
-        gone = len(one) - len(one.among(keep_points(network, keep)))
+        gone = len(one) - len(one.among(left))
         if gone:
             messages.append(f"{one.TABLE}: left out {count(gone, 'row')} about excluded objects")
     lost = (~keep[distances.points].all(1)).sum()
     if lost:
         messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
+    left = left.warn(*messages)
     if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
+        said = left.warnings[len(network.warnings) :]
         raise InputError(
-            f"datum_points: none is left ({'; '.join(messages)}); name points with two rays"
+            f"datum_points: none is left ({'; '.join(said)}); name points with two rays"
         )
-    return keep_points(network, keep).warn(*messages)
+    return left
 
 
-def check_images(before: Network, network: Network) -> None:
-    """Refuse an image with too few points; `before` is the complete network.
-
-    **Raises:** `InputError`; `NotSolvedError` if the image has enough points, but no other
-    image sees them.
-    """
-    images, points = network.images, before.points
-    rays_of_point = np.bincount(before.observations.point, minlength=len(points))
-    taking_part = ~network.points.has_role("check")[network.observations.point]
-    rays = np.bincount(network.observations.image[taking_part], minlength=len(images))
-    measured = np.bincount(before.observations.image, minlength=len(images))
-    equations = 2 * rays + (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
-    for row in np.flatnonzero((rays == 0) | (equations < 6))[:1]:
-        place = f"{images.source(row)}: image {images.id[row]!r}: "
-        if measured[row] == 0:
-            raise InputError(
-                f"{place}an image with no rays; measure points in it or remove the image"
-            )
-        seen = before.observations.point[before.observations.image == row]
-        lone = [points.id[p] for p in seen if rays_of_point[p] == 1 and points.role[p] == "tie"]
-        if measured[row] >= 3 and lone:
-            raise NotSolvedError(
-                f"{place}not solved: it shares too few points with other images, so that neither "
-                f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-                f"{list_some(lone)} can be determined; add images of the same points, or "
-                "control points",
-                [f"{name} of image {images.id[row]}" for name in EXTERIOR]
-                + [f"X, Y, Z of point {id}" for id in lone],
-            )
-        used = "" if measured[row] == rays[row] else f" of the {measured[row]} measured ones"
-        why = "" if not used else " (the others are check points or seen in one image only)"
-        raise InputError(
-            f"{place}only {count(rays[row], 'point')}{used} can be used{why}; an image needs at "
-            "least 3, or prior σ of its exterior orientation"
+def _too_few_points(network: Network, row, used) -> InputError | NotSolvedError:
+    """Why an image with only `used` [images] of its points is not determined."""
+    images, points, rays = network.images, network.points, network.observations
+    rays_of_point = np.bincount(rays.point, minlength=len(points))
+    place = f"{images.source(row)}: image {images.id[row]!r}: "
+    seen = rays.point[rays.image == row]
+    if not len(seen):
+        return InputError(f"{place}an image with no rays; measure points in it or remove the image")
+    lone = [points.id[p] for p in seen if rays_of_point[p] == 1 and points.role[p] == "tie"]
+    if len(seen) >= 3 and lone:
+        return NotSolvedError(
+            f"{place}not solved: it shares too few points with other images, so that neither "
+            f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
+            f"{list_some(lone)} can be determined; add images of the same points, or "
+            "control points",
+            [f"{name} of image {images.id[row]}" for name in EXTERIOR]
+            + [f"X, Y, Z of point {id}" for id in lone],
         )
+    part = "" if used[row] == len(seen) else f" of the {len(seen)} measured ones"
+    why = "" if not part else " (the others are check points or seen in one image only)"
+    return InputError(
+        f"{place}only {count(used[row], 'point')}{part} can be used{why}; an image needs at "
+        "least 3, or prior σ of its exterior orientation"
+    )
 
 
 def check_parts(network: Network) -> None:

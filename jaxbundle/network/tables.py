@@ -194,6 +194,17 @@ class Distances:
         return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
 
+@dataclasses.dataclass(frozen=True)
+class LeftOut:
+    """What an adjustment leaves out for one reason: `thing` is "image", "tie point",
+    "image point", …; `names` of image points are "POINT in IMAGE"; `why` completes
+    "… left out"."""
+
+    thing: str
+    names: tuple[str, ...]
+    why: str
+
+
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Network:
@@ -203,7 +214,8 @@ class Network:
     `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
     has datum defects). `residuals` names the domain in which v = computed − observed is formed.
     `further`: observations of further kinds (`network/further`), which name images and points by
-    id. `warnings` list exclusions with their reasons, for the report.
+    id. `warnings` for the report, which also list what was left out; `left_out`: the same with all
+    names.
     """
 
     cameras: tuple[Camera, ...]
@@ -220,6 +232,7 @@ class Network:
     angle_unit: str = "rad"
     further: tuple[Any, ...] = ()
     warnings: tuple[str, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
 
     def replace(self, **changes) -> "Network":
         """A copy with some fields changed."""

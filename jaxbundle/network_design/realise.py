@@ -68,6 +68,7 @@ def _distances(network: Network, points, seed: int | None):
 def problem_of(network: Network) -> Problem | None:
     """The problem of a designed network; None if it cannot be adjusted."""
     try:
-        return make_problem(check_network(network))
+        checked = check_network(network)
+        return make_problem(checked) if len(checked.images) == len(network.images) else None
     except (InputError, NotSolvedError):
         return None

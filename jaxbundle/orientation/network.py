@@ -16,7 +16,7 @@ from which little grows is replaced by the next.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -26,8 +26,8 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.sightings import keep_images, keep_points
-from jaxbundle.network.tables import Network
+from jaxbundle.network.sightings import keep_images, keep_points, leave_out
+from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
@@ -91,7 +91,9 @@ class Oriented:
         for thing, reasons in (("image", self.images), ("point", self.points)):
             lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
         if self.left_out:
-            lines.append(_in_contradiction(self.left_out))
+            names = list_some(self.left_out, 5, str)
+            number = count(len(self.left_out), "image point")
+            lines.append(f"left out {number} {CONTRADICTION}: {names}")
         if self.finding:
             lines.append(self.finding)
         return "\n".join(lines)
@@ -148,7 +150,7 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
 
 def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
-    wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
+    wrong = np.bincount(seen.point, are_out_of_the_question(seen, model), seen.points)
     return are_controlled(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
@@ -163,7 +165,7 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     control = are_controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
-    wrong = _out_of_the_question(seen, model)
+    wrong = are_out_of_the_question(seen, model)
     seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
@@ -355,10 +357,10 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = seen.row[_out_of_the_question(seen, model)]
+    wrong = seen.row[are_out_of_the_question(seen, model)]
     keep = model.placed
     known = np.all(np.isfinite(X), axis=1)
-    reasons = _reasons(network, seen, model, known)
+    reasons = explain_missing(network, seen, model, known)
     rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
@@ -366,25 +368,30 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
         observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
     )
     network = keep_points(keep_images(network, keep), known)
-    said = [
-        f"left out {count(len(found), thing)} for which no start values were found: "
-        + list_some((f"{id} ({why})" for id, why in found.items()), 5, str)
-        for thing, found in zip(("image", "point"), reasons) if found
-    ]  # fmt: skip
+    network = network.warn(f"start values found, {frame}")
+    for thing, found in zip(("image", "point"), reasons):
+        network = note_missing(network, thing, found, "for which no start values were found")
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
-    if names:
-        said.append(_in_contradiction(names))
-    return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons, names)
+    network = leave_out(network, "image point", names, CONTRADICTION)
+    return Oriented(network, frame, *reasons, names)
 
 
-def _in_contradiction(names: Sequence[str]) -> str:
-    return (
-        f"left out {count(len(names), 'image point')} that contradict the start values: "
-        f"{list_some(names, 5, str)}"
-    )
+CONTRADICTION = "that contradict the start values"
 
 
-def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
+def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
+    """The network with notes that images or points were left out, by name with the reasons."""
+    if not reasons:
+        return network
+    names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
+    groups = {why: tuple(id for id, one in reasons.items() if one == why)
+              for why in dict.fromkeys(reasons.values())}  # fmt: skip
+    network = network.warn(f"left out {count(len(reasons), thing)} {what}: {names}")
+    notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
+    return network.replace(left_out=(*network.left_out, *notes))
+
+
+def are_out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
     return misclosures(seen, model) > EXCLUSION_RATIO * seen.tolerance[seen.image]
 
@@ -393,10 +400,11 @@ def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
     """The images with too few consistent known points."""
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     known = of_image(model.known[seen.point])
-    return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
+    return of_image(are_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
 
 
-def _reasons(network: Network, seen: Sights, model: Model, known):
+def explain_missing(network: Network, seen: Sights, model: Model, known):
+    """By id, why images are not placed, and why points are not `known`."""
     rays = np.bincount(seen.image, minlength=seen.images)
     of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
     images = {}
@@ -414,9 +422,15 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]
     by_point = np.bincount(seen.point[placed], minlength=seen.points)
+    outside = np.ones(len(network.observations), bool)
+    outside[seen.row] = False
+    no_ray = np.bincount(network.observations.point[outside], minlength=seen.points)
     points = {}
     for point in np.flatnonzero(~known):
-        if by_point[point] < 2:
+        if by_point[point] < 2 and no_ray[point]:
+            number = count(no_ray[point], "image point")
+            why = f"{number} of it outside the range of the camera model, where there are no rays"
+        elif by_point[point] < 2:
             why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
         else:
             why = f"its {by_point[point]} rays do not intersect, or are parallel"

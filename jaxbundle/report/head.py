@@ -57,8 +57,24 @@ def title(adjustment, date: str | None) -> list[str]:
 
 
 def settings(adjustment) -> list[str]:
-    """Method, datum, domain of the residuals, units."""
-    return ["", *facts(setting_facts(adjustment))]
+    """What to know first; method, datum, domain of the residuals, units."""
+    return ["", *facts([*first_facts(adjustment), *setting_facts(adjustment)])]
+
+
+def first_facts(adjustment) -> list[tuple[str, str]]:
+    """Likely causes of a bad fit, and how much was left out."""
+    rows = [("Attention", clean(text)) for text in adjustment.findings]
+    if words := left_out_in_words(adjustment):
+        rows.append(("Left out", f"{words}: see Warnings, and left_out in the JSON"))
+    return rows
+
+
+def left_out_in_words(adjustment) -> str:
+    """The numbers of things left out, by kind."""
+    number: dict[str, int] = {}
+    for note in adjustment.problem.network.left_out:
+        number[note.thing] = number.get(note.thing, 0) + len(note.names)
+    return ", ".join(count(n, thing) for thing, n in number.items())
 
 
 def setting_facts(adjustment) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.report.head import (
     chi_squared,
     image_precision,
+    left_out_in_words,
     redundancy_in_words,
     result_in_words,
     sigma0_in_words,
@@ -49,6 +50,8 @@ def summary(adjustment) -> list[tuple[str, str]]:
         ),
         ("Redundancy", redundancy_in_words(adjustment)),
     ]
+    if words := left_out_in_words(adjustment):
+        rows.insert(1, ("Left out", words))
     if not adjustment.converged:
         if adjustment.undetermined:
             rows.append(("Not determined", list_some(adjustment.undetermined, 8, clean)))

@@ -245,17 +245,38 @@ def test_cameras_without_images_are_left_out():
     assert "'spare'" in checked.warnings[0]
 
 
-def test_images_without_enough_points_are_refused():
-    with pytest.raises(InputError, match="images, row 2: image 'i1': an image with no rays"):
-        check_network(make_network(**without_rays(lambda o: o["image"] != "i1")))
-    few = without_rays(lambda o: o["image"] != "i1" or o["point"] in ("p0", "p1"))
-    with pytest.raises(InputError, match="image 'i1': only 2 points can be used; .* at least 3"):
-        check_network(make_network(**few))
-    few["images"][1] |= {"sX0": 0.1, "sY0": 0.1}
-    check_network(make_network(**few))
-    lonely = without_rays(lambda o: (o["image"] == "i1") == (o["point"] in ("p4", "p5", "p6")))
-    with pytest.raises(NotSolvedError, match="X0, .* of image i1 nor X, Y, Z of points 'p4', 'p5'"):
-        check_network(make_network(**lonely))
+FEW = {
+    "no rays": lambda o: False,
+    "only 2 points can be used; .* at least 3": lambda o: o["point"] in ("p0", "p1"),
+    "X0, .* of image i1 nor X, Y, Z of points 'p4', 'p5'": lambda o: o["point"] in ("p4", "p5"),
+}
+
+
+@pytest.mark.parametrize("said, keep", FEW.items())
+def test_images_without_enough_points_are_left_out_by_name(said, keep):
+    """One of three is left out, with the points that only it shares with another; one of two is
+    refused."""
+    given = without_rays(lambda o: o["image"] != "i1" or keep(o))
+    found = check_network(make_network(**given))
+    assert found.images.id == ("i0", "i2") and len(found.points) == 8
+    (left,) = found.left_out
+    assert (left.thing, left.names) == ("image", ("i1",)) and "three points" in left.why
+    assert "left out 1 image" in " ".join(found.warnings)
+    given["images"][1] |= {"sX0": 0.1, "sY0": 0.1}
+    kept = "i1" in check_network(make_network(**given)).images.id
+    assert kept == (said != "no rays")
+
+
+@pytest.mark.parametrize("said, keep", FEW.items())
+def test_half_of_the_images_without_enough_points_are_refused(said, keep):
+    given = tables(images=2)
+    lone = ("p4", "p5", "p6")
+    share = lambda o: o["point"] not in lone if o["image"] == "i0" else keep(o)
+    if said.startswith("X0"):
+        share = lambda o: (o["image"] == "i1") == (o["point"] in lone)
+    given["observations"] = [o for o in given["observations"] if share(o)]
+    with pytest.raises((InputError, NotSolvedError), match=f"image 'i[01]': .*{said}"):
+        check_network(make_network(**given))
 
 
 def two_parts(**changes):

@@ -41,6 +41,10 @@ def result_dict(adjustment, brief: bool = False) -> dict:
             },
         },
         "warnings": list(adjustment.warnings),
+        "left_out": [
+            {"kind": note.thing, "names": list(note.names), "reason": note.why}
+            for note in adjustment.problem.network.left_out
+        ],
     }
     if not adjustment.converged:
         return head | {"undetermined": list(adjustment.undetermined)}

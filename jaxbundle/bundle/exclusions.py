@@ -1,0 +1,249 @@
+"""What takes part in an adjustment: what rays do not determine is left out by name, and what start
+values excluded is tried again with the adjusted orientation.
+
+Before and after the iterations points whose rays are one line, and images that see a line, are
+looked for (`orientation.determined`). After them, everything that was excluded because of start
+values (image points that contradict them, points without intersection, images that could not be
+placed) is placed by the adjusted images and points, as `orient` does, and what agrees takes part in
+the next adjustment.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.far_points import NARROW, angle_of_rays
+from jaxbundle.bundle.minimum import adjusted_cameras
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.columns import list_some
+from jaxbundle.network.sightings import equations_of, keep_images, keep_points, leave_out
+from jaxbundle.network.tables import LeftOut, Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.determined import have_one_line, see_a_line
+from jaxbundle.orientation.growth import (
+    FOR_ITSELF,
+    Model,
+    are_controlled,
+    grow,
+    intersect,
+    place_far_points,
+)
+from jaxbundle.orientation.network import (
+    are_out_of_the_question,
+    explain_missing,
+    note_missing,
+)
+from jaxbundle.orientation.sights import Sights, sights
+
+LARGEST_SIGMA = 0.01
+"""Radians: a ray of a larger a priori σ, half a degree, was not measured. Its σ is in a wrong unit
+or was not given, and says nothing before the adjustment has estimated it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Undetermined:
+    """Points and images that rays do not determine, each with the reason."""
+
+    notes: tuple[LeftOut, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.notes)
+
+    def __add__(self, other: "Undetermined") -> "Undetermined":
+        return Undetermined(self.notes + other.notes)
+
+    def leave_out(self, network: Network) -> Network:
+        """The network without them, with notes."""
+        gone = {thing: {name for note in self.notes if note.thing == thing for name in note.names}
+                for thing in ("tie point", "image")}  # fmt: skip
+        keep = lambda ids, names: np.array([id not in names for id in ids], bool)
+        network = keep_points(network, keep(network.points.id, gone["tie point"]))
+        network = keep_images(network, keep(network.images.id, gone["image"]))
+        for note in self.notes:
+            network = leave_out(network, note.thing, note.names, note.why)
+        return network
+
+
+def find_undetermined(problem: Problem, values: Values, factor: float | None) -> Undetermined:
+    """The tie points whose rays are one line, and the images whose points are on a line, unless
+    they are the half of all: then the network has no depth, or σ says nothing.
+
+    **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
+    """
+    network = problem.network
+    finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
+    narrow = angle_of_rays(problem, values) < NARROW
+    flat = _see_nearly_a_line(problem, values) & _have_only_rays(problem)
+    if not finite or not (narrow.any() or flat.any()):
+        return Undetermined()
+    seen = sights(network.replace(cameras=_cameras(problem, values)))
+    if factor is None and not np.median(seen.sigma) < LARGEST_SIGMA:
+        return Undetermined()
+    model = _adjusted_model(problem, values, network, seen)
+    ties = network.points.has_role("tie")
+    free = ties & ~problem.system.kept_rows & (equations_of(network, "POINTS") == 0)
+    free[network.distances.points.ravel()] = False
+    points, one_place = have_one_line(seen, model, narrow & free, factor or 1.0)
+    images = flat & see_a_line(seen, model, factor or 1.0)
+    points &= 2 * points.sum() < ties.sum()
+    images &= 2 * images.sum() < len(network.images)
+    return Undetermined(_notes(network, seen, points, one_place, images))
+
+
+def _notes(network: Network, seen: Sights, points, one_place, images) -> tuple[LeftOut, ...]:
+    of = lambda ids, mask: tuple(ids[k] for k in np.flatnonzero(mask))
+    groups = []
+    for mask, where in (
+        (points & one_place, "from one place (images {})"),
+        (points & ~one_place, "along the line through the projection centres (images {})"),
+    ):
+        by = np.unique(seen.image[mask[seen.point]])
+        where = where.format(list_some((network.images.id[k] for k in by), 4))
+        why = f"whose rays are one line to their noise, {where}, so that they have no distance"
+        groups.append(LeftOut("tie point", of(network.points.id, mask), why))
+    why = "whose points are on one line, about which the image may turn"
+    groups.append(LeftOut("image", of(network.images.id, images), why))
+    return tuple(group for group in groups if group.names)
+
+
+def _have_only_rays(problem: Problem) -> Bool[np.ndarray, " images"]:
+    """Images whose exterior orientation nothing but image points determines."""
+    network = problem.network
+    own = np.isnan(network.images.sigma).all(1) & (equations_of(network, "IMAGES") == 0)
+    return own if len(problem.layout.sets) == len(problem.system.observations) else ~own & own
+
+
+def _see_nearly_a_line(problem: Problem, values: Values) -> Bool[np.ndarray, " images"]:
+    """Images whose points are within a narrow angle of a line, cheaply."""
+    image, n = problem.image, len(problem.network.images)
+    X = np.asarray(values.point)[problem.point]
+    away = np.linalg.norm(X - np.asarray(values.position)[image], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.nan_to_num(1 / away, posinf=0.0)
+    total = lambda v: np.stack(
+        [np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1
+    )
+    weight = np.maximum(np.bincount(image, root**2, n), 1e-300)[:, None]
+    scaled = root[:, None] * (X - (total(root[:, None] ** 2 * X) / weight)[image])
+    C = np.nan_to_num(total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3))
+    number = np.maximum(np.bincount(image, minlength=n), 1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:, 1], 0) / number) < NARROW
+
+
+def _cameras(problem: Problem, values: Values):
+    return tuple(adjusted_cameras(problem, values).values())
+
+
+def _adjusted_model(problem: Problem, values: Values, network: Network, seen: Sights) -> Model:
+    """The adjusted images and points, as rows of `network`."""
+    model = Model.empty(seen)
+    images, points = (
+        np.array([place[id] for id in own.id], int)
+        for own, place in (
+            (table, {id: k for k, id in enumerate(whole.id)})
+            for table, whole in (
+                (problem.network.images, network.images), (problem.network.points, network.points)
+            )
+        )
+    )  # fmt: skip
+    M = many.matrices_of_quaternions(np.asarray(values.rotation))
+    model.place(images, np.asarray(values.position) + problem.origin, M)
+    X = np.asarray(values.point) + problem.origin
+    model.X[points], model.known[points] = X, np.isfinite(X).all(1)
+    return model
+
+
+def take_back(
+    given: Network, current: Network, problem: Problem, values: Values, factor: float
+) -> Network:
+    """The given network with everything that agrees with adjusted images and points, and notes of
+    what does not.
+
+    **Arguments:** `current`: the part of `given` that was adjusted, with its check points;
+    `factor`: σ0."""
+    cameras = adjusted_cameras(problem, values)
+    lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
+    seen = sights(given.replace(cameras=lens))
+    model = _adjusted_model(problem, values, given, seen)
+    model.held = are_controlled(given.points)
+    new = model.held & ~model.known
+    model.X[new], model.known[new] = given.points.position[new], True
+    before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
+    grow(seen, model)
+    intersect(seen, model, FOR_ITSELF)
+    place_far_points(seen, model)
+    used = _are_among(given, current)
+    wrong = are_out_of_the_question(seen, model) & ~used[seen.row]
+    kept = dataclasses.replace(seen, **{
+        name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")
+    })  # fmt: skip
+    ties = given.points.has_role("tie") & ~before
+    line, one_place = have_one_line(kept, model, ties, factor)
+    images, points = given.images, given.points
+    poses = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
+    lacking = model.placed & ~poses
+    position, angles = images.position.copy(), images.angles.copy()
+    position[lacking] = model.X0[lacking]
+    if lacking.any():
+        angles[lacking] = many.angles(model.M[lacking])
+    X = np.where(
+        (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
+    )
+    known = np.isfinite(X).all(1)
+    missing_images, missing_points = explain_missing(given, seen, model, known | line)
+    network = given.replace(
+        images=dataclasses.replace(images, position=position, angles=angles),
+        points=dataclasses.replace(points, position=X),
+        observations=given.observations.take(
+            np.setdiff1d(np.arange(len(used)), seen.row[wrong])
+        ),
+    )  # fmt: skip
+    network = keep_points(keep_images(network, model.placed), known & ~line)
+    after = "that the adjusted orientation does not determine either"
+    network = note_missing(network, "image", missing_images, after)
+    network = note_missing(network, "point", missing_points, after)
+    for note in _notes(given, kept, line, one_place, np.zeros(len(images), bool)):
+        network = leave_out(network, note.thing, note.names, note.why)
+    rays = given.observations
+    names = [f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in seen.row[wrong]]
+    return leave_out(network, "image point", names, "that contradict the adjusted orientation")
+
+
+def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
+    """Which image points of a network are in a part of it."""
+    key = lambda network, ids: np.array([
+        ids[0][network.images.id[i]] * len(given.points) + ids[1][network.points.id[p]]
+        for i, p in zip(network.observations.image, network.observations.point)
+    ], np.int64)  # fmt: skip
+    places = [{id: k for k, id in enumerate(table.id)} for table in (given.images, given.points)]
+    return np.isin(key(given, places), key(current, places))
+
+
+def carry(problem: Problem, before: Problem, values: Values) -> Values:
+    """Start values of a problem: those at which another of the same network ended, by name; its own
+    for what that did not have."""
+    start = problem.data.start
+
+    def taken(own, ids, other, other_ids, shift=0.0):
+        own, other = np.array(own), np.asarray(other)
+        place = {id: k for k, id in enumerate(other_ids)}
+        rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]
+        to, of = np.array(rows, int).reshape(-1, 2).T
+        there = np.isfinite(other[of]).all(1)
+        own[to[there]] = (other[of] + shift)[there]
+        return jax.device_put(own)
+
+    network, old, shift = problem.network, before.network, before.origin - problem.origin
+    images, points = (network.images.id, old.images.id), (network.points.id, old.points.id)
+    cameras = [c.id for c in network.cameras], [c.id for c in old.cameras]
+    width = start.camera.shape[1]
+    return dataclasses.replace(
+        start,
+        camera=taken(start.camera, cameras[0], np.asarray(values.camera)[:, :width], cameras[1]),
+        position=taken(start.position, images[0], values.position, images[1], shift),
+        rotation=taken(start.rotation, images[0], values.rotation, images[1]),
+        point=taken(start.point, points[0], values.point, points[1], shift),
+    )  # fmt: skip
