@@ -9,12 +9,23 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
-from jaxbundle.bundle.exclusions import Undetermined, carry, find_undetermined, take_back
-from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_infinity
+from jaxbundle.bundle.exclusions import (
+    Undetermined,
+    carry,
+    find_undetermined,
+    may_be_undetermined,
+    take_back,
+)
+from jaxbundle.bundle.far_points import (
+    join_legs,
+    minimise_at_any_distance,
+    minimise_with_infinity,
+)
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
     inspect_solution,
     is_misjudged,
+    minimise,
     name_inseparable,
     names_of_defects,
     start_with,
@@ -52,11 +63,12 @@ from jaxbundle.types import present
 
 MISFIT = 5.0
 """For a larger σ0, likely causes are searched for."""
+EVALUATIONS_BEFORE_A_LOOK = 6
+"""Evaluations before points that rays may not determine are looked for: the images are then nearly
+where they end, and such points have not yet slowed them."""
 MOST_RETRIES = 5
 """Repeated adjustments with what start values excluded: each brings back what agrees with a better
 orientation, most of it the first."""
-Begun = tuple[Problem, Minimum, tuple]
-"""A problem, where its iterations ended, check points and their image points."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
 """Name of the undetermined if no single unknown dominates."""
 
@@ -145,9 +157,9 @@ class _First:
     oriented: Oriented | None
     options: Mapping[str, Any]
 
-    def find(self, given: Network, outliers: bool) -> Begun:
+    def find(self, given: Network, outliers: bool) -> tuple[Problem, Minimum, tuple]:
         """Adjust from the start values of `given`, which may contain `outliers`, or those computed
-        for it."""
+        for it: the problem, where its iterations ended, check points and their image points."""
         network = given if self.oriented is None else self.oriented.network
         found = self._minimise(network)
         while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
@@ -164,16 +176,19 @@ class _First:
         left_out = network is not given and network.left_out[len(given.left_out) :]
         return self._try_again(given, found) if left_out or found[3] else found[:3]
 
-    def _try_again(self, given: Network, found: Begun) -> Begun:
+    def _try_again(self, given: Network, found) -> tuple[Problem, Minimum, tuple]:
         """Adjust again, with everything left out because of start values that agrees with the
         adjusted orientation, until nothing more does."""
         if self.oriented is not None:
             said = (f"start values found, {self.oriented.frame}", self.oriented.finding)
             given = given.warn(*filter(None, said))
-        rounds = 0
+        rounds, final = 0, Undetermined()
         while inspect_solution(found[0].with_factor(), found[1]):
-            problem, minimum, check, _, current = found
-            whole = take_back(given, current, problem, minimum.values, _sigma0(problem, minimum))
+            problem, minimum, check, gone, current = found
+            if rounds:  # Here they were left out at the end of an adjustment with them.
+                final += gone
+            part, factor = final.leave_out(given), _sigma0(problem, minimum)
+            whole = take_back(part, current, problem, minimum.values, factor)
             try:
                 whole = check_network(whole)
                 gained = len(whole.observations) - len(current.observations)
@@ -188,7 +203,7 @@ class _First:
                     )
                     return dataclasses.replace(problem, network=network), minimum, check
                 carried = partial(carry, before=problem, values=minimum.values)
-                again = self._minimise(whole, carried)
+                again = self._minimise(whole, carried, look=False)
             except (InputError, NotSolvedError):
                 break
             if not inspect_solution(again[0].with_factor(), again[1]):
@@ -196,9 +211,11 @@ class _First:
             found, rounds = again, rounds + 1
         return found[:3]
 
-    def _minimise(self, network: Network, begin: Callable[[Problem], Values] | None = None):
+    def _minimise(
+        self, network: Network, begin: Callable[[Problem], Values] | None = None, look: bool = True
+    ) -> tuple[Problem, Minimum, tuple, Undetermined, Network]:
         """The minimum of a network without what its rays do not determine, the check points, what
-        was left out, and the network with its check points."""
+        was left out, and the network with its check points; `look`: also before the minimum."""
         gone, factor = Undetermined(), None
         while True:
             current = check_network(gone.leave_out(network))
@@ -210,14 +227,22 @@ class _First:
                 finding = "" if self.oriented is None else self.oriented.finding
                 raise InputError(f"{error} {finding}".strip()) from None
             start = problem.data.start if begin is None else begin(problem)
-            more = find_undetermined(problem, start, factor)
+            legs = []
+            more = find_undetermined(problem, start, factor) if look else Undetermined()
+            if not more and look and may_be_undetermined(problem, start):
+                options = self.options | {"max_steps": EVALUATIONS_BEFORE_A_LOOK}
+                legs, look = [minimise(problem, start, **options)], False
+                factor, start = _sigma0(problem, legs[0]), legs[0].values
+                more = find_undetermined(problem, start, factor)
+                begin = partial(carry, before=problem, values=start)
             if not more:
-                problem, minimum = minimise_at_any_distance(problem, start, make, **self.options)
-                factor = _sigma0(problem, minimum)
-                more = find_undetermined(problem, minimum.values, factor)
-                begin = partial(carry, before=problem, values=minimum.values)
+                found, minimum = minimise_at_any_distance(problem, start, make, **self.options)
+                factor = _sigma0(found, minimum)
+                more = find_undetermined(found, minimum.values, factor)
+                begin = partial(carry, before=found, values=minimum.values)
                 if not more:
-                    return problem, minimum, tuple(check), gone, current
+                    minimum = join_legs([*legs, minimum])
+                    return found, minimum, tuple(check), gone, current
             gone += more
 
 

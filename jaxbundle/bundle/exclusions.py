@@ -12,10 +12,10 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.far_points import NARROW, angle_of_rays
+from jaxbundle.bundle.far_points import VAGUE, angle_of_rays, noise_of_rays
 from jaxbundle.bundle.minimum import adjusted_cameras
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import list_some
@@ -74,23 +74,39 @@ def find_undetermined(problem: Problem, values: Values, factor: float | None) ->
     **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
     """
     network = problem.network
-    finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
-    narrow = angle_of_rays(problem, values) < NARROW
-    flat = _see_nearly_a_line(problem, values) & _have_only_rays(problem)
-    if not finite or not (narrow.any() or flat.any()):
+    narrow, flat = _find_candidates(problem, values, factor)
+    if not (narrow.any() or flat.any()):
         return Undetermined()
-    seen = sights(network.replace(cameras=_cameras(problem, values)))
-    if factor is None and not np.median(seen.sigma) < LARGEST_SIGMA:
-        return Undetermined()
+    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
     model = _adjusted_model(problem, values, network, seen)
-    ties = network.points.has_role("tie")
-    free = ties & ~problem.system.kept_rows & (equations_of(network, "POINTS") == 0)
-    free[network.distances.points.ravel()] = False
-    points, one_place = have_one_line(seen, model, narrow & free, factor or 1.0)
+    points, one_place = have_one_line(seen, model, narrow, factor or 1.0)
     images = flat & see_a_line(seen, model, factor or 1.0)
-    points &= 2 * points.sum() < ties.sum()
+    points &= 2 * points.sum() < network.points.has_role("tie").sum()
     images &= 2 * images.sum() < len(network.images)
     return Undetermined(_notes(network, seen, points, one_place, images))
+
+
+def may_be_undetermined(problem: Problem, values: Values) -> bool:
+    """Whether there are points or images that rays may not determine: worth a look after a few
+    iterations, before they cost many."""
+    return any(mask.any() for mask in _find_candidates(problem, values, None))
+
+
+def _find_candidates(problem: Problem, values: Values, factor: float | None):
+    """Tie points with nearly parallel rays, and images whose points are nearly on a line, that
+    nothing but image points determines: found without the rays, which are rarely needed."""
+    network = problem.network
+    ties, one = network.points.has_role("tie"), len(network.images)
+    none = np.zeros(len(ties), bool), np.zeros(one, bool)
+    noise = noise_of_rays(problem)
+    finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
+    if not finite or factor is None and noise > LARGEST_SIGMA:
+        return none
+    noise *= VAGUE * (factor or 1.0)
+    free = ties & ~problem.system.kept_rows & (equations_of(network, "POINTS") == 0)
+    free[network.distances.points.ravel()] = False
+    narrow = free & (angle_of_rays(problem, values) < noise)
+    return narrow, _have_only_rays(problem) & (_width_of_points(problem, values) < noise)
 
 
 def _notes(network: Network, seen: Sights, points, one_place, images) -> tuple[LeftOut, ...]:
@@ -116,8 +132,8 @@ def _have_only_rays(problem: Problem) -> Bool[np.ndarray, " images"]:
     return own if len(problem.layout.sets) == len(problem.system.observations) else ~own & own
 
 
-def _see_nearly_a_line(problem: Problem, values: Values) -> Bool[np.ndarray, " images"]:
-    """Images whose points are within a narrow angle of a line, cheaply."""
+def _width_of_points(problem: Problem, values: Values) -> Float[np.ndarray, " images"]:
+    """The RMS angle between the points of every image and their best line, radians."""
     image, n = problem.image, len(problem.network.images)
     X = np.asarray(values.point)[problem.point]
     away = np.linalg.norm(X - np.asarray(values.position)[image], axis=1)
@@ -130,11 +146,7 @@ def _see_nearly_a_line(problem: Problem, values: Values) -> Bool[np.ndarray, " i
     scaled = root[:, None] * (X - (total(root[:, None] ** 2 * X) / weight)[image])
     C = np.nan_to_num(total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3))
     number = np.maximum(np.bincount(image, minlength=n), 1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:, 1], 0) / number) < NARROW
-
-
-def _cameras(problem: Problem, values: Values):
-    return tuple(adjusted_cameras(problem, values).values())
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:, 1], 0) / number)
 
 
 def _adjusted_model(problem: Problem, values: Values, network: Network, seen: Sights) -> Model:

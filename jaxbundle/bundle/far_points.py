@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution, minimise
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
@@ -29,6 +30,10 @@ NARROW, PARALLEL = 0.03, 1e-3
 """Largest angle between the rays, in radians, of a point that may be at any distance; and of one
 that is so from the start, unless half of the tie points are: then all images have nearly the same
 projection centre."""
+VAGUE = 10.0
+"""Points with an angle between rays below this number of σ of a ray are at any distance from the
+start as well: σ of their distance is above a tenth of it, so that the distance is far from linear
+in the observations, and its reciprocal nearly is."""
 EVALUATIONS_BEFORE_RELEASE = 30
 """Evaluations before narrow points are put at any distance; twice as many if half of the tie points
 are narrow."""
@@ -49,7 +54,7 @@ def minimise_at_any_distance(
     if not (angle < NARROW).any():
         return problem, minimise(problem, start, max_steps=max_steps, **options)
     mostly = lambda narrow: 2 * narrow.sum() >= (angle < np.pi).sum()
-    legs, parallel = [], angle < PARALLEL
+    legs, parallel = [], angle < max(PARALLEL, min(VAGUE * noise_of_rays(problem), NARROW))
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
             patience = EVALUATIONS_BEFORE_RELEASE * (2 if mostly(angle < NARROW) else 1)
@@ -63,10 +68,10 @@ def minimise_at_any_distance(
         if far is not None:
             found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
             if inspect_solution(found.with_factor(), minimum):
-                return found, _join([*legs, minimum])
+                return found, join_legs([*legs, minimum])
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]
-    return problem, _join([*legs, minimise(problem, start, max_steps=left, **options)])
+    return problem, join_legs([*legs, minimise(problem, start, max_steps=left, **options)])
 
 
 def minimise_with_infinity(
@@ -91,11 +96,21 @@ def minimise_with_infinity(
         released += held & ~there
         changed = (there != held).any()
         if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
-            return problem, _join(legs)
+            return problem, join_legs(legs)
         steps = EVALUATIONS_BETWEEN_CHECKS if changed else 2 * steps
         if changed:
             held = there
             problem = _hold_at_infinity(problem, held, start)
+
+
+def noise_of_rays(problem: Problem) -> float:
+    """The median a priori σ of an image coordinate, in principal distances."""
+    network = problem.network
+    c = np.array([
+        min((camera.parameters[n] for n in get_model(camera.model).principal_distance), default=1.0)
+        for camera in network.cameras
+    ])  # fmt: skip
+    return float(np.median(network.observations.sigma.max(1) / np.abs(c[problem.camera])))
 
 
 def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
@@ -194,7 +209,7 @@ def _unit(problem: Problem) -> float:
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 
 
-def _join(legs: Sequence[Minimum]) -> Minimum:
+def join_legs(legs: Sequence[Minimum]) -> Minimum:
     """Several successive minimisations combined into one; each but the first re-evaluates the end
     point of the previous one."""
     if len(legs) == 1:
