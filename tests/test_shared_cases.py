@@ -111,3 +111,35 @@ def test_camcal_with_blunders():
     for name, entry in clean.cameras["cam"]["parameters"].items():
         if entry["free"]:
             assert abs(huber[name]["value"] - entry["value"]) < huber[name]["sigma"]
+
+
+SMALL = CASES.parent / "data" / "real" / "small"
+needs_small = pytest.mark.skipif(not SMALL.is_dir(), reason="../shared/data/real is not here")
+
+
+@needs_small
+def test_a_repeated_video_frame_leaves_the_rest_adjusted():
+    """Three points are seen only in the two equal frames; σ0 without frame and points 0.6146."""
+    network = jaxbundle.read_network(SMALL / "twin_frames" / "project.toml")
+    result = adjust(network)
+    assert result.converged
+    (note,) = result.problem.network.left_out
+    assert note.names == ("only_twins0", "only_twins1", "only_twins2")
+    assert any("'i5_again' repeats 'i5'" in line for line in result.warnings)
+    images, keep = network.images, np.array([id != "i5_again" for id in network.images.id])
+    single = adjust(network.replace(
+        images=images.take(keep),
+        observations=network.observations.take(keep[network.observations.image]),
+    ))  # fmt: skip
+    assert (single.counts.observations, single.counts.unknowns) == (360, 126)
+    assert single.sigma0 == pytest.approx(0.6146, abs=1e-4)
+    # the same minimum with the frame twice: its residuals count twice
+    np.testing.assert_allclose(result.image_values[:6], single.image_values, atol=0.05)
+
+
+@needs_small
+def test_poor_start_values_of_a_fisheye_lose_nothing():
+    result = adjust(jaxbundle.read_network(SMALL / "poor_start_poses" / "project.toml"))
+    assert result.converged and not result.problem.network.left_out
+    assert (result.counts.observations, result.counts.unknowns) == (2486, 387)
+    assert result.sigma0 == pytest.approx(1.010, abs=1e-3)

@@ -15,7 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.far_points import VAGUE, angle_of_rays, noise_of_rays
+from jaxbundle.bundle.far_points import (
+    NARROW,
+    PARALLEL,
+    VAGUE,
+    angle_of_rays,
+    noise_of_rays,
+)
 from jaxbundle.bundle.minimum import adjusted_cameras
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import list_some
@@ -87,9 +93,14 @@ def find_undetermined(problem: Problem, values: Values, factor: float | None) ->
 
 
 def may_be_undetermined(problem: Problem, values: Values) -> bool:
-    """Whether there are points or images that rays may not determine: worth a look after a few
-    iterations, before they cost many."""
-    return any(mask.any() for mask in _find_candidates(problem, values, None))
+    """Whether start values show points or images that rays may not determine: worth a look after a
+    few iterations, before they cost many. Rays of poor start values converge in appearance, so that
+    all narrow points count, unless some are parallel: these would drift meanwhile."""
+    narrow, flat = _find_candidates(problem, values, None)
+    angle = angle_of_rays(problem, values)
+    return bool(
+        narrow.any() or flat.any() or ((angle < NARROW).any() and not (angle < PARALLEL).any())
+    )
 
 
 def _find_candidates(problem: Problem, values: Values, factor: float | None):
@@ -184,7 +195,8 @@ def take_back(
     new = model.held & ~model.known
     model.X[new], model.known[new] = given.points.position[new], True
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
-    grow(seen, model)
+    straight = see_a_line(seen, model, factor) & ~model.placed
+    grow(seen, model, ~straight)
     intersect(seen, model, FOR_ITSELF)
     place_far_points(seen, model)
     used = _are_among(given, current)
@@ -206,6 +218,8 @@ def take_back(
     )
     known = np.isfinite(X).all(1)
     missing_images, missing_points = explain_missing(given, seen, model, known | line)
+    for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
+        missing_images[images.id[k]] = "its points are on one line, about which it may turn"
     network = given.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),

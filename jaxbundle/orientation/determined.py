@@ -1,18 +1,21 @@
 """What the rays of a network determine, within their noise: points, and the images of points.
 
-**Points.** The rays of a point determine it unless they are one line. With the unit directions dᵢ
-in the object frame, the projection centres X0ᵢ, p = 1/σᵢ² of the directions (radians), and u the
-common direction, the first eigenvector of Σ pᵢ·dᵢ·dᵢᵀ,
+**Points.** The rays of a point determine it unless they are one line. With their unit directions dᵢ
+in the object frame, p = 1/σᵢ² of these (radians), u the common direction, the first eigenvector of
+Σ pᵢ·dᵢ·dᵢᵀ, and rᵢ the distance, across u, of projection centre i from their mean, a point at the
+distance sᵢ misses the rays by the angles of
 
-    T = Σ pᵢ·|dᵢ × u|²              the angles between rays, χ² of 2n − 2 if all are parallel
-    B = Σ pᵢ·(|rᵢ|/sᵢ)²             the angles that there would be if the point were as far away
-                                    as is usual, rᵢ = X0ᵢ − X̄0 across u, sᵢ the median distance
-                                    from image i to its points
+    T(s) = Σ pᵢ·|rᵢ/sᵢ + dᵢ⊥|²,        dᵢ⊥ = dᵢ − (dᵢ·u)·u,
 
-Rays are parallel if T is below the quantile of χ². If B is above it, the point is far away: its
-direction is determined, and a least distance. If B is below it too, the rays say nothing about the
-distance: the images were taken from one place, or the point lies on the line through their
-projection centres.
+which is χ² of 2n − 2 if the point is there. sᵢ is the median distance from image i to its points.
+If half of it, all of it and twice of it pass the test, the rays say nothing about the distance: the
+images were taken from one place, or the point lies on the line through their projection centres.
+Parallel rays from places apart fail it: such a point is far away, its direction determined, and a
+least distance.
+
+Orientations have errors too. At the distances of its n points those of an image have, on average,
+3/n of the variance of a ray (six unknowns from 2n coordinates), which is added; at infinity they
+would have much more, if rotation and position compensate each other.
 
 **Images.** Points on a line leave a rotation of their image about this line open. They are on it if
 their distances eᵢ from it are seen at angles within the noise, Σ pᵢ·(|eᵢ|/sᵢ)² below the quantile
@@ -48,32 +51,37 @@ def have_one_line(
         [np.bincount(point, v, seen.points) for v in values.reshape(len(rows), -1).T], 1
     )
     d = np.einsum("nij,ni->nj", model.M[image], seen.ray[rows])
-    p = 1 / (factor * seen.sigma[rows]) ** 2
+    measured = np.bincount(seen.image[seen.sigma > 0], minlength=seen.images)[image]
+    p = 1 / ((factor * seen.sigma[rows]) ** 2 * (1 + 3 / measured))
     S = total(p[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(-1, 3, 3)
     u = np.linalg.eigh(S)[1][:, :, 2]
     weight = np.maximum(np.bincount(point, p, seen.points), 1e-300)[:, None]
     away = model.X0[image] - (total(p[:, None] * model.X0[image]) / weight)[point]
-    across = np.cross(away, u[point])
-    of_angles = np.bincount(point, p * np.square(np.cross(d, u[point])).sum(1), seen.points)
-    usual = usual_distances(seen, model)[image]
-    seen_at = lambda v: np.bincount(point, p * np.square(v / usual[:, None]).sum(1), seen.points)
+    u = u[point]
+    across = lambda v: v - (v * u).sum(1, keepdims=True) * u
+    r, off = across(away), across(d) * np.sign((d * u).sum(1, keepdims=True))
+    usual = usual_distances(seen, model)[image, None]
+    misses = lambda v: np.bincount(point, p * np.square(v).sum(1), seen.points)
     limit = _quantiles(2 * number - 2)
-    one_line = (number > 1) & (of_angles < limit) & (seen_at(across) < limit)
-    return one_line, one_line & (seen_at(away) < limit)
+    one_line = number > 1
+    for distance in (0.5 * usual, usual, 2 * usual):
+        one_line &= misses(r / distance + off) < limit
+    return one_line, one_line & (misses(away / usual) < limit)
 
 
 def see_a_line(
     seen: Sights, model: Model, factor: float = 1.0
 ) -> Bool[np.ndarray, " images"]:
-    """Which placed images see points on a line only, or fewer than three points."""
-    rows = np.flatnonzero(
-        model.placed[seen.image] & model.known[seen.point] & (seen.sigma > 0)
-    )
+    """Which images see known points on a line only, or fewer than three. Images that are not placed
+    count as at the usual distance."""
+    rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
     image = seen.image[rows]
     number = np.bincount(image, minlength=seen.images)
-    X = model.X[seen.point[rows]]
+    X, placed = model.X[seen.point[rows]], model.placed[image]
+    away = np.linalg.norm(X - model.X0[image], axis=1)
+    away = np.where(placed, away, usual_distances(seen, model)[image])
     # Distances of the points from the image weigh their offsets; the line is that of least squares.
-    root = 1 / (factor * seen.sigma[rows] * np.linalg.norm(X - model.X0[image], axis=1))
+    root = 1 / (factor * seen.sigma[rows] * away)
     total = lambda values: np.stack(
         [np.bincount(image, v, seen.images) for v in values.reshape(len(rows), -1).T], 1
     )
@@ -82,7 +90,7 @@ def see_a_line(
     scaled = root[:, None] * away
     C = total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3)
     off = np.linalg.eigvalsh(C)[:, :2].sum(1)
-    return model.placed & (number > 0) & (off < _quantiles(2 * number - 4))
+    return (number > 0) & (off < _quantiles(2 * number - 4))
 
 
 def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
