@@ -20,6 +20,7 @@ from jaxbundle.bundle.far_points import (
     join_legs,
     minimise_at_any_distance,
     minimise_with_infinity,
+    noise_of_rays,
 )
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
@@ -51,8 +52,9 @@ from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.network.unit_mistakes import name_pixels
+from jaxbundle.network.unit_mistakes import name_pixels, name_sigma_unit
 from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
@@ -61,6 +63,9 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_robust
 from jaxbundle.types import present
 
+LARGEST_START_MISFIT = 0.1
+"""Radians, RMS: no start values in the right convention predict image points so badly that an
+adjustment from them settles by itself."""
 MISFIT = 5.0
 """For a larger σ0, likely causes are searched for."""
 EVALUATIONS_BEFORE_A_LOOK = 6
@@ -347,10 +352,17 @@ def _likely_causes(
     accepted = np.asarray(minimum.history.accepted)[:tried]
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
-        return ()
+        # Settled far from its start, it may be a mirror image; or σ is in a larger unit.
+        start = np.sqrt(2 * np.asarray(minimum.history.cost)[0] / problem.counts.observations)
+        far = start * noise_of_rays(problem) > LARGEST_START_MISFIT
+        sigma0 = _sigma0(problem, minimum)
+        causes = name_image_convention(network) if far else "", name_sigma_unit(network, sigma0)
+        return tuple(filter(None, causes))
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     causes = (
-        name_pixels(network), name_angle_unit(network),
+        name_pixels(network), name_angle_unit(network), name_image_convention(network),
+        name_image_extent(network),
+        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
         "" if told else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
@@ -377,7 +389,8 @@ def _place(found: Oriented) -> Oriented:
     ):  # fmt: skip
         if len(reasons) >= left:
             said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
-            cause = name_pixels(network)
+            causes = filter(None, (name_pixels(network), name_image_extent(network)))
+            cause = "; ".join(causes)
             raise NotSolvedError(
                 f"not solved: no start values for {len(reasons)} of "
                 f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import Camera, Network, Points
 
 LARGEST_RADIUS = 10.0
 """Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
@@ -29,6 +29,15 @@ LEAST_PIXELS = 300.0
 """No camera has a c of fewer pixels."""
 HALF_OF_POINTS = 1 / 3
 """Width of an image evenly filled from whose centre half of its points lie (sides 3 : 2)."""
+FAR, STEEP = 1000.0, 3.0
+"""Degrees: coordinates of more than this many of their extents (12 km at 120° of longitude), and
+heights that extend over more than this many (3 m to 111 km of ground)."""
+SIGMA0_RANGE = (0.1, 10.0)
+"""σ0 within these is a matter of precision; units differ by more."""
+AGREEING = 4.0
+"""Largest ratio of σ0 to the ratio of two units: a guessed σ is right to about this factor."""
+FINEST_PIXELS = 0.005
+"""No image point is measured more precisely, in pixels."""
 MILLIMETRE_RATIOS = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
@@ -36,7 +45,10 @@ MILLIMETRE_RATIOS = (300.0, 3000.0)
 def check_units(network: Network) -> Network:
     """The network, with warnings for lengths that seem to be in another unit.
 
-    **Raises:** `InputError` if half of a camera's image points would be outside any lens."""
+    **Raises:** `InputError` if half of a camera's image points would be outside any lens, and for
+    known points in degrees."""
+    if degrees := name_degrees(network.points):
+        raise InputError(f"{network.points.source.name}: {degrees}")
     of_camera = network.images.camera[network.observations.image]
     said = []
     for c, camera in enumerate(network.cameras):
@@ -72,6 +84,54 @@ def _check_field(camera: Camera, xy) -> str:
     if size is not None or camera.image_size is not None:
         return _in_pixels(camera, xy)
     return ""
+
+
+def name_degrees(points: Points) -> str:
+    """Whether X and Y of known points are longitude and latitude in degrees, in words; else empty.
+
+    They are within ±180 and ±90, hardly differ for their distance from 0, and the heights differ by
+    more: a degree is 111 km, so that any ground is steep in these numbers."""
+    known = points.has_role("control", "fixed", "check") & np.isfinite(points.position).all(1)
+    if known.sum() < 2:
+        return ""
+    low, high = points.position[known].min(0), points.position[known].max(0)
+    extent = max((high - low)[:2])
+    largest = np.maximum(np.abs(low), np.abs(high))
+    swapped = largest[0] <= 90 and largest[1] <= 180
+    if not (largest[0] <= 180 and largest[1] <= 90 or swapped):
+        return ""
+    if not (largest[:2].max() > FAR * extent and high[2] - low[2] > STEEP * extent):
+        return ""
+    return (
+        f"X and Y of the {count(int(known.sum()), 'known point')} look like longitude and latitude "
+        f"in degrees (X {low[0]:.8g} to {high[0]:.8g}, Y {low[1]:.8g} to {high[1]:.8g}, Z "
+        f"{low[2]:.4g} to {high[2]:.4g}): expected are coordinates in one unit of length; convert "
+        "them to a map projection, such as UTM, or to a local system"
+    )
+
+
+def name_sigma_unit(network: Network, sigma0: float) -> str:
+    """The unit in which the a priori σ of image coordinates would agree with σ0, in words; empty if
+    σ0 is not far from 1, or no unit does."""
+    if SIGMA0_RANGE[0] < sigma0 < SIGMA0_RANGE[1] or not sigma0 > 0:
+        return ""
+    camera, sigma = network.cameras[0], float(np.median(network.observations.sigma))
+    unit, pitch = get_model(camera.model).unit, camera.pixel_size and abs(camera.pixel_size[0])
+    if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
+        unit, sigma = "px", sigma / pitch
+    if unit == "mm":
+        meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
+    else:
+        meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < FINEST_PIXELS else {}
+    near = {u: f for u, f in meant.items() if 1 / AGREEING < sigma0 / f < AGREEING}
+    if not near:
+        return ""
+    other = min(near, key=lambda u: abs(np.log(sigma0 / near[u])))
+    return (
+        f"σ0 is {sigma0:.3g}: the a priori σ of the image coordinates, {sigma:.4g} {unit}, looks "
+        f"like one in {other}; it is expected in {unit}: {sigma * near[other]:.3g} (times "
+        f"{near[other]:.4g})"
+    )
 
 
 def name_pixels(network: Network) -> str:

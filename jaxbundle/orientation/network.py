@@ -31,6 +31,7 @@ from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
+from jaxbundle.orientation.conventions import name_image_extent
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
     AGREEING_SHARE,
@@ -144,7 +145,8 @@ def find_start_values(
 
 
 def _no_start_values(network: Network, why: str) -> NotSolvedError:
-    causes = "; ".join(filter(None, (why, name_pixels(network))))
+    extent = name_image_extent(network)
+    causes = "; ".join(filter(None, (why, name_pixels(network), extent)))
     return NotSolvedError(f"no start values found: {causes}", _names(network))
 
 

@@ -26,12 +26,16 @@ from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
 from jaxbundle.network.columns import Columns, count, did_you_mean, list_some, show
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
+from jaxbundle.network.unit_mistakes import name_degrees
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.network import find_start_values
 
 PLAIN = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
 NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
+WORST_FIT = 0.3
+"""Median residual of a similarity, relative to the RMS distance of the control from its mean, from
+which it is none: of points in random order it is about 1."""
 LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
@@ -62,13 +66,14 @@ def read_control(path: str | Path) -> Points:
         raise InputError(
             f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
             f"{', '.join(PLAIN[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+            f"{_split_name(rows[0], separator)}"
         )
     header = header or PLAIN[: len(rows[0])]
     for (number, _), row in zip(lines, rows):
         if len(row) != len(header):
             raise InputError(
                 f"{path}, line {number}: {len(row)} cells where {len(header)} are expected "
-                f"({', '.join(header)})"
+                f"({', '.join(header)}){_split_name(row, separator)}"
             )
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
@@ -91,6 +96,16 @@ def _cells(line: str, separator: str | None) -> list[str]:
         return line.split()
     (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
     return [cell.strip() for cell in row]
+
+
+def _split_name(row: list[str], separator: str | None) -> str:
+    """A hint that a name with a blank fills two columns."""
+    if separator is not None or len(row) < 5:
+        return ""
+    return (
+        f"; is {' '.join(row[:2])!r} one name? Here blanks separate columns: write it without, or "
+        "separate the columns by commas"
+    )
 
 
 def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
@@ -147,7 +162,10 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
             f"{control.source.name}: none of its {len(control)} points is one of the network; it "
             f"has {list_some(network.points.id)}"
         )
-    network = _in_the_frame_of(network, at, control.position[rows])
+    if degrees := name_degrees(control):
+        raise InputError(f"{control.source.name}: {degrees}")
+    names = [control.id[k] for k in rows]
+    network = _in_the_frame_of(network, at, control.position[rows], names, control.source.name)
     points = network.points
     named = np.zeros(len(points), bool)
     named[at] = True
@@ -173,8 +191,10 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     return network.warn(*warnings)
 
 
-def _in_the_frame_of(network: Network, at, target) -> Network:
-    """The network with start values transformed so that control points `at` are at `target`."""
+def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> Network:
+    """The network with start values transformed so that control points `at` are at `target`.
+
+    **Raises:** `InputError` if they fit no similarity: then it would not be in that frame."""
     images, points = network.images, network.points
     if np.isfinite(images.sigma).any() or not np.isfinite(images.position).any():
         return network
@@ -190,6 +210,16 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
     if np.median(np.linalg.norm(source - target, axis=1)) <= LARGEST_OFFSET * extent:
         return network
     A, t = found
+    off = np.linalg.norm(source @ A.T + t - target, axis=1)
+    spread = np.sqrt(np.square(target - target.mean(0)).sum(1).mean())
+    if np.median(off) > WORST_FIT * spread:
+        worst = [np.array(names)[known][k] for k in np.argsort(-off)]
+        raise InputError(
+            f"{source_name}: the control fits no similarity of the start values of the input: its "
+            f"{count(len(off), 'point')} are within {spread:.3g} {network.object_unit} of their "
+            f"mean and {np.median(off):.3g} off (median), most of all {list_some(worst, 3)}; check "
+            "names and units of the table, or leave out the start values of the input"
+        )
     scale = np.cbrt(np.linalg.det(A))
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t

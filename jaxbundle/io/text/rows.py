@@ -11,6 +11,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
 
+BLANKS = "; blanks separate columns, so that no name may have one"
+
 
 class Row:
     """A line of a file: its place, text, and words."""
@@ -18,6 +20,7 @@ class Row:
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
         self.path, self.number, self.text = path, number, text
         self.words = [word.strip() for word in text.split(separator)]
+        self.separator = separator
 
     def __len__(self) -> int:
         return len(self.words)
@@ -37,8 +40,9 @@ class Row:
         """The numbers from the word `first` on, called `what`; no others unless `more`."""
         words = self.words[first:]
         if len(words) < len(what) or (len(words) > len(what) and not more):
+            split = BLANKS if len(words) > len(what) and self.separator is None else ""
             raise self.error(
-                f"{len(words)} values where {len(what)} are expected ({', '.join(what)})"
+                f"{len(words)} values where {len(what)} are expected ({', '.join(what)}){split}"
             )
         return np.array([self._number(word, name) for word, name in zip(words, what)])
 

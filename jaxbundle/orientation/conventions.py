@@ -1,0 +1,141 @@
+"""Image coordinates in another convention than the expected one: an axis in the other direction,
+exchanged axes, another origin.
+
+Expected are pixels from the centre of the upper-left one, u right and v down, or mm from the image
+centre, x right and y up, as the model of the camera has it. Start values of images and points
+predict every image point. If the predictions are far from the measurements, but near one of the
+eight symmetries of the image, about its centre or about a corner, that is their convention. Without
+start values the extent of the coordinates shows another origin or unit.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import get_model
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation.sights import sights
+
+LARGEST_MISCLOSURE = 3.0
+"""Limit for the median misclosure of image points, in tolerances of start values; as of
+`angle_units`."""
+MUCH_BETTER = 10.0
+"""Least ratio of the misclosures of the expected convention and of another that fits."""
+MOST_RAYS = 2000
+"""Image points that are tried: the median of so many is known to 2 %."""
+OUTSIDE_SHARE = 0.25
+"""Part of the image points outside the image from which another origin is suspected: of centred
+coordinates three quarters are outside, of a few blunders less."""
+SMALL_PART = 0.02
+"""Part of an image, about its first pixel, in which all points lie if they are in mm: sensors of 36
+mm have 2000 columns and more."""
+SYMMETRIES = {
+    (1, 0, 0, -1): "{y} is counted in the other direction",
+    (-1, 0, 0, 1): "{x} is counted in the other direction",
+    (-1, 0, 0, -1): "the image is turned by 180°",
+    (0, 1, 1, 0): "{x} and {y} are exchanged",
+    (0, -1, -1, 0): "{x} and {y} are exchanged, both in the other direction",
+    (0, -1, 1, 0): "the image is turned by 90°",
+    (0, 1, -1, 0): "the image is turned by −90°",
+}
+SAME = (1, 0, 0, 1)
+EXPECTED = {
+    "px": "pixels from the centre of the upper-left pixel, u right, v down",
+    "mm": "mm from the image centre, x right, y up",
+}
+
+
+def name_image_convention(network: Network) -> str:
+    """The convention in which the image coordinates fit the start values, in words; empty if the
+    expected one does, or no other."""
+    images, points, rays = network.images, network.points, network.observations
+    placed = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
+    known = np.isfinite(points.position).all(1)
+    rows = np.flatnonzero(placed[rays.image] & known[rays.point])
+    if not len(rows):
+        return ""
+    rows = rows[many.spread(len(rows), MOST_RAYS)]
+    some = network.replace(observations=rays.take(rows))
+    centres, halves = (np.array(v) for v in zip(*(_frame(c) for c in network.cameras)))
+    camera = images.camera[some.observations.image]
+    missed = {(SAME, False): _misclosure(some, placed, known)}
+    if missed[SAME, False] <= LARGEST_MISCLOSURE:
+        return ""
+    m, half = centres[camera], halves[camera]
+    for symmetry, shifted in itertools.product([SAME, *SYMMETRIES], [False, True]):
+        if (symmetry, shifted) in missed or shifted and not np.isfinite(half).all():
+            continue
+        # Centred coordinates instead of those from a corner, or the other way round.
+        middle = np.where(m == 0, half, 0.0) if shifted else m
+        xy = (some.observations.xy - middle) @ np.reshape(symmetry, (2, 2)).T + m
+        changed = dataclasses.replace(some.observations, xy=xy)
+        missed[symmetry, shifted] = _misclosure(some.replace(observations=changed), placed, known)
+    best = min(missed, key=lambda k: missed[k])  # The expected one, and simple ones, come first.
+    if not MUCH_BETTER * missed[best] < missed[SAME, False]:
+        return ""
+    unit = get_model(network.cameras[0].model).unit
+    x, y = ("u", "v") if unit == "px" else ("x", "y")
+    words = []
+    if best[1]:
+        words.append("they are counted from the image centre" if unit == "px" else
+                     "they are counted from a corner of the image")  # fmt: skip
+    if best[0] != SAME:
+        words.append(SYMMETRIES[best[0]].format(x=x, y=y))
+    return (
+        f"the image coordinates fit the start values if {' and '.join(words)}: expected are "
+        f"{EXPECTED[unit]}; change them in the input"
+    )
+
+
+def _frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """The image centre, and half the size of the image, in the unit of the model; NaN: unknown."""
+    size, pitch = camera.image_size, camera.pixel_size
+    if get_model(camera.model).unit == "px":
+        half = np.full(2, np.nan) if size is None else np.array(size) / 2
+        point = [camera.parameters.get(n, 0.0) for n in get_model(camera.model).principal_point]
+        centre = half - 0.5 if size is not None else np.array(point if len(point) == 2 else [0, 0])
+        return np.asarray(centre, float), half
+    known = size is not None and pitch is not None
+    return np.zeros(2), np.array(size) * pitch / 2 if known else np.full(2, np.nan)
+
+
+def _misclosure(network: Network, placed, known) -> float:
+    """The median misclosure of start values, in tolerances; infinite if half have no ray."""
+    seen, images = sights(network), network.images
+    if 2 * len(seen.row) < len(network.observations):
+        return np.inf
+    model = Model.empty(seen)
+    model.place(placed, images.position[placed], many.matrices(images.angles[placed]))
+    model.X[known] = network.points.position[known]
+    return float(np.median(misclosures(seen, model) / seen.tolerance[seen.image]))
+
+
+def name_image_extent(network: Network) -> str:
+    """Whether image coordinates lie where no image is, in words: another origin, or unit."""
+    camera = network.images.camera[network.observations.image]
+    for c, given in enumerate(network.cameras):
+        xy = network.observations.xy[camera == c]
+        centre, half = _frame(given)
+        if not len(xy) or not np.isfinite(half).all():
+            continue
+        unit = get_model(given.model).unit
+        low, high = np.quantile(xy, [0.01, 0.99], axis=0)
+        said = (
+            f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, {low[1]:.4g} to "
+            f"{high[0]:.4g}, {high[1]:.4g} {unit}, where the image is from "
+            f"{(centre - half)[0]:.4g}, {(centre - half)[1]:.4g} to "
+            f"{(centre + half)[0]:.4g}, {(centre + half)[1]:.4g}"
+        )
+        if unit == "px" and (np.abs([low, high]) < SMALL_PART * 2 * half).all():
+            return f"{said}: are they in mm? Expected are {EXPECTED[unit]}"
+        outside = (np.abs(xy - centre) > half).any(1).mean()
+        shifted = np.where(centre == 0, half, 0.0)
+        if outside > OUTSIDE_SHARE and (np.abs(xy - shifted) <= half).all(1).mean() > 0.99:
+            origin = "the image centre" if unit == "px" else "a corner of the image"
+            return f"{said}: are they counted from {origin}? Expected are {EXPECTED[unit]}"
+    return ""
+

@@ -1,0 +1,175 @@
+"""Mistakes in an input, said as what they are: units, conventions of image coordinates, control that
+fits nothing, names with blanks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.networks.control import read_control, with_control
+from jaxbundle.network.unit_mistakes import name_degrees, name_sigma_unit
+from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+
+TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
+RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
+MM = Camera("cam", "brown", {"c": 24.0}, image_size=(6000, 4000), pixel_size=(0.006, 0.006))
+PX = Camera("cam", "opencv", {"fx": 4000.0, "fy": 4000.0, "cx": 2999.5, "cy": 1999.5},
+            image_size=(6000, 4000))  # fmt: skip
+
+
+def network(camera=MM, **options):
+    noise = 0.3 * (0.006 if camera is MM else 1)
+    return simulate(RING, TARGETS, camera, noise=noise, seed=3, disturb=0.005, **options)
+
+
+def with_xy(given, change):
+    rays = given.observations
+    return given.replace(observations=dataclasses.replace(rays, xy=change(rays.xy)))
+
+
+def without_start_values(given):
+    images, points = given.images, given.points
+    nothing = np.full_like(images.position, np.nan)
+    tie = points.has_role("tie")[:, None]
+    return given.replace(
+        images=dataclasses.replace(images, position=nothing, angles=nothing),
+        points=dataclasses.replace(points, position=np.where(tie, np.nan, points.position)),
+    )
+
+
+# --- control --------------------------------------------------------------------------------
+
+
+def table(folder, X):
+    path = folder / "control.csv"
+    rows = (f"{k},{','.join(map(repr, x))},0.02,0.02,0.02" for k, x in X.items())
+    path.write_text("\n".join(["id,X,Y,Z,sX,sY,sZ", *rows]))
+    return path
+
+
+DEGREES = {
+    "1": (11.5731, 48.1402, 519.2), "5": (11.5752, 48.1404, 520.1),
+    "21": (11.5730, 48.1416, 518.4), "25": (11.5755, 48.1417, 519.9),
+}  # fmt: skip
+
+
+def test_control_in_degrees_is_said_and_not_adjusted(tmp_path):
+    """100 iterations, then 40 unknowns that are hardly separated."""
+    with pytest.raises(InputError, match=r"control.csv: X and Y of the 4 known points look like "
+                       r"longitude and latitude in degrees .*11.573.*projection"):  # fmt: skip
+        with_control(network(), read_control(table(tmp_path, DEGREES)))
+    points = network(control=(0, 4, 20, 24)).points
+    position = points.position.copy()
+    position[[0, 4, 20, 24]] = list(DEGREES.values())
+    given = network(control=(0, 4, 20, 24))
+    with pytest.raises(InputError, match="longitude and latitude"):
+        jaxbundle.adjust(given.replace(points=dataclasses.replace(points, position=position)))
+
+
+@pytest.mark.parametrize("X", [
+    TARGETS + [120.0, 35.0, 100.0],  # an object of 1 m in a local system
+    TARGETS * [1, 1, 0] + [12.0, 48.0, 0.0],  # flat
+    TARGETS * 200 + [4.5e6, 5.3e6, 500.0],  # a projection
+    TARGETS * 1e5 * [1, 1, 0.01],  # metres about 0
+])  # fmt: skip
+def test_metric_coordinates_are_not_taken_for_degrees(X):
+    points = network(control=range(25)).points
+    assert name_degrees(dataclasses.replace(points, position=X)) == ""
+
+
+def test_control_that_fits_no_similarity_is_named_with_its_residuals(tmp_path):
+    rng = np.random.default_rng(1)
+    ids = ("1", "3", "5", "12", "21", "25")
+    wrong = {id: tuple(rng.uniform(0, 80, 3).tolist()) for id in ids}
+    with pytest.raises(InputError, match=r"fits no similarity .* its 6 points .* off \(median\), "
+                       r"most of all '\d+'.*check names and units"):  # fmt: skip
+        with_control(network(), read_control(table(tmp_path, wrong)))
+    A = np.array([[0, -7.0, 0], [7, 0, 0], [0, 0, 7]])
+    right = {id: tuple((A @ TARGETS[int(id) - 1] + [900, 800, 70]).tolist()) for id in ids}
+    right["12"] = (910.0, 805.0, 72.0)  # one of them wrong: that is not the similarity's fault
+    moved = with_control(network(), read_control(table(tmp_path, right)))
+    assert any("a similarity by 6 points was applied" in line for line in moved.warnings)
+
+
+# --- conventions of image coordinates -------------------------------------------------------
+
+HALF = np.array([18.0, 12.0])
+CENTRE = np.array([2999.5, 1999.5])
+MISREAD = [
+    (MM, lambda xy: xy * [1, -1], "y is counted in the other direction"),
+    (MM, lambda xy: -xy, "turned by 180°"),
+    (MM, lambda xy: xy[:, ::-1], "x and y are exchanged"),
+    (MM, lambda xy: xy + HALF, "from a corner of the image: expected"),
+    (MM, lambda xy: xy * [1, -1] + HALF, "from a corner of the image and y is counted in the other"),
+    (PX, lambda uv: uv * [1, -1] + [0, 3999], "v is counted in the other direction"),
+    (PX, lambda uv: uv - CENTRE, "from the image centre: expected"),
+]
+
+
+@pytest.mark.parametrize("camera, misread, said", MISREAD)
+def test_another_convention_of_image_coordinates_is_named(camera, misread, said):
+    given = network(camera)
+    assert name_image_convention(given) == ""
+    found = name_image_convention(with_xy(given, misread))
+    assert said in found and "change them in the input" in found
+
+
+def test_a_flipped_axis_is_the_first_line_of_a_report_without_result():
+    try:
+        result = jaxbundle.adjust(with_xy(network(), MISREAD[0][1]))
+        said = result.report().split("Counts")[0]
+    except NotSolvedError as error:
+        said = str(error)
+    assert "y is counted in the other direction" in " ".join(said.split())
+
+
+@pytest.mark.parametrize("camera, misread, said", [
+    (MM, lambda xy: xy + HALF, "are they counted from a corner of the image?"),
+    (PX, lambda uv: uv - CENTRE, "are they counted from the image centre?"),
+    (PX, lambda uv: (uv - CENTRE) * [0.006, -0.006], "are they in mm?"),
+])  # fmt: skip
+def test_coordinates_where_no_image_is_name_their_origin_or_unit(camera, misread, said):
+    given = network(camera)
+    assert name_image_extent(given) == ""
+    assert said in name_image_extent(with_xy(given, misread))
+
+
+# --- σ --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera, sigma, said", [
+    (MM, 0.3, "0.3 mm, looks like one in pixels; it is expected in mm: 0.0018 (times 0.006)"),
+    (MM, 1.8, "1.8 mm, looks like one in µm; it is expected in mm: 0.0018 (times 0.001)"),
+    (PX, 0.0018, "looks like one in mm; it is expected in px"),
+])  # fmt: skip
+def test_a_sigma_in_another_unit_is_said_with_the_factor(camera, sigma, said):
+    given = network(camera)
+    rays = given.observations
+    wrong = dataclasses.replace(rays, sigma=np.full_like(rays.sigma, sigma))
+    result = jaxbundle.adjust(given.replace(observations=wrong))
+    assert result.converged
+    head = " ".join(result.report().split("Counts")[0].split())
+    assert "Attention σ0 is" in head and said in head
+    assert any(said in line for line in result.warnings)
+
+
+def test_a_sigma_that_is_only_poor_is_in_no_other_unit():
+    given = network()
+    assert name_sigma_unit(given, 5.0) == name_sigma_unit(given, 0.3) == ""
+    assert name_sigma_unit(given, 40.0) == ""
+
+
+# --- names ----------------------------------------------------------------------------------
+
+
+def test_names_that_blanks_split_are_said(tmp_path):
+    path = tmp_path / "control.txt"
+    path.write_text("P 1 10.0 20.0 3.0\nP 2 11.0 20.0 3.0\n")
+    with pytest.raises(InputError, match="control.txt, line 1: .* is 'P 1' one name. .* by commas"):
+        read_control(path)
+    path.write_text("id X Y Z\nP1 10.0 20.0 3.0\nP 2 11.0 20.0 3.0\n")
+    with pytest.raises(InputError, match="control.txt, line 3: .* is 'P 2' one name. .* by commas"):
+        read_control(path)
