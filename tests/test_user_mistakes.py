@@ -1,5 +1,5 @@
-"""Mistakes in an input, said as what they are: units, conventions of image coordinates, control that
-fits nothing, names with blanks."""
+"""Mistakes in an input, said as what they are: units, conventions of image coordinates, control
+that fits nothing, names with blanks."""
 
 import dataclasses
 
@@ -85,7 +85,7 @@ def test_control_that_fits_no_similarity_is_named_with_its_residuals(tmp_path):
     ids = ("1", "3", "5", "12", "21", "25")
     wrong = {id: tuple(rng.uniform(0, 80, 3).tolist()) for id in ids}
     with pytest.raises(InputError, match=r"fits no similarity .* its 6 points .* off \(median\), "
-                       r"most of all '\d+'.*check names and units"):  # fmt: skip
+                       r"most of all '\d+' by \d.*check names and units"):  # fmt: skip
         with_control(network(), read_control(table(tmp_path, wrong)))
     A = np.array([[0, -7.0, 0], [7, 0, 0], [0, 0, 7]])
     right = {id: tuple((A @ TARGETS[int(id) - 1] + [900, 800, 70]).tolist()) for id in ids}
@@ -103,7 +103,7 @@ MISREAD = [
     (MM, lambda xy: -xy, "turned by 180°"),
     (MM, lambda xy: xy[:, ::-1], "x and y are exchanged"),
     (MM, lambda xy: xy + HALF, "from a corner of the image: expected"),
-    (MM, lambda xy: xy * [1, -1] + HALF, "from a corner of the image and y is counted in the other"),
+    (MM, lambda xy: xy * [1, -1] + HALF, "a corner of the image and y is counted in the other"),
     (PX, lambda uv: uv * [1, -1] + [0, 3999], "v is counted in the other direction"),
     (PX, lambda uv: uv - CENTRE, "from the image centre: expected"),
 ]

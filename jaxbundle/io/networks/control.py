@@ -213,11 +213,12 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
     off = np.linalg.norm(source @ A.T + t - target, axis=1)
     spread = np.sqrt(np.square(target - target.mean(0)).sum(1).mean())
     if np.median(off) > WORST_FIT * spread:
-        worst = [np.array(names)[known][k] for k in np.argsort(-off)]
+        of = [name for name, there in zip(names, known) if there]
+        worst = (f"{of[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
         raise InputError(
             f"{source_name}: the control fits no similarity of the start values of the input: its "
             f"{count(len(off), 'point')} are within {spread:.3g} {network.object_unit} of their "
-            f"mean and {np.median(off):.3g} off (median), most of all {list_some(worst, 3)}; check "
+            f"mean and {np.median(off):.3g} off (median), most of all {list_some(worst, 3, str)}; check "
             "names and units of the table, or leave out the start values of the input"
         )
     scale = np.cbrt(np.linalg.det(A))
