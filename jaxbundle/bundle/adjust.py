@@ -192,7 +192,7 @@ class _First:
             problem, minimum, check, gone, current = found
             if rounds:  # Here they were left out at the end of an adjustment with them.
                 final += gone
-            part, factor = final.leave_out(given), _sigma0(problem, minimum)
+            part, factor = final.leave_out(given), _noise_factor(problem, minimum)
             whole = take_back(part, current, problem, minimum.values, factor)
             try:
                 whole = check_network(whole)
@@ -237,12 +237,12 @@ class _First:
             if not more and look and may_be_undetermined(problem, start):
                 options = self.options | {"max_steps": EVALUATIONS_BEFORE_A_LOOK}
                 legs, look = [minimise(problem, start, **options)], False
-                factor, start = _sigma0(problem, legs[0]), legs[0].values
+                factor, start = _noise_factor(problem, legs[0]), legs[0].values
                 more = find_undetermined(problem, start, factor)
                 begin = partial(carry, before=problem, values=start)
             if not more:
                 found, minimum = minimise_at_any_distance(problem, start, make, **self.options)
-                factor = _sigma0(found, minimum)
+                factor = _noise_factor(found, minimum)
                 more = find_undetermined(found, minimum.values, factor)
                 begin = partial(carry, before=found, values=minimum.values)
                 if not more:
@@ -368,6 +368,12 @@ def _likely_causes(
         "" if inspection else name_inseparable(problem, minimum),
     )  # fmt: skip
     return tuple(filter(None, causes))
+
+
+def _noise_factor(problem: Problem, minimum: Minimum) -> float:
+    """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
+    of the rays."""
+    return min(_sigma0(problem, minimum), MISFIT)
 
 
 def _sigma0(problem: Problem, minimum: Minimum) -> float:

@@ -31,19 +31,23 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.determined import have_one_line, see_a_line
 from jaxbundle.orientation.growth import (
     FOR_ITSELF,
+    Demands,
     Model,
     are_controlled,
     grow,
     intersect,
+    misclosures,
     place_far_points,
 )
 from jaxbundle.orientation.network import (
-    are_out_of_the_question,
     explain_missing,
     note_missing,
 )
 from jaxbundle.orientation.sights import Sights, sights
 
+COMES_BACK = Demands(FOR_ITSELF.angle, 1.0)
+"""On points and image points that come back: adjusted images are better than start values, which
+may miss by three times as much; blunders should not come back with the others."""
 LARGEST_SIGMA = 0.01
 """Radians: a ray of a larger a priori σ, half a degree, was not measured. Its σ is in a wrong unit
 or was not given, and says nothing before the adjustment has estimated it."""
@@ -197,10 +201,11 @@ def take_back(
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
     straight = see_a_line(seen, model, factor) & ~model.placed
     grow(seen, model, ~straight)
-    intersect(seen, model, FOR_ITSELF)
+    intersect(seen, model, COMES_BACK)
     place_far_points(seen, model)
     used = _are_among(given, current)
-    wrong = are_out_of_the_question(seen, model) & ~used[seen.row]
+    off = misclosures(seen, model) > COMES_BACK.miss * seen.tolerance[seen.image]
+    wrong = off & ~used[seen.row]
     kept = dataclasses.replace(seen, **{
         name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")
     })  # fmt: skip
@@ -216,7 +221,8 @@ def take_back(
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    known = np.isfinite(X).all(1)
+    # A tie point that was left out comes back if its rays meet, even if it has given coordinates.
+    known = np.isfinite(X).all(1) & (before | model.known | ~given.points.has_role("tie"))
     missing_images, missing_points = explain_missing(given, seen, model, known | line)
     for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
         missing_images[images.id[k]] = "its points are on one line, about which it may turn"

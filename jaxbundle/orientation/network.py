@@ -152,7 +152,7 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
 
 def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
     """Control points that most of their rays miss grossly."""
-    wrong = np.bincount(seen.point, are_out_of_the_question(seen, model), seen.points)
+    wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
     return are_controlled(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
@@ -167,7 +167,7 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     control = are_controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
-    wrong = are_out_of_the_question(seen, model)
+    wrong = _out_of_the_question(seen, model)
     seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
@@ -359,7 +359,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = seen.row[are_out_of_the_question(seen, model)]
+    wrong = seen.row[_out_of_the_question(seen, model)]
     keep = model.placed
     known = np.all(np.isfinite(X), axis=1)
     reasons = explain_missing(network, seen, model, known)
@@ -393,7 +393,7 @@ def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what:
     return network.replace(left_out=(*network.left_out, *notes))
 
 
-def are_out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
+def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
     return misclosures(seen, model) > EXCLUSION_RATIO * seen.tolerance[seen.image]
 
@@ -402,7 +402,7 @@ def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
     """The images with too few consistent known points."""
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     known = of_image(model.known[seen.point])
-    return of_image(are_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
+    return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
 
 
 def explain_missing(network: Network, seen: Sights, model: Model, known):

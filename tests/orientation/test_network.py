@@ -338,7 +338,7 @@ def test_blunders_that_leave_least_squares_no_solution(with_control):
     off = result.image_values[:, :3] - with_control.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
-    assert any("that contradict the start values" in warning for warning in result.warnings)
+    assert any("that contradict the adjusted" in warning for warning in result.warnings)
 
 
 def test_a_plane_without_control():

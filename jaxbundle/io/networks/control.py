@@ -218,8 +218,9 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
         raise InputError(
             f"{source_name}: the control fits no similarity of the start values of the input: its "
             f"{count(len(off), 'point')} are within {spread:.3g} {network.object_unit} of their "
-            f"mean and {np.median(off):.3g} off (median), most of all {list_some(worst, 3, str)}; check "
-            "names and units of the table, or leave out the start values of the input"
+            f"mean and {np.median(off):.3g} off (median), most of all "
+            f"{list_some(worst, 3, str)}; check names and units of the table, or leave out the "
+            "start values of the input"
         )
     scale = np.cbrt(np.linalg.det(A))
     M = matrices_of(images.angles) @ (A / scale).T
