@@ -235,7 +235,7 @@ class _First:
             legs = []
             more = find_undetermined(problem, start, factor) if look else Undetermined()
             if not more and look and may_be_undetermined(problem, start):
-                options = self.options | {"max_steps": EVALUATIONS_BEFORE_A_LOOK}
+                options = {**self.options, "max_steps": EVALUATIONS_BEFORE_A_LOOK}
                 legs, look = [minimise(problem, start, **options)], False
                 factor, start = _noise_factor(problem, legs[0]), legs[0].values
                 more = find_undetermined(problem, start, factor)

@@ -259,7 +259,7 @@ def carry(problem: Problem, before: Problem, values: Values) -> Values:
     for what that did not have."""
     start = problem.data.start
 
-    def taken(own, ids, other, other_ids, shift=0.0):
+    def taken(own, ids, other, other_ids, shift: np.ndarray | float = 0.0):
         own, other = np.array(own), np.asarray(other)
         place = {id: k for k, id in enumerate(other_ids)}
         rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]

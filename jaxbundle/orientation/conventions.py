@@ -53,8 +53,8 @@ def name_image_convention(network: Network) -> str:
     """The convention in which the image coordinates fit the start values, in words; empty if the
     expected one does, or no other."""
     images, points, rays = network.images, network.points, network.observations
-    placed = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
-    known = np.isfinite(points.position).all(1)
+    placed = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
+    known = np.all(np.isfinite(points.position), axis=1)
     rows = np.flatnonzero(placed[rays.image] & known[rays.point])
     if not len(rows):
         return ""
@@ -62,6 +62,7 @@ def name_image_convention(network: Network) -> str:
     some = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]
+    missed: dict[tuple[tuple[int, int, int, int], bool], float]
     missed = {(SAME, False): _misclosure(some, placed, known)}
     if missed[SAME, False] <= LARGEST_MISCLOSURE:
         return ""

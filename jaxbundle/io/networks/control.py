@@ -213,7 +213,7 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
     off = np.linalg.norm(source @ A.T + t - target, axis=1)
     spread = np.sqrt(np.square(target - target.mean(0)).sum(1).mean())
     if np.median(off) > WORST_FIT * spread:
-        of = [name for name, there in zip(names, known) if there]
+        of = [names[k] for k in np.flatnonzero(known)]
         worst = (f"{of[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
         raise InputError(
             f"{source_name}: the control fits no similarity of the start values of the input: its "
