@@ -160,6 +160,9 @@ def test_a_sigma_that_is_only_poor_is_in_no_other_unit():
     given = network()
     assert name_sigma_unit(given, 5.0) == name_sigma_unit(given, 0.3) == ""
     assert name_sigma_unit(given, 40.0) == ""
+    rays = given.observations
+    weights = dataclasses.replace(rays, sigma=np.ones_like(rays.sigma))
+    assert name_sigma_unit(given.replace(observations=weights), 0.0015) == ""
 
 
 # --- names ----------------------------------------------------------------------------------

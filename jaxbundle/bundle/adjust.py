@@ -193,8 +193,8 @@ class _First:
             if rounds:  # Here they were left out at the end of an adjustment with them.
                 final += gone
             part, factor = final.leave_out(given), _noise_factor(problem, minimum)
-            whole = take_back(part, current, problem, minimum.values, factor)
             try:
+                whole = take_back(part, current, problem, minimum.values, factor)
                 whole = check_network(whole)
                 gained = len(whole.observations) - len(current.observations)
                 if gained <= 0 or rounds == MOST_RETRIES:
@@ -209,10 +209,15 @@ class _First:
                     return dataclasses.replace(problem, network=network), minimum, check
                 carried = partial(carry, before=problem, values=minimum.values)
                 again = self._minimise(whole, carried, look=False)
+                solved = inspect_solution(again[0].with_factor(), again[1])
             except (InputError, NotSolvedError):
-                break
-            if not inspect_solution(again[0].with_factor(), again[1]):
-                break
+                solved = None
+            if not solved:
+                network = problem.network.warn(
+                    "what start values excluded was tried again with the adjusted orientation, "
+                    "but with it there is no solution"
+                )
+                return dataclasses.replace(problem, network=network), minimum, check
             found, rounds = again, rounds + 1
         return found[:3]
 
@@ -232,23 +237,34 @@ class _First:
                 finding = "" if self.oriented is None else self.oriented.finding
                 raise InputError(f"{error} {finding}".strip()) from None
             start = problem.data.start if begin is None else begin(problem)
-            legs = []
-            more = find_undetermined(problem, start, factor) if look else Undetermined()
+            legs, left = [], self.options["max_steps"]
+            find = partial(self._find_more, network, gone)
+            more = find(problem, start, factor) if look else Undetermined()
             if not more and look and may_be_undetermined(problem, start):
-                options = {**self.options, "max_steps": EVALUATIONS_BEFORE_A_LOOK}
+                options = {**self.options, "max_steps": min(EVALUATIONS_BEFORE_A_LOOK, left)}
                 legs, look = [minimise(problem, start, **options)], False
+                left -= int(legs[0].iterations)
                 factor, start = _noise_factor(problem, legs[0]), legs[0].values
-                more = find_undetermined(problem, start, factor)
+                more = find(problem, start, factor)
                 begin = partial(carry, before=problem, values=start)
             if not more:
-                found, minimum = minimise_at_any_distance(problem, start, make, **self.options)
+                found = problem
+                if left > 0:
+                    options = {**self.options, "max_steps": left}
+                    found, last = minimise_at_any_distance(problem, start, make, **options)
+                    legs.append(last)
+                minimum = join_legs(legs)
                 factor = _noise_factor(found, minimum)
-                more = find_undetermined(found, minimum.values, factor)
+                more = find(found, minimum.values, factor)
                 begin = partial(carry, before=found, values=minimum.values)
                 if not more:
-                    minimum = join_legs([*legs, minimum])
                     return found, minimum, tuple(check), gone, current
             gone += more
+
+    @staticmethod
+    def _find_more(network: Network, gone: Undetermined, *where) -> Undetermined:
+        more = find_undetermined(*where)
+        return more if (gone + more).spares_most_of(network) else Undetermined()
 
 
 @dataclasses.dataclass

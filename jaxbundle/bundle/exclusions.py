@@ -65,6 +65,14 @@ class Undetermined:
     def __add__(self, other: "Undetermined") -> "Undetermined":
         return Undetermined(self.notes + other.notes)
 
+    def spares_most_of(self, network: Network) -> bool:
+        """Whether more than half of the tie points and of the images are determined; otherwise the
+        network has no depth, or σ says nothing, and nothing should be left out."""
+        number = {thing: sum(len(n.names) for n in self.notes if n.thing == thing)
+                  for thing in ("tie point", "image")}  # fmt: skip
+        ties = int(network.points.has_role("tie").sum())
+        return 2 * number["tie point"] < max(ties, 1) and 2 * number["image"] < len(network.images)
+
     def leave_out(self, network: Network) -> Network:
         """The network without them, with notes."""
         gone = {thing: {name for note in self.notes if note.thing == thing for name in note.names}
@@ -78,8 +86,7 @@ class Undetermined:
 
 
 def find_undetermined(problem: Problem, values: Values, factor: float | None) -> Undetermined:
-    """The tie points whose rays are one line, and the images whose points are on a line, unless
-    they are the half of all: then the network has no depth, or σ says nothing.
+    """The tie points whose rays are one line, and the images whose points are on a line.
 
     **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
     """
@@ -91,20 +98,40 @@ def find_undetermined(problem: Problem, values: Values, factor: float | None) ->
     model = _adjusted_model(problem, values, network, seen)
     points, one_place = have_one_line(seen, model, narrow, factor or 1.0)
     images = flat & see_a_line(seen, model, factor or 1.0)
-    points &= 2 * points.sum() < network.points.has_role("tie").sum()
-    images &= 2 * images.sum() < len(network.images)
     return Undetermined(_notes(network, seen, points, one_place, images))
 
 
 def may_be_undetermined(problem: Problem, values: Values) -> bool:
     """Whether start values show points or images that rays may not determine: worth a look after a
     few iterations, before they cost many. Rays of poor start values converge in appearance, so that
-    all narrow points count, unless some are parallel: these would drift meanwhile."""
+    all narrow points count that would be narrow at the usual distance as well, unless some are
+    parallel: these would drift meanwhile."""
     narrow, flat = _find_candidates(problem, values, None)
     angle = angle_of_rays(problem, values)
-    return bool(
-        narrow.any() or flat.any() or ((angle < NARROW).any() and not (angle < PARALLEL).any())
-    )
+    near = (angle < NARROW) & (_parallax_at_usual_distance(problem, values) < NARROW)
+    return bool(narrow.any() or flat.any() or (near.any() and not (angle < PARALLEL).any()))
+
+
+def _parallax_at_usual_distance(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
+    """The largest angle at which a projection centre of a point is seen off the common line of its
+    rays, from the median distance of the points of its image; radians."""
+    point, image, n = problem.point, problem.image, len(problem.network.points)
+    X0 = np.asarray(values.position)[image]
+    to_point = np.asarray(values.point)[point] - X0
+    s = np.linalg.norm(to_point, axis=1)
+    usual = np.full(len(problem.network.images), np.inf)
+    order = np.lexsort((s, image))
+    seen, first, number = np.unique(image[order], return_index=True, return_counts=True)
+    usual[seen] = s[order][first + number // 2]
+    mean = lambda v: np.stack([np.bincount(point, c, n) for c in v.T], 1) / np.maximum(
+        np.bincount(point, minlength=n), 1)[:, None]  # fmt: skip
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = mean(to_point / s[:, None])
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        off = np.linalg.norm(np.cross(X0 - mean(X0)[point], u[point]), axis=1) / usual[image]
+    largest = np.zeros(n)
+    np.fmax.at(largest, point, off)
+    return largest
 
 
 def _find_candidates(problem: Problem, values: Values, factor: float | None):

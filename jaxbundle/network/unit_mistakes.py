@@ -119,6 +119,8 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
     unit, pitch = get_model(camera.model).unit, camera.pixel_size and abs(camera.pixel_size[0])
     if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
         unit, sigma = "px", sigma / pitch
+    if sigma == 1.0:  # Unit weights: nothing was meant.
+        return ""
     if unit == "mm":
         meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
     else:
