@@ -143,7 +143,7 @@ class AdjustmentComparison:
             name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"
             lines.append(
                 f"{name[:24]:24}{self.a[k]:16.8g}{self.b[k]:16.8g}{self.difference[k]:12.4g}"
-                f"{self.sigma[k]:11.3g}{fixed(ratio[k], 2):>11}{' *' * bool(self.differs[k])}"
+                f"{self.sigma[k]:11.3g}{fixed(float(ratio[k]), 2):>11}{' *' * bool(self.differs[k])}"
             )
         if len(self) > len(rows):
             lines.append(f"and {count(len(self) - len(rows), 'unknown')} that differ by less of "
