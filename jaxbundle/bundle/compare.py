@@ -141,9 +141,10 @@ class AdjustmentComparison:
         lines.append(f"{'':24}{'a':>16}{'b':>16}{'b − a':>12}{'σ':>11}{'b − a in σ':>11}")
         for k in rows:
             name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"
+            in_sigma = fixed(float(ratio[k]), 2)
             lines.append(
                 f"{name[:24]:24}{self.a[k]:16.8g}{self.b[k]:16.8g}{self.difference[k]:12.4g}"
-                f"{self.sigma[k]:11.3g}{fixed(float(ratio[k]), 2):>11}{' *' * bool(self.differs[k])}"
+                f"{self.sigma[k]:11.3g}{in_sigma:>11}{' *' * bool(self.differs[k])}"
             )
         if len(self) > len(rows):
             lines.append(f"and {count(len(self) - len(rows), 'unknown')} that differ by less of "
