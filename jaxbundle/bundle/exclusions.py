@@ -33,7 +33,7 @@ from jaxbundle.orientation.growth import (
     FOR_ITSELF,
     Demands,
     Model,
-    are_controlled,
+    are_held,
     grow,
     intersect,
     misclosures,
@@ -222,7 +222,7 @@ def take_back(
     lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
     seen = sights(given.replace(cameras=lens))
     model = _adjusted_model(problem, values, given, seen)
-    model.held = are_controlled(given.points)
+    model.held = are_held(given.points)
     new = model.held & ~model.known
     model.X[new], model.known[new] = given.points.position[new], True
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
