@@ -2,12 +2,12 @@
 
     python benchmarks/measuring.py [--json FILE]
 
-Photographs as in the tests (`tests/measure/render.py`): 480 × 360 pixels, grey values of noise σ 2
-with a contrast of 204, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
+Photographs as in the tests (`tests/measure/exact_render.py`): grey values of noise σ 1.5 with a
+contrast of 190, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
 discs each, their true centres those of the images of the circles (eccentricity taken into account).
-Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, against truth; for
-targets also the RMS of errors over their stated σ, which should be 1. The exit status is 1 if an
-RMS is above 0.05 pixels, or errors are more than twice their σ.
+Corners: `find_board_points` on a chessboard of 9 × 6, squares of 30 pixels. RMS of a coordinate in
+pixels, against truth, and of errors over their stated σ, which should be 1. The exit status is 1 if
+an RMS is above 0.05 pixels, or errors are more than 1.5 times their σ.
 """
 
 import os
@@ -16,7 +16,6 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import jax
 import machine
 import numpy as np
 
@@ -25,31 +24,30 @@ import jaxbundle
 jaxbundle.enable_x64()
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "measure"))
 
-import render  # noqa: E402
+from exact_render import Cells, Rings, image_of, photograph, plane_to_pixels  # noqa: E402
 
-from jaxbundle.cameras import get_model  # noqa: E402
 from jaxbundle.measure import (  # noqa: E402
     Board,
     centre_by_ellipse,
     centre_by_grey_values,
-    circle_centre_shift,
-    find_board,
+    find_board_points,
 )
-from jaxbundle.orientation import Pose  # noqa: E402
 
-LIMIT_PX, LIMIT_IN_SIGMA = 0.05, 2.0
-PLACES = np.array([[0.06 * i, 0.06 * j, 0.0] for i in range(5) for j in range(4)])
-MODEL, P, UP = get_model("opencv"), render.LENS.parameters, np.array([0.0, 0.0, 1.0])
-shifts = jax.jit(jax.vmap(lambda pose, X, r: circle_centre_shift(MODEL, P, pose, X, UP, r),
-                          (None, 0, None)))  # fmt: skip
+LIMIT_PX, LIMIT_IN_SIGMA = 0.05, 1.5
+PLACES = [(6.1 * i + 0.3 * j, 6.3 * j + 0.2 * i) for i in range(5) for j in range(4)]
 
 
 def targets(radius, tilt, blur):
     """Errors and σ of both methods."""
-    M, X0 = render.pose(tilt, -tilt, 40 * (tilt > 0), (0.12, 0.09), 0.55)
-    pattern = render.discs(PLACES[:, :2], radius, margin=0.03)
-    picture = render.photograph(render.LENS, M, X0, pattern, blur)
-    true = render.LENS.image_of(M, X0, PLACES) + np.asarray(shifts(Pose(X0, M), PLACES, radius))
+    size = int(32 * radius + 30)
+    H = plane_to_pixels(radius, tilt, 37, 20, (size / 2, size / 2), (13, 10), 90)
+    discs = Rings(tuple((x, y, 0, 1, 0, 7, 0.0) for x, y in PLACES), 1.0)
+    picture = photograph(discs, H, (size, size), blur)
+    true = []
+    for x, y in PLACES:  # the pole of the line at infinity
+        circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - 1]])
+        dual = H @ np.linalg.inv(circle) @ H.T
+        true.append(dual[:2, 2] / dual[2, 2])
     for method in (centre_by_grey_values, centre_by_ellipse):
         found = [method(picture, place + [1.3, -1.1]) for place in true]
         yield np.array([t.xy for t in found]) - true, np.array([t.sigma for t in found])
@@ -61,10 +59,10 @@ def rms(x):
 
 def targets_of_all():
     """RMS of a coordinate and of error/σ by both methods, for every radius and blur."""
-    for radius in (0.002, 0.003, 0.005, 0.008):
+    for radius in (2.3, 3.4, 5.6, 9.0):
         for blur in (0.7, 1.2):
             both = [list(targets(radius, tilt, blur)) for tilt in (0, 25)]
-            found = {"radius_px": radius * 620 / 0.55, "blur": blur}
+            found = {"radius_px": radius, "blur": blur}
             for k, method in enumerate(("grey_values", "ellipse")):
                 errors = np.concatenate([b[k][0] for b in both])
                 sigma = np.concatenate([b[k][1] for b in both])
@@ -73,17 +71,19 @@ def targets_of_all():
 
 
 def corners_of_all():
-    """RMS of a coordinate of a chessboard's corners, for every blur."""
-    board = Board(9, 6, 0.03)
+    """RMS of a coordinate of a chessboard's corners and of error/σ, for every blur."""
+    board, squares = Board(9, 6, 1.0), np.indices((7, 10)).sum(0) % 2
+    table = np.pad(squares.astype(float), 1, constant_values=1.0)
+    places = [[j + 2, i + 2] for i in range(6) for j in range(9)]
     for blur in (0.7, 1.2):
-        errors = []
+        errors, sigma = [], []
         for i, tilt in enumerate((0, 15, 25, 35)):
-            M, X0 = render.pose(tilt, -tilt / 2, 20 * i, board.points.mean(0)[:2], 0.5)
-            picture = render.photograph(
-                render.LENS, M, X0, render.chessboard(9, 6, 0.03), blur, seed=i
-            )
-            errors.append(find_board(picture, board) - render.LENS.image_of(M, X0, board.points))
-        yield {"blur": blur, "rms_px": rms(np.concatenate(errors))}
+            H = plane_to_pixels(30, tilt, 5 * i, 50 * i, (200.3 + i / 4, 160.1), (6, 4.5), 30)
+            found = find_board_points(photograph(Cells(table), H, (400, 320), blur, seed=i), board)
+            errors.append(found.xy - image_of(H, places))
+            sigma.append(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
+        errors, sigma = np.concatenate(errors), np.concatenate(sigma)
+        yield {"blur": blur, "rms_px": rms(errors), "error_over_sigma": rms(errors / sigma)}
 
 
 def show(found):
@@ -97,9 +97,9 @@ def show(found):
             for method in ("grey_values", "ellipse")
         ]
         print(f"{f['radius_px']:9.1f}  {f['blur']:4.1f}    {cells[0]}     {cells[1]}")
-    print("\ncorners of a chessboard\nblur    RMS px")
+    print("\ncorners of a chessboard\nblur    RMS px  error/σ")
     for f in found["corners"]:
-        print(f"{f['blur']:4.1f}  {f['rms_px']:8.3f}")
+        print(f"{f['blur']:4.1f}  {f['rms_px']:8.3f}  {f['error_over_sigma']:7.2f}")
 
 
 def complaints(found):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
+from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS, WEAK
 from jaxbundle.batch.misfit import OF_DEVIATION
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import f_tail
@@ -68,6 +68,10 @@ class Population:
         self.sigma = {name: of(name, "sigma") for name in names}
         self.apart = {name: np.abs(self._apart(values, self.sigma[name]))
                       for name, values in self.values.items()}  # fmt: skip
+        # views that determine nothing: weak without values
+        self._void = np.array([
+            row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept
+        ], bool)  # fmt: skip
         self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept)))
 
     def __len__(self) -> int:
@@ -76,7 +80,7 @@ class Population:
     @property
     def solved(self) -> np.ndarray:
         """Which have values."""
-        return np.isin(self.status.astype(str), SOLVED)
+        return np.isin(self.status.astype(str), SOLVED) & ~self._void
 
     @property
     def fit(self) -> np.ndarray:

@@ -30,10 +30,11 @@ class BatchCalibration:
 
     - `model`, `parameters`: the camera model and its k free parameters.
     - `status`: "converged"; "weak", the same, but the views do not determine the principal distance
-      or point, whose σ is above a fiftieth of the principal distance; "misfit": it has values, but
-      the residuals are too large, on their own (gross errors) or compared with the other cameras of
-      the batch (see `jaxbundle.batch.misfit`). Without a solution "iteration limit", "singular",
-      "not finite" (an infinite number among the measurements, or the start) or
+      or point, whose σ is above a fiftieth of the principal distance (NaN for the values if
+      the iterations could not end because of the geometry of the views, see `remark`); "misfit": it
+      has values, but the residuals are too large, on their own (gross errors) or compared with the
+      other cameras of the batch (see `jaxbundle.batch.misfit`). Without a solution "iteration
+      limit", "singular", "not finite" (an infinite number among the measurements, or the start) or
       "too few points" (no usable view, or no redundancy).
     - `remark`: suspicious image points, or for an undetermined camera an RMS far above that of the
       others; mostly empty.
@@ -121,7 +122,7 @@ class BatchCalibration:
         if self.undetermined[i].any():
             row["undetermined"] = np.array(self.parameters)[self.undetermined[i]].tolist()
         if not self.solved[i]:
-            return row
+            return row | ({"rms": float(self.rms[i])} if np.isfinite(self.rms[i]) else {})
         estimates = zip(self.parameters, self.values[i].tolist(), self.sigma[i].tolist())
         row |= {
             "rms": float(self.rms[i]),

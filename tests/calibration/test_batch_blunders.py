@@ -309,3 +309,8 @@ def test_views_that_do_not_determine_a_camera_are_weak_and_say_why(clean):
     for row in (1, 2):
         if not found.solved[row]:
             assert found.remark[row] == weak_geometry(BOARD, xy[row], seen)
+        line = found.row(row)
+        assert line["status"] == "weak" and line["rms"] > 0
+    people = found.population()
+    assert people.solved[0] and list(people.solved) == list(found.solved)
+    assert "weak" in str(found)

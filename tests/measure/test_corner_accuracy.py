@@ -101,8 +101,8 @@ def test_what_is_too_small_is_left_out_or_says_so(side, tilt, blur):
 
 
 def test_scale_bars_between_corners_of_markers_give_the_scale():
-    """The scale of a network with bars along the sides of its markers is that of the measured
-    sides: with `cornerSubPix` they were 0.9 % too short here, at 42 px a side."""
+    """The scale of a network with bars along the sides of its markers is that of the sides
+    measured: with `cornerSubPix` they were 0.9 % too short here, at 42 px a side."""
     table = np.ones((24, 36))
     words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     for k in range(6):
