@@ -102,7 +102,7 @@ def test_a_terminal_is_told_what_is_compiled(monkeypatch):
         assert said[0] == "compiling programs, once per size"
         assert said[-1] == "starting"
         assert tell is not None
-        tell(3, 0.5, 0.0)
+        tell("adjusting: vᵀPv 1", 3, 50)
         assert said[-1] == "iteration 3: vᵀPv 1"
     before = len(said)
     jax.jit(lambda x: jnp.sin(x) + 0.125)(1.0)
