@@ -39,8 +39,9 @@ SOFT, SMALLEST_IMAGE = 2.8, 64
 """τ from which the image is reduced, and the rows or columns that it must have."""
 NARROWEST = 1.5
 """Narrowest strip or window, in τ: below, blurred edges are one."""
-WIDE = 4.5
-"""A strip of this width, in τ, shows the whole step."""
+WIDE = 3.2
+"""A strip of this width, in τ, determines the step without the marker beside it, whose place in
+a printed board is known to a pixel of the print only."""
 NEGLECTED, NEGLECTED_NARROW = 0.01, 0.06
 """σ, in τ·|n₁·n₂|, of what is not modelled beside markers under oblique lines, to whose sides they
 are not parallel; the second decreases by exp(−(width/τ)²/2). Found on rendered boards tilted by 50°
