@@ -39,12 +39,15 @@ SOFT, SMALLEST_IMAGE = 2.8, 64
 """τ from which the image is reduced, and the rows or columns that it must have."""
 NARROWEST = 1.5
 """Narrowest strip or window, in τ: below, blurred edges are one."""
-WIDE = 4.5
-"""A strip of this width, in τ, shows the whole step."""
+WIDE = 3.2
+"""A strip of this width, in τ, determines the step without the marker beside it, whose place in
+a printed board is known to a pixel of the print only."""
 NEGLECTED, NEGLECTED_NARROW = 0.01, 0.06
 """σ, in τ·|n₁·n₂|, of what is not modelled beside markers under oblique lines, to whose sides they
 are not parallel; the second decreases by exp(−(width/τ)²/2). Found on rendered boards tilted by 50°
 and 65°."""
+COVERED = 3.0
+"""Residuals of a corner above this multiple of their median over all corners are not noise."""
 UNKNOWNS = 9
 STEPS, CONVERGED = 12, 4e-3
 """Most steps, and the change of nearly all corners, in pixels, after which the next is
@@ -151,7 +154,9 @@ def _fit(grey, near, lines, strips, largest):
     why[~(largest <= LARGEST_SIGMA**2)] = TOO_SMALL
     why[narrow < NARROWEST * blur] = TOO_SMALL
     moved = np.linalg.norm(xy - near, axis=1)
-    lost = ~(moved < np.maximum(half, 2.5)) | (noise > 0.4 * np.abs(theta[:, 5]))
+    # residuals far above those of the other corners: something covers the window in part
+    covered = (noise > COVERED * np.median(noise)) & (noise > 0.05 * np.abs(theta[:, 5]))
+    lost = ~(moved < np.maximum(half, 2.5)) | (noise > 0.4 * np.abs(theta[:, 5])) | covered
     why[lost | (weight.sum(1) < 2 * UNKNOWNS)] = NO_CORNER
     return Saddles(xy, covariance, why), blur
 

@@ -126,8 +126,10 @@ def test_charuco_boards_with_missing_corners(searched, tmp_path):
     picture = drawn.generateImage((1000, 700), marginSize=0)
     pattern = render.print_of(picture, 10 * 0.027, 0.03)
     (tmp_path / "camera").mkdir()
+    # only the distortion that is free: the corners are too precise to hide another
+    lens = render.Lens.of(fx=620.0, fy=621.0, cx=242.3, cy=177.8, k1=-0.12)
     for i, (M, X0) in enumerate(poses(VIEWS, turned=False, middle=(0.135, 0.0945))):
-        taken = render.photograph(render.LENS, M, X0, pattern, seed=i)
+        taken = render.photograph(lens, M, X0, pattern, seed=i)
         taken[:, (70 * (i % 3)) :][:, :90] = 128
         cv2.imwrite(f"{tmp_path}/camera/{i}.png", taken)
     file = tmp_path / "results.jsonl"
@@ -138,7 +140,7 @@ def test_charuco_boards_with_missing_corners(searched, tmp_path):
     seen = np.array([~np.isnan(xy).any(1) for _, xy in looks])
     assert row["views"] == VIEWS and 20 < seen.sum(1).min() < 27 and (seen.sum(1) < 54).sum() > 4
     assert row["redundancy"] == 2 * seen.sum() - 6 * VIEWS - len(FREE)
-    truth = dict(zip(["fx", "fy", "cx", "cy"], render.LENS.parameters))
+    truth = dict(zip(["fx", "fy", "cx", "cy"], lens.parameters))
     for name, value in truth.items():
         found = row["parameters"][name]
         assert abs(found["value"] - value) < 4 * found["sigma"], name
