@@ -289,7 +289,7 @@ def test_a_photograph_counts_once(folder, tmp_path):
         (tmp_path / name).write_bytes(picture.read_bytes())
     views = measure_boards([tmp_path], taken.BOARD, lambda *done: told.append(done))
     assert views.names == ("a.png",) and views.failed == (("b.png", "is the same file as a.png"),)
-    assert told == [(1, 2), (2, 2)]
+    assert told == [("searching the board", 1, 2), ("searching the board", 2, 2)]
 
 
 def test_a_photograph_saved_again_counts_once(folder, tmp_path):
