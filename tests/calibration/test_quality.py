@@ -243,7 +243,8 @@ def test_two_halves_agree_unless_the_camera_changed(calibration):
     mixed = np.where((np.arange(len(views)) % 2 == 1)[:, None, None], other, views.xy)
     changed = calibrate(dataclasses.replace(views, xy=mixed), snooping=None)
     assert changed.cross_validation.test > 100
-    assert changed.cross_validation.comparison.largest > 10 * found.comparison.largest
+    # Not the largest, which is in a corner of the image without points.
+    assert changed.cross_validation.comparison.rms > 10 * found.comparison.rms
     assert any("halves of the photographs contradict" in text for text in changed.advice)
 
 
