@@ -1,6 +1,7 @@
 """The pages of batches, reconstructions and several cameras: their contents agree with the
 result."""
 
+import datetime
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ from page_reader import Page, column
 
 from jaxbundle.batch.page import compose_batch
 from jaxbundle.batch.run import result_rows
+from jaxbundle.reconstruction.block import Block
 from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 from jaxbundle.report.page import Addition, Finding, Section, compose
@@ -88,8 +90,15 @@ def test_lines_of_other_inputs_are_not_of_the_batch(tmp_path, rows):
 # --- reconstructions ------------------------------------------------------------------------
 
 
+BLOCK = Block(
+    photographs=4, taken=None, computed=datetime.datetime(2026, 5, 4), system="", unit="m",
+    ground_sample_distance=0.01, object_distance=10.0, flying_height=None, area=None,
+    rays_per_point=4.0, points_per_photograph=10.0, photographs_per_place=None, positions=None,
+)  # fmt: skip
+
+
 def test_a_reconstruction_names_what_it_left_out(convergent4):
-    part = Part("part 1", convergent4, {}, {"sift": 1.75})
+    part = Part("part 1", convergent4, {}, {"sift": 1.75}, BLOCK)
     found = Reconstruction(
         (part,), {f"{HOSTILE}.jpg": "too few matches"}, ("a note",),
         (("a.jpg", "b.jpg", 100, 60, "general"),), {name: None for name in "abcde"},
@@ -108,7 +117,7 @@ def test_a_reconstruction_names_what_it_left_out(convergent4):
     (3.0, "met", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
 ])  # fmt: skip
 def test_a_reconstruction_that_fits_badly_says_so_first(convergent4, factor, state, words):
-    part = Part("part 1", convergent4, {}, {"sift": factor, "other": 1.0})
+    part = Part("part 1", convergent4, {}, {"sift": factor, "other": 1.0}, BLOCK)
     warnings = (f"part 1: {words}measurements fit {factor} times worse",) if words else ()
     found = Reconstruction((part,), {}, ("a note",), (), {"a": None}, warnings)
     first = str(found).splitlines()[0]
