@@ -49,6 +49,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.devices import on_accelerator
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Progress
 
@@ -117,7 +118,7 @@ def calibrate_batch(
         down = camera_model.axes == "down"
         far = far_outside(batch.xy, batch.visible, batch.image_size, down)
         batch = dataclasses.replace(batch, visible=batch.visible & ~far)
-    on_cpu = jax.default_backend() == "cpu"
+    on_cpu = not on_accelerator()
     portions = list(batch.portions(on_cpu))
     fixed = camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu
 

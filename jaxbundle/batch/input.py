@@ -18,8 +18,10 @@ FLAT_THICKNESS = 0.02
 LARGEST_NUMBER = 1e100
 """Larger numbers count as infinite, because their products overflow."""
 
-ON_CPU, ON_ACCELERATOR = 32, 512
-"""Cameras of a portion."""
+ON_CPU = 32
+"""Cameras of a portion on a processor."""
+POINTS_ON_ACCELERATOR = 1 << 23
+"""Padded image points of a portion on an accelerator: their Jacobian is 2.3 GB."""
 
 WORTH_COMPILING = 4_000_000
 """Padded points that cost as much as compiling for another number of views: 2 to 3 s."""
@@ -159,7 +161,8 @@ class Batch:
         widths = self._widths(shown.sum(1), points)
         size = ON_CPU
         if not on_cpu:
-            size = min(ON_ACCELERATOR, 2 ** math.ceil(math.log2(max(len(self), 1))))
+            power = math.log2(max(POINTS_ON_ACCELERATOR / (max(widths, default=1) * points), 1))
+            size = 2 ** min(math.floor(power), math.ceil(math.log2(max(len(self), 1))))
         for flat in (True, False):
             for width in np.unique(widths):
                 cameras = np.flatnonzero((self.flat == flat) & (widths == width))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxbundle.geometry.vectors import difference
 from jaxbundle.pushbroom.corrections import apparent_point
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
+from jaxbundle.system.devices import batch_size
 
 STEPS = 2
 """Steps of a round."""
@@ -26,8 +27,8 @@ LAST_CHANGE = 1e-3
 """Largest change of a corrected sight in its last round, in lines."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
-GATHERED_AT_ONCE = 64
-"""Batch size of points gathered for another round."""
+GATHERED_AT_ONCE = 64, 1 << 15
+"""Points gathered for another round, on a processor and on an accelerator."""
 LARGEST_GATHERED = 8
 """If a larger fraction of points needs another round, all points take it."""
 EDGE = 1e-5
@@ -41,7 +42,7 @@ def refine(image, pieces, earth, X, t, u):
     round_ = partial(_round, image, pieces, earth)
     far = FARTHEST_OUTSIDE * line_period(image)
     n = t.size
-    few = min(n, GATHERED_AT_ONCE)
+    few = min(n, batch_size(*GATHERED_AT_ONCE))
 
     def open_(state):
         t, _, settled, rounds = state

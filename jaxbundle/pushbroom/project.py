@@ -40,13 +40,15 @@ from jaxbundle.pushbroom.passages import (
 )
 from jaxbundle.pushbroom.pieces import Pieces, make_pieces
 from jaxbundle.pushbroom.scanner import LineTimes, Optics, Pair
+from jaxbundle.system.devices import batch_size
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
-CHUNK = 2048
-"""Batch size of points, which stay in the cache."""
-SEARCHED_AT_ONCE = 256
-"""Batch size of searched points outside the footprint."""
+POINTS_AT_ONCE = 2048, 1 << 18
+"""Points of one step, on a processor and on an accelerator: 0.1 MB of numbers a step of Newton's
+method, which stay in the cache, and 15 MB."""
+SEARCHED_AT_ONCE = 256, 1 << 14
+"""The same of points that are searched for outside the footprint."""
 NEAR_STEPS = 6
 
 
@@ -225,11 +227,11 @@ def misclosure_of(
 
 def _map_chunks(function, arrays):
     """The function of arrays [n], whose values are [..., n], by chunks."""
-    n = arrays[0].shape[0]
-    if n <= CHUNK:
+    n, size = arrays[0].shape[0], batch_size(*POINTS_AT_ONCE)
+    if n <= size:
         return function(arrays)
-    chunks = -(-n // CHUNK)
-    cut = lambda a: jnp.pad(a, (0, chunks * CHUNK - n), mode="edge").reshape(chunks, CHUNK)
+    chunks = -(-n // size)
+    cut = lambda a: jnp.pad(a, (0, chunks * size - n), mode="edge").reshape(chunks, size)
     found = jax.lax.map(function, tuple(cut(a) for a in arrays))
     joined = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
     return jax.tree.map(joined, found)
@@ -249,7 +251,7 @@ def _found(image, search, X, most, margin):
 
     def search_on(state):
         found, known = state
-        chosen = first_of(~known, min(SEARCHED_AT_ONCE, known.size))
+        chosen = first_of(~known, min(batch_size(*SEARCHED_AT_ONCE), known.size))
         few = _search(image, search, gather(X, chosen), most, margin)
         return replace_chosen(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
