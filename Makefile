@@ -58,9 +58,10 @@ test test-all: install
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
 
-# 500 random problems by the engine and by dense algebra; 40 of them are in `make test`.
+# 500 random problems by the engine and by dense algebra, in WORKERS processes; 40 of them are in `make test`.
 random-problems: install
-	cd tests/leastsquares && ../../$(BIN)/python test_random_problems.py 500
+	cd tests/leastsquares && seq 0 $$(($(WORKERS) - 1)) | \
+	  xargs -P $(WORKERS) -I{} ../../$(BIN)/python test_random_problems.py 500 {} $(WORKERS)
 
 # Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
 # Python (make test-newest PYTHON=python3.13), each in an environment of its own: what depends on them,
