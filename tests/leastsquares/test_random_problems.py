@@ -162,7 +162,7 @@ def _dense_solution(given: Random, held, values, data) -> np.ndarray:
 
 
 def main(number: int, share: int = 0, shares: int = 1) -> int:
-    """Compare the structures share, share + shares, … of a number of problems; 1 if any is wrong."""
+    """Compare the structures share, share + shares, … of `number` problems; 1 if any is wrong."""
     jaxbundle.enable_x64()
     wrong, done = [], 0
     for seed in range(share, -(-number // VARIANTS), shares):
