@@ -19,7 +19,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all random-problems bench docs install install-demo install-docs clean \
+.PHONY: demo test test-all random-problems mutants bench docs install install-demo install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
@@ -62,6 +62,18 @@ test test-all: install
 random-problems: install
 	cd tests/leastsquares && seq 0 $$(($(WORKERS) - 1)) | \
 	  xargs -P $(WORKERS) -I{} ../../$(BIN)/python test_random_problems.py 500 {} $(WORKERS)
+
+# 300 changes of the package, each with the tests that should notice it: hours; goes on where it was stopped.
+mutants: $(VENV)/mutated
+	$(BIN)/python tests/mutants.py
+
+$(VENV)/mutated: $(VENV)/installed
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv pip install --quiet --python $(BIN)/python -e '.[mutants]'; \
+	else \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[mutants]'; \
+	fi
+	@touch $@
 
 # Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
 # Python (make test-newest PYTHON=python3.13), each in an environment of its own: what depends on them,
