@@ -128,7 +128,7 @@ class EliminationOfJacobian(lx.AbstractLinearSolver):
             damping = root**2
         *_, blocks = normal_equations(self.declared, self.plan, *found["seen"])
         ones = {g: jnp.ones(group.free.shape) for g, group in self.plan.groups.items()}
-        normal = Normal(self.plan, dataclasses.replace(blocks, metric=ones))
+        normal = Normal(self.plan, dataclasses.replace(blocks, damping_matrix=ones))
         return factorise(damp(normal, damping)), operator
 
     def compute(self, state, vector, options):

@@ -5,7 +5,7 @@ observation receives (`prepare`), the effect of a small change δ on that block 
 second order at δ = 0, where all derivatives are taken), the application of a finite change
 (`retract`), and the change between two values (`difference`; `small_difference`, if there is one,
 has the same first derivatives where both are equal). `hold` is a value with its held part taken
-from another; `chart` gives the unknowns of the damping metric,
+from another; `chart` gives the unknowns of the damping matrix,
 T = ∂(chart)/∂δ and T⁻¹.
 
 Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array,

@@ -1,4 +1,4 @@
-"""The metric of the damping: λ·D is added to N; the step becomes shorter as λ grows.
+"""The damping matrix: λ·D is added to N; the step becomes shorter as λ grows.
 
 Marquardt (1963) takes D = diag(N), which depends on the choice of unknowns. A space may define
 other unknowns for the damping (`Space.chart`): D is diag(N) in these, transformed back,

@@ -66,7 +66,7 @@ class Factor(eqx.Module):
 def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     """N + λ·D."""
     N, e = normal.blocks, normal.plan.eliminated
-    more = {name: damping * d for name, d in matrices(N.metric).items()}
+    more = {name: damping * d for name, d in matrices(N.damping_matrix).items()}
     own = {name: B + more[name] for name, B in N.own.items()}
     eliminated = None if e is None else present(N.eliminated) + more[e]
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))

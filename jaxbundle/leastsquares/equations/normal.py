@@ -39,13 +39,13 @@ AnyTangent = Mapping[str, Rows]
 
 class NormalBlocks(eqx.Module):
     """N in blocks; rows and columns of held unknowns are zero. `own` and `off` are sums over all
-    devices, the others belong to the eliminated rows of one device. `metric`: D of the damping."""
+    devices, the others belong to the eliminated rows of one device. `damping_matrix`: D."""
 
     own: dict[str, Float[Array, "rows w w"]]
     off: dict[Key, Float[Array, "blocks w v"]]
     eliminated: Float[Array, "rows w w"] | None
     W: dict[str, Float[Array, "chunks length w v"]]
-    metric: dict[str, Float[Array, "rows w *w"]]
+    damping_matrix: dict[str, Float[Array, "rows w *w"]]
 
 
 class Normal(lx.AbstractLinearOperator):
@@ -298,8 +298,8 @@ class Sums:
         eliminated = None
         if e is not None:
             eliminated, gradient[e] = self.own[e], self.gradient[e]
-        metric = measure(declared, plan, values, own | ({e: eliminated} if e else {}))
-        return cost, gradient, NormalBlocks(own, off, eliminated, self.W, metric)
+        D = measure(declared, plan, values, own | ({e: eliminated} if e else {}))
+        return cost, gradient, NormalBlocks(own, off, eliminated, self.W, D)
 
 
 def products(a, b):

@@ -13,19 +13,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxbundle.leastsquares.iterations.search import RegionState, fraction_kept
+from jaxbundle.leastsquares.iterations.search import RegionState, gain_ratio
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, Approach, Tolerance
 
 
 class Loop(eqx.Module):
     """The accepted unknowns `at`, with the normal equations and ½vᵀPv there; the unknowns to try
-    next; the termination, and the number of iterations."""
+    next, and the decrease of ½vᵀPv predicted there; the termination, and the number of
+    iterations."""
 
     at: PyTree
     trial: PyTree
     equations: PyTree
     cost: Float[Array, ""]
-    promised: Float[Array, ""]
+    predicted: Float[Array, ""]
     step_size: Float[Array, ""]
     region: RegionState
     approach: Approach
@@ -56,16 +57,16 @@ def iterate(
 
     def body(loop: Loop) -> Loop:
         first = loop.steps == 0
-        tried_equations, tried = linearise(loop.trial)
-        limits = tolerance(loop.equations)
-        kept = fraction_kept(loop.promised, loop.cost - tried, limits.noise(loop.cost))
-        accept, region = loop.region.after(first, kept)
+        trial_equations, trial_cost = linearise(loop.trial)
+        noise = tolerance(loop.equations).noise(loop.cost)
+        ratio = gain_ratio(loop.predicted, loop.cost - trial_cost, noise)
+        accept, region = loop.region.after(first, ratio)
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
-            (loop.trial, tried_equations, tried), (loop.at, loop.equations, loop.cost),
+            (loop.trial, trial_equations, trial_cost), (loop.at, loop.equations, loop.cost),
         )  # fmt: skip
         step_size, approach = loop.approach.choose_step(
-            region.radius, loop.step_size, first, accept, loop.promised, kept, cost
+            region.radius, loop.step_size, first, accept, loop.predicted, ratio, cost
         )
         damping = 1 / step_size
         change, decrement, damped = step(equations, damping)
@@ -73,11 +74,11 @@ def iterate(
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
         termination, approach = approach.judge(
             tolerance(equations), step_size, finite, decrement, first, accept, loop.cost, cost,
-            tried,
+            trial_cost,
         )  # fmt: skip
         return Loop(
             at=at, trial=retract(at, change), equations=equations, cost=cost,
-            promised=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
+            predicted=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
             step_size=step_size, region=region, approach=approach, termination=termination,
             steps=loop.steps + 1,
         )  # fmt: skip
@@ -89,7 +90,7 @@ def iterate(
         lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
         body,
         Loop(
-            at=start, trial=start, equations=equations, cost=zero, promised=zero,
+            at=start, trial=start, equations=equations, cost=zero, predicted=zero,
             step_size=jnp.full_like(zero, jnp.inf), region=RegionState.begin(),
             approach=Approach.begin(), termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
         ),

@@ -89,24 +89,25 @@ class MarquardtDescent(optx.AbstractDescent):
 
 
 class RegionState(eqx.Module):
-    """Radius 1/λ, and the divisor of the next reduction."""
+    """Radius 1/λ, and the number by which the next rejected step divides it."""
 
     radius: Float[Array, ""]
-    reduction: Float[Array, ""]
+    divisor: Float[Array, ""]
 
     @classmethod
     def begin(cls, radius: float = 1e4) -> "RegionState":
         return cls(jnp.asarray(radius), jnp.asarray(2.0))
 
-    def after(self, first, kept) -> tuple[Bool[Array, ""], "RegionState"]:
-        """Whether a step with this fraction of the predicted decrease is accepted, and the next
-        region: widened by the rule of Nielsen (1999), narrowed by 2, 4, 8, …"""
-        accept = first | (kept > SUFFICIENT_DECREASE)
+    def after(self, first, gain_ratio) -> tuple[Bool[Array, ""], "RegionState"]:
+        """Whether a step with this gain ratio is accepted, and the next region: widened by the rule
+        of Nielsen (1999), narrowed by 2, 4, 8, …"""
+        accept = first | (gain_ratio > SUFFICIENT_DECREASE)
         finite = jnp.minimum(self.radius, LARGEST_RADIUS)
-        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), LARGEST_RADIUS)
-        radius = jnp.where(accept, wider, finite / self.reduction)
+        growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
+        wider = jnp.minimum(finite * growth, LARGEST_RADIUS)
+        radius = jnp.where(accept, wider, finite / self.divisor)
         radius = jnp.where(first, self.radius, radius)
-        return accept, RegionState(radius, jnp.where(accept, 2.0, 2.0 * self.reduction))
+        return accept, RegionState(radius, jnp.where(accept, 2.0, 2.0 * self.divisor))
 
 
 class NielsenTrustRegion(optx.AbstractSearch):
@@ -120,8 +121,9 @@ class NielsenTrustRegion(optx.AbstractSearch):
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
         change = jax.tree.map(jnp.subtract, y_eval, y)
-        _, kept = promise(f_info, change, f_eval_info.as_min())
-        accept, state = state.after(first_step, kept)
+        predicted = predicted_decrease(f_info, change)
+        decrease = f_info.as_min() - f_eval_info.as_min()
+        accept, state = state.after(first_step, gain_ratio(predicted, decrease, f_info.noise))
         return state.radius, accept, optx.RESULTS.successful, state
 
 
@@ -140,19 +142,20 @@ SEARCHES: dict[str, NielsenTrustRegion | FullStep] = dict(
 )
 
 
-def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
-    """The decrease of ½vᵀPv predicted for a damped step, ½(−gᵀδ + λ·δᵀDδ), and the fraction
-    achieved."""
-    plan, D = info.hessian.plan, info.hessian.blocks.metric
+def predicted_decrease(info: Info, change: Tangent) -> Float[Array, ""]:
+    """The decrease of ½vᵀPv that the linearised residuals predict for a damped step,
+    ½(−gᵀδ + λ·δᵀDδ)."""
+    plan, D = info.hessian.plan, info.hessian.blocks.damping_matrix
     damped = info.damping * dot(plan, change, times(D, change))
-    promised = 0.5 * (damped - dot(plan, info.grad, change))
-    return promised, fraction_kept(promised, info.as_min() - cost, info.noise)
+    return 0.5 * (damped - dot(plan, info.grad, change))
 
 
-def fraction_kept(promised, gain, noise):
-    """The fraction of the predicted decrease of ½vᵀPv that was achieved; −1 if it is not finite. A
-    prediction below rounding counts as achieved unless the sum of squares visibly grows."""
-    kept = jnp.where(promised > 0, gain / promised, -1.0)
-    kept = jnp.where(jnp.isfinite(kept), kept, -1.0)
-    unseen = (promised > 0) & (promised < noise) & (gain > -noise)
-    return jnp.where(unseen, 1.0, kept)
+def gain_ratio(predicted, decrease, noise) -> Float[Array, ""]:
+    """The decrease of ½vᵀPv as a fraction of the predicted one; −1 if it is not finite.
+
+    A prediction below rounding counts as achieved unless the sum of squares visibly grows.
+    """
+    ratio = jnp.where(predicted > 0, decrease / predicted, -1.0)
+    ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
+    below_rounding = (predicted > 0) & (predicted < noise) & (decrease > -noise)
+    return jnp.where(below_rounding, 1.0, ratio)

@@ -37,7 +37,8 @@ from jaxbundle.leastsquares.iterations.search import (
     Info,
     MarquardtDescent,
     NielsenTrustRegion,
-    promise,
+    gain_ratio,
+    predicted_decrease,
 )
 from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
@@ -127,28 +128,30 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state: State, tags):
         before, zero = self._info(state.known), zero_tangent(self.plan)
         residual, aux = fn(state.trial, args)
-        tried = optx.FunctionInfo.Eval(half_square(self.plan, residual))
+        trial = optx.FunctionInfo.Eval(half_square(self.plan, residual))
         step_size, accept, _, search = self.search.step(
-            state.first, zero, state.change, before, tried, state.search
+            state.first, zero, state.change, before, trial, state.search
         )
-        promised, kept = promise(before, state.change, tried.f)
+        predicted = predicted_decrease(before, state.change)
+        ratio = gain_ratio(predicted, before.f - trial.f, before.noise)
         y, known = self._accepted_point(accept, y, args, state)
         step_size, approach = state.approach.choose_step(
-            step_size, state.step_size, state.first, accept, promised, kept, known.cost
+            step_size, state.step_size, state.first, accept, predicted, ratio, known.cost
         )
         change, finite = self._next_change(known, step_size, state.descent)
         termination, approach = approach.judge(
             self.tolerance, step_size, finite, -dot(self.plan, known.gradient, change),
-            state.first, accept, before.f, known.cost, tried.f,
+            state.first, accept, before.f, known.cost, trial.f,
         )  # fmt: skip
-        trial = self.retract(self.plan, y, change)
-        y = jax.tree.map(lambda old, new: jnp.where(termination == SETTLED, new, old), y, trial)
-        self._report(state, tried.f)
+        following = self.retract(self.plan, y, change)
+        y = jax.tree.map(lambda a, b: jnp.where(termination == SETTLED, b, a), y, following)
+        self._report(state, trial.f)
         return y, State(
             first=jnp.asarray(False), known=dataclasses.replace(known, damping=1 / step_size),
-            change=change, trial=trial, step_size=step_size, descent=state.descent, search=search,
+            change=change, trial=following, step_size=step_size,
+            descent=state.descent, search=search,
             approach=approach, termination=termination, steps=state.steps + 1,
-            history=state.history.with_row(state.steps, tried.f, 1 / state.step_size, accept),
+            history=state.history.with_row(state.steps, trial.f, 1 / state.step_size, accept),
         ), aux  # fmt: skip
 
     def terminate(self, fn, y, args, options, state: State, tags):

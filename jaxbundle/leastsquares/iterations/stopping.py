@@ -38,10 +38,11 @@ Without redundancy all residuals vanish and there is no σ0 for stopping: this w
 NEAR_SOLUTION = 0.1
 """Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction. A
 rejected undamped step makes the limit of its problem ten times narrower, and nothing else: only
-those after a damped step that settled count as `REFUSALS`."""
-KEPT, FALLING = 0.95, 0.5
-"""The fraction of its prediction that it must achieve, and its limit relative to the one before."""
-REFUSALS = 2
+those after a damped step that settled count towards `MAX_REJECTED_UNDAMPED`."""
+QUADRATIC_GAIN, QUADRATIC_DECREASE = 0.95, 0.5
+"""Steps converge quadratically where the gain ratio is above the first, and the predicted decrease
+below this fraction of the one before."""
+MAX_REJECTED_UNDAMPED = 2
 """Number of rejected undamped steps, after damped ones settled, that means (nearly) singular."""
 SHORTEST_STEP = 1e-20
 """The smallest step size worth trying."""
@@ -70,48 +71,55 @@ class Tolerance(eqx.Module):
 
 
 class Approach(eqx.Module):
-    """State near convergence: the predicted decrease of the previous step, the number of rejected
-    undamped steps, whether the undamped equations could not be solved."""
+    """State near convergence: the largest relative decrease that is near the solution; the
+    decrease predicted for the last accepted step; whether the undamped equations could not be
+    solved, whether a settled step is to be repeated without damping, whether the last one was, and
+    how many of those were rejected."""
 
     near: Float[Array, ""]
-    promised: Float[Array, ""]
+    predicted: Float[Array, ""]
     singular: Bool[Array, ""]
-    trial: Bool[Array, ""]
-    tried: Bool[Array, ""]
-    refusals: Int[Array, ""]
+    repeat_undamped: Bool[Array, ""]
+    repeated: Bool[Array, ""]
+    rejected: Int[Array, ""]
 
     @classmethod
     def begin(cls) -> "Approach":
         no = jnp.asarray(False)
         return cls(jnp.asarray(NEAR_SOLUTION), jnp.asarray(0.0), no, no, no, jnp.asarray(0))
 
-    def choose_step(self, step_size, last_size, first, accept, promised, kept, cost):
+    def choose_step(self, step_size, last_size, first, accept, predicted, gain_ratio, cost):
         """The step size, infinite for an undamped step; and the approach after it."""
         # A rejected undamped step was tried too early.
         near = jnp.where(jnp.isinf(last_size) & ~accept, 0.1 * self.near, self.near)
-        quadratic = accept & (kept > KEPT) & ~self.singular & ~first
-        quadratic &= (promised < near * cost) & (promised < FALLING * self.promised)
-        refusals = self.refusals + (self.tried & ~accept)
+        quadratic = accept & (gain_ratio > QUADRATIC_GAIN) & ~self.singular & ~first
+        quadratic &= (predicted < near * cost) & (predicted < QUADRATIC_DECREASE * self.predicted)
         approach = Approach(
-            near=near, promised=jnp.where(accept, promised, self.promised),
-            singular=self.singular, trial=self.trial, tried=self.trial, refusals=refusals,
-        )  # fmt: skip
-        return jnp.where(quadratic | self.trial, jnp.inf, step_size), approach
+            near=near,
+            predicted=jnp.where(accept, predicted, self.predicted),
+            singular=self.singular,
+            repeat_undamped=self.repeat_undamped,
+            repeated=self.repeat_undamped,
+            rejected=self.rejected + (self.repeated & ~accept),
+        )
+        return jnp.where(quadratic | self.repeat_undamped, jnp.inf, step_size), approach
 
     def judge(
-        self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost, tried
-    ):
+        self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost,
+        trial_cost,
+    ):  # fmt: skip
         """The termination code after a step was computed, and the approach.
 
-        `cost`: at the accepted point; `before`: at the one before; `tried`: at the point tried."""
+        `cost`: at the accepted point; `before`: at the one before; `trial_cost`: at the one tried.
+        """
         undamped = jnp.isinf(step_size)
         small = finite & (decrement <= tolerance.limit(cost))
         settled = small & undamped
         again = self.singular & undamped & ~finite
-        singular = self.singular | (~finite & undamped) | (self.refusals >= REFUSALS)
-        # Accepted steps may grow: visible growth is not stalling.
-        stalled = accept & ~first & (before - tried < tolerance.rtol * before)
-        stalled &= tried - before <= tolerance.noise(before)
+        singular = self.singular | (~finite & undamped) | (self.rejected >= MAX_REJECTED_UNDAMPED)
+        stalled = accept & ~first & (before - trial_cost < tolerance.rtol * before)
+        # Gauss–Newton accepts every step: a sum of squares that grows has not stalled, it diverges.
+        stalled &= trial_cost - before <= tolerance.noise(before)
         reasons = (
             (~jnp.isfinite(cost), NOT_FINITE),
             (settled, SETTLED),
@@ -123,7 +131,9 @@ class Approach(eqx.Module):
         termination = jnp.asarray(LIMIT)
         for happened, reason in reversed(reasons):
             termination = jnp.where(happened, reason, termination)
-        # A small damped step: try it undamped before declaring convergence.
-        trial = small & ~singular & ~settled
-        approach = Approach(self.near, self.promised, singular, trial, self.tried, self.refusals)
+        # A small damped step says nothing: λ may have made it small.
+        repeat = small & ~singular & ~settled
+        approach = Approach(
+            self.near, self.predicted, singular, repeat, self.repeated, self.rejected
+        )
         return termination, approach
