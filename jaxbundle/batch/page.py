@@ -16,7 +16,6 @@ from jaxbundle.report.page import (
     Origin,
     Page,
     Section,
-    describe_origin,
     give_verdict,
     write,
 )
@@ -46,7 +45,7 @@ def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarra
     first = give_verdict(_judge(found), (), "<h3>Status</h3>\n", _states(found))
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
-    return Page(title, [first, *sections], describe_origin((), origin), {"results": listed})
+    return Page(title, [first, *sections], origin, tables={"results": listed})
 
 
 def _judge(found: Population) -> list[Finding]:

@@ -29,7 +29,6 @@ from jaxbundle.report.page import (
     Page,
     Section,
     compose,
-    describe_origin,
     find,
     give_verdict,
     write,
@@ -112,7 +111,7 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
     parts.append("</div>\n")
     title = f"Quality of camera {name}" if name else "Quality"
     link = "Quality" if number == 0 else ""
-    return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link, True)
+    return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link)
 
 
 def _validation(calibration) -> Section:
@@ -179,7 +178,7 @@ def _describe_several(found, origin: Origin) -> Page:
     more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
     first = give_verdict(findings, (), more)
-    return Page(title, [first, *sections], describe_origin((), origin), tables)
+    return Page(title, [first, *sections], origin, tables=tables)
 
 
 def _rig(rig, unit: str) -> Section:
@@ -190,7 +189,7 @@ def _rig(rig, unit: str) -> Section:
     for name in rig.names:
         parts += [f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",
                   grid(("parameter", "value", "σ"), rig_parameter_rows(rig, name))]  # fmt: skip
-    return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig", True)
+    return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig")
 
 
 def _table_of_cameras(found) -> Listing:

@@ -33,7 +33,7 @@ from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import micrometres
 from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import clean, significant
-from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
@@ -174,9 +174,8 @@ class CameraView:
             sections.append(Section("photo-section", "Undistorted photograph", place("photo"),
                                     "Photograph"))  # fmt: skip
         title = f"camera {clean(self.camera.id)}: explorer"
-        chosen = describe_origin([("model", self.model.name)], self.origin)
-        return make_page(title, sections, chosen, live, "camera", self.answer(given),
-                         given=values)  # fmt: skip
+        return make_page(title, sections, self.origin, live, "camera", self.answer(given),
+                         [("model", self.model.name)], given=values)  # fmt: skip
 
     # --- drawings ---------------------------------------------------------------------------
 

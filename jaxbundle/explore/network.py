@@ -41,7 +41,6 @@ from jaxbundle.report.page import (
     Origin,
     Page,
     Section,
-    describe_origin,
     find,
     give_verdict,
 )
@@ -301,8 +300,8 @@ class NetworkView:
         ]  # fmt: skip
         state = {"moves": given.get("moves", {}), "aim": given.get("aim", True)}
         return make_page(
-            title, sections, describe_origin((), self.origin), live, "network", answer,
-            collect_tables(found), drawings, state,
+            title, sections, self.origin, live, "network", answer, tables=collect_tables(found),
+            drawings=drawings, given=state,
         )  # fmt: skip
 
     def _move_section(self, given: Given, live: bool) -> Section:
@@ -328,7 +327,7 @@ class NetworkView:
             "</button></div>\n",
             draw_tools(live), place("moved"),
         ]  # fmt: skip
-        return Section("move", "Move a station", "".join(parts), "Move a station", True)
+        return Section("move", "Move a station", "".join(parts), "Move a station")
 
 
 def _selection() -> Section:

@@ -5,7 +5,7 @@ from importlib.resources import files
 from typing import Any, NamedTuple
 
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.report.page import Listing, Page, Section
+from jaxbundle.report.page import Listing, Origin, Page, Section
 from jaxbundle.report.page.markup import text
 
 STYLE = "explore.css"
@@ -88,15 +88,16 @@ def draw_tools(live: bool, exports: Mapping[str, str] = NOTHING) -> str:
 
 
 def make_page(
-    title: str, sections: Iterable[Section], origin: Section, live: bool, kind: str,
-    answer: Mapping[str, Any], tables: Mapping[str, Listing] = NOTHING,
-    drawings: Mapping[str, Any] = NOTHING, given: Mapping[str, Any] = NOTHING,
+    title: str, sections: Iterable[Section], origin: Origin, live: bool, kind: str,
+    answer: Mapping[str, Any], settings: Sequence[tuple[str, object]] = (),
+    tables: Mapping[str, Listing] = NOTHING, drawings: Mapping[str, Any] = NOTHING,
+    given: Mapping[str, Any] = NOTHING,
 ) -> Page:  # fmt: skip
     """A page of the explorer with the answer to the values `given`."""
     state = {"live": live, "kind": kind, "given": dict(given), "answer": dict(answer)}
     state = without_nan(state)
     return Page(
-        title, sections, origin, tables, {**drawings, "explore": state},
+        title, sections, origin, settings, tables, {**drawings, "explore": state},
         tuple(_read(name) for name in SCRIPTS), _read(STYLE), live,
     )  # fmt: skip
 

@@ -11,10 +11,9 @@ def text(value: object) -> str:
     return escape(clean(value))
 
 
-def section(id: str, title: str, *content: str, breaks: bool = False) -> str:
-    """A section with its heading; `breaks`: on a new page when printed."""
-    kind = ' class="breaks"' if breaks else ""
-    return f'<section id="{id}"{kind}><h2>{text(title)}</h2>\n{"".join(content)}</section>\n'
+def section(id: str, title: str, *content: str) -> str:
+    """A section with its heading."""
+    return f'<section id="{id}"><h2>{text(title)}</h2>\n{"".join(content)}</section>\n'
 
 
 def paragraph(words: object, kind: str = "") -> str:

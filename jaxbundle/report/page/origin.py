@@ -1,4 +1,5 @@
-"""Origin of a result: fingerprints of the input files, versions of the software."""
+"""Origin of a result: when it was computed, fingerprints of the input files, versions of the
+software."""
 
 import hashlib
 import os
@@ -23,10 +24,12 @@ class InputFile(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The origin of a result: the input files, and further settings by displayed name."""
+    """The origin of a result: the input files, the first of which names the project; further
+    settings by displayed name; the date of the computation in words, empty: that of the page."""
 
     inputs: tuple[InputFile, ...] = ()
     settings: Mapping[str, object] = MappingProxyType({})
+    computed: str = ""
 
 
 UNKNOWN = Origin()

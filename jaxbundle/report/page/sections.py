@@ -41,7 +41,7 @@ def network() -> Section:
         '<p class="legend" id="network-legend"></p>\n',
         '<p id="network-said" aria-live="polite"></p>\n',
     ]  # fmt: skip
-    return Section("network", "Network", "".join(parts), "Network", True)
+    return Section("network", "Network", "".join(parts), "Network")
 
 
 def photographs(test: str = "τ") -> Section:
@@ -55,7 +55,7 @@ def photographs(test: str = "τ") -> Section:
         '<p id="photograph-said" aria-live="polite"></p>\n',
     ]  # fmt: skip
     title = "Photographs: residuals and redundancy"
-    return Section("photographs", title, "".join(parts), "Photographs", True)
+    return Section("photographs", title, "".join(parts), "Photographs")
 
 
 def cameras(adjustment) -> Iterator[Section]:
@@ -73,7 +73,7 @@ def cameras(adjustment) -> Iterator[Section]:
         if others and number == len(chosen) - 1:
             parts.append(paragraph(f"{others} other cameras are in the table."))
         id, link = ("distortion", "Distortion") if number == 0 else (f"distortion-{number}", "")
-        yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link, True)
+        yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link)
 
 
 def _distortion(adjustment, camera: str) -> str:
@@ -133,7 +133,7 @@ def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "")
         draw_histogram(edges, counted, f"normalised residual {symbol}", "observations", expected),
         f"Normalised residuals of {counted.sum()} controlled observations; outer classes are open",
     )
-    return Section("residuals", "Normalised residuals", drawing + more, "Residuals", True)
+    return Section("residuals", "Normalised residuals", drawing + more, "Residuals")
 
 
 def convergence(adjustment) -> Section:
