@@ -34,7 +34,7 @@ from jaxbundle.report.page import (
     write,
 )
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_field
-from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
@@ -168,7 +168,7 @@ def _describe_several(found, origin: Origin) -> Page:
             maps = rig.reported_maps(name)
             sections.append(_quality(rig.coverage(name), maps, unit, f"{name} in the rig", number))
         sections.append(show_residuals(rig.residuals["tau"]))
-        listed = table_of_residuals(rig.residuals)
+        listed = table_of_residuals(rig.residuals, rig.sigma0)
         tables["observations"] = Listing("Observations of the rig", listed, "result.json")
     else:
         for number, (name, one) in enumerate(found.cameras.items()):
@@ -204,5 +204,6 @@ def _table_of_cameras(found) -> Listing:
     return Listing("Cameras, calibrated separately", {
         "camera": Column(words(camera), "camera"), "model": Column(words(model), "model"),
         "parameter": Column(words(parameter), "parameter"),
-        "value": Column(numbers(value), "value", -9, True), "sigma": Column(numbers(sigma), "σ"),
+        "value": estimates(numbers(value), numbers(sigma), "value"),
+        "sigma": Column(numbers(sigma), "σ"),
     }, "result.json")  # fmt: skip

@@ -123,7 +123,7 @@ def _control(part) -> list[Section]:
     """Control and check points."""
     if part.control is None:
         return []
-    points = grid(HEADER, part.control.rows())
+    points = grid(HEADER, part.control.rows(), "remarks")
     said = items([part.control.sigma, *part.control.notes])
     title = f"Control and check points: adjusted − given, in {clean(part.control.unit)}"
     return [Section("control", title, points + said, "Control")]

@@ -198,7 +198,7 @@ def convergence(adjustment) -> list[str]:
     rows = [
         (
             "start" if i == 0 else str(i),
-            f"{vtpv[i]:.8e}" if np.isfinite(vtpv[i]) else "not finite",
+            f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
             "–" if i == 0 else f"{damping[i]:.1e}" if damping[i] else "0",
             "" if i == 0 else "accepted" if accepted[i] else "rejected",
         )
@@ -253,12 +253,12 @@ def image_precision(adjustment) -> str:
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
             size = abs(next(iter(pitch))[0])
-            parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
+            parts.append(f"{span(adjustment.sigma0 * ends / size)} px")
     kind = "estimated" if adjustment.sigma_factors else "a priori"
-    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends, 4)} {unit})"
+    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends)} {unit})"
 
 
-def span(values, digits: int = 5) -> str:
+def span(values, digits: int = 3) -> str:
     """From the smallest to the largest; one number if they are equal to these digits."""
     return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 
@@ -311,7 +311,7 @@ def variance_factor(adjustment) -> list[str]:
 def variance_facts(adjustment) -> list[tuple[str, str]]:
     """vᵀPv, redundancy, σ0, the precision of an image coordinate, the global test."""
     return [
-        ("vᵀPv", significant(adjustment.vtpv, 7)),
+        ("vᵀPv", significant(adjustment.vtpv, 6)),
         ("Redundancy", str(adjustment.redundancy)),
         ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), dimensionless"),
         ("Image coordinate", image_precision(adjustment)),

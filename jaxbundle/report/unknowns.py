@@ -7,6 +7,7 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import (
+    WITHOUT_SIGMA,
     bar,
     clean,
     column_decimals,
@@ -51,7 +52,7 @@ def _one_camera(entry, model: CameraModel) -> list[str]:
     rows, held = [], []
     for name, found in entry["parameters"].items():
         if not found["free"]:
-            held.append(f"{name} {significant(found['value'], 10)}")
+            held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
         value, sigma = estimate(found["value"], found["sigma"])
         t, total = found["t"], found["total_correlation"]

@@ -43,9 +43,10 @@ class Table {
   }
 
   cell(name, row) {
-    const { names, places } = this.columns[name];
+    const { names, places, digits } = this.columns[name];
     const value = this.numbers(name)[row];
-    return names === undefined ? formatNumber(value, places) : names[value];
+    if (names !== undefined) return names[value];
+    return formatNumber(value, digits === undefined ? places : -unpack(digits, this.length)[row]);
   }
 
   row(wanted, name = "id") {

@@ -10,6 +10,7 @@ import base64
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -118,7 +119,7 @@ def _origin(page: Page) -> Section:
     parts = [markup.facts([*page.settings, *origin.settings.items()])]
     if origin.inputs:
         rows = [(file.name, file.size, file.sha256) for file in origin.inputs]
-        listed = markup.grid(("file", "bytes", "SHA-256"), rows, "words")
+        listed = markup.grid(("file", "bytes", "SHA-256"), rows, "words files")
         parts += ["<h3>Input files</h3>\n", listed]
     parts += ["<h3>Software</h3>\n", markup.facts(software_versions())]
     title = "Settings and origin"
@@ -154,11 +155,13 @@ def _beginning(page: Page, date: str) -> str:
 
 
 def _source(origin: Origin) -> str:
-    """The first input file, which is that of the project, and the number of others."""
+    """The first input file, which is that of the project, in its folder, and the number of
+    others."""
     if not origin.inputs:
         return ""
     others = len(origin.inputs) - 1
-    return origin.inputs[0].name + (f" and {count(others, 'other file')}" if others else "")
+    name = "/".join(Path(origin.inputs[0].name).parts[-2:])
+    return name + (f" and {count(others, 'other file')}" if others else "")
 
 
 def _css_text(words: str) -> str:

@@ -36,13 +36,14 @@ def facts(rows: Iterable[tuple[object, object]]) -> str:
 
 
 def grid(header: Sequence[object], rows: Iterable[Sequence[object]], kind: str = "") -> str:
-    """A table with a header; all but the first column are numbers."""
+    """A table with a header, which scrolls where it is wider than the page; all but the first
+    column are numbers, of the kind `remarks` also the last are words, of the kind `words` all."""
     head = "".join(f'<th scope="col">{text(cell)}</th>' for cell in header)
     body = "".join(
         "<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>\n" for row in rows
     )
     cells = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>"
-    return f"<table{_class(kind)}>\n{cells}</table>\n"
+    return f'<div class="wide"><table{_class(kind)}>\n{cells}</table></div>\n'
 
 
 def figure(drawing: str, caption: object) -> str:

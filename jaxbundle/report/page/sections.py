@@ -147,7 +147,7 @@ def convergence(adjustment) -> Section:
         drawing = figure(draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
                          f"{head.result_in_words(adjustment)}: {adjustment.termination}")
     rows = [
-        (i or "start", f"{vtpv[i]:.8e}" if np.isfinite(vtpv[i]) else "not finite",
+        (i or "start", f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
          f"{damping[i]:.1e}" if i else "", ("accepted" if accepted[i] else "rejected") if i else "")
         for i in step
     ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import clean, column_decimals
-from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.document import Listing
 
 MOST_ROWS = 500_000
@@ -43,7 +43,7 @@ def cameras(adjustment) -> Columns:
         "camera": Column(found["camera"], "camera"),
         "model": Column(found["model"], "model"),
         "parameter": Column(found["parameter"], "parameter"),
-        "value": Column(numbers(found["value"]), "value", -9, True),
+        "value": estimates(numbers(found["value"]), numbers(found["sigma"]), "value"),
         "sigma": Column(numbers(found["sigma"]), "σ"),
         "free": Column(found["free"].astype(bool), "free"),
         "t": Column(numbers(found["t"]), "t = |value|/σ"),
@@ -126,11 +126,11 @@ def checks(adjustment) -> Columns:
 def observations(adjustment) -> Columns:
     """All observations, of very many those with the largest |τ|; `measured` of image points."""
     return table_of_residuals(
-        adjustment.residuals | {"measured": measured_coordinates(adjustment)}
+        adjustment.residuals | {"measured": measured_coordinates(adjustment)}, adjustment.sigma0
     )
 
 
-def table_of_residuals(found: Mapping[str, np.ndarray]) -> Columns:
+def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Columns:
     """The columns there are of a table of residuals."""
     chosen = choose_largest(found["tau"], MOST_ROWS)
     labels = {
@@ -138,7 +138,8 @@ def table_of_residuals(found: Mapping[str, np.ndarray]) -> Columns:
         "v": "v", "sigma": "σ a priori", "r": "r", "w": "w", "tau": "τ", "mdb": "MDB (σ a priori)",
         "external": "ext.", "weight": "weight",
     }  # fmt: skip
-    places = {"r": 3, "tau": 2, "w": 2, "measured": 4}
+    of_images = found["sigma"][found["kind"] == "image"]
+    places = {"r": 3, "tau": 2, "w": 2, "measured": column_decimals(sigma0 * of_images)}
     return {
         name: Column(found[name][chosen], label, places.get(name, -3))
         for name, label in labels.items()
