@@ -117,14 +117,19 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
 def _validation(calibration) -> Section:
     """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
-    x = np.log10(distances)
-    curves = [Curve("middle of the image", x, np.log10(middle)),
-              Curve("worst corner", x, np.log10(corners), kind="second")]  # fmt: skip
+    # σ is 0 everywhere if the measurements fit exactly, and no number without a ray
+    known = [(name, np.log10(distances[s > 0]), np.log10(s[s > 0]), kind) for name, s, kind in (
+        ("middle of the image", middle, "first"), ("worst corner", corners, "second")
+    )]  # fmt: skip
+    curves = [Curve(name, x, y, kind=kind) for name, x, y, kind in known if len(x)]
     unit = _unit(calibration)
-    drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
-                          (float(np.log10(reported[0, 0])), "median distance of the board"))
-    parts = [figure(drawing, "Uncertainty against the distance of the point, in the scene"),
-             "<h3>Cross-validation</h3>\n"]  # fmt: skip
+    if curves:
+        drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
+                              (float(np.log10(reported[0, 0])), "median distance of the board"))
+        shown = figure(drawing, "Uncertainty against the distance of the point, in the scene")
+    else:
+        shown = paragraph("The measurements fit exactly: σ of a projected point is 0.")
+    parts = [shown, "<h3>Cross-validation</h3>\n"]
     parts += [paragraph(words[:1].upper() + words[1:])
               for words in cross_validation_in_words(calibration)]  # fmt: skip
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")

@@ -27,7 +27,8 @@ class Addition(NamedTuple):
 
     **Fields:** `kind`, for the title, empty if the name of the network is enough; `findings` before
     those of the adjustment; `without`: findings of the adjustment to omit; `warnings` before its
-    own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before the others.
+    own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before the others;
+    `name`, in place of that of the network.
     """
 
     kind: str = "bundle adjustment"
@@ -37,6 +38,7 @@ class Addition(NamedTuple):
     overview: str = ""
     sections: tuple[Section, ...] = ()
     tables: Mapping[str, Listing] = NOTHING
+    name: str = ""
 
 
 ALONE = Addition()
@@ -70,7 +72,8 @@ def compose_failure(
 
 def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
     """The page of an adjustment, as a `Page`."""
-    title = ": ".join(filter(None, (clean(adjustment.network.name) or "network", also.kind)))
+    name = clean(also.name or adjustment.network.name) or "network"
+    title = f"{name}: {also.kind}" if also.kind else name
     settings = head.setting_facts(adjustment)
     warnings = (*also.warnings, *adjustment.warnings)
     if not adjustment.converged:

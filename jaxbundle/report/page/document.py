@@ -133,8 +133,8 @@ def _beginning(page: Page, date: str) -> str:
     made = " · ".join(clean(words) for words in made if words)
     # Repeated in the margin of every printed page, by browsers that know margin boxes.
     margins = (
-        f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; }} '
-        f'@bottom-left {{ content: "{_css_text(made)}"; }} }}\n'
+        f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; font-size: 8pt; }} '
+        f'@bottom-left {{ content: "{_css_text(made)}"; font-size: 8pt; }} }}\n'
     )
     style, script = _read(STYLE) + margins + page.style, _script(page)
     policy = (

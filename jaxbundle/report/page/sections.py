@@ -19,6 +19,8 @@ from jaxbundle.report.unknowns import validity
 
 MOST_CAMERAS = 20
 """Largest number of cameras with drawn distortion and correlations."""
+LEAST_FALL = 1e-5
+"""Smallest relative change of vᵀPv that is drawn: its table has six digits."""
 
 
 def collect(adjustment) -> Iterator[Section]:
@@ -142,7 +144,7 @@ def convergence(adjustment) -> Section:
     there = np.isfinite(vtpv) & (vtpv > 0)
     step = np.arange(len(vtpv))
     drawing = ""
-    if there.sum() > 1:
+    if there.sum() > 1 and vtpv[there].max() > (1 + LEAST_FALL) * vtpv[there].min():
         curve = Curve("vᵀPv", step[there], np.log10(vtpv[there]))
         drawing = figure(draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
                          f"{head.result_in_words(adjustment)}: {adjustment.termination}")
