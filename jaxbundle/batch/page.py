@@ -165,5 +165,7 @@ def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, 
                     f"sigma_{name}": Column(found.sigma[name], f"σ {name}")}  # fmt: skip
     if np.isfinite(found.farthest).any():
         columns["farthest"] = Column(found.farthest, "largest deviation [robust σ]", 1)
-    columns |= {f"with {n}": Column(values, n, -WITHOUT_SIGMA, True) for n, values in against.items()}
+    columns |= {
+        f"with {n}": Column(values, n, -WITHOUT_SIGMA, True) for n, values in against.items()
+    }
     return columns | {"remark": Column(found.remark, "remark")}

@@ -43,7 +43,8 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
 
 
 def _places(values: Float[np.ndarray, " n"]) -> int:
-    """Decimal places of the step, which is 1, 2, 2.5 or 5 times a power of ten; negative: tens, …"""
+    """Decimal places of the step, which is 1, 2, 2.5 or 5 times a power of ten; negative for tens,
+    hundreds, …"""
     step = float(values[1] - values[0])
     first = -math.floor(math.log10(step) + 1e-9)
     whole = step * 10.0**first
@@ -52,24 +53,26 @@ def _places(values: Float[np.ndarray, " n"]) -> int:
 
 def offset_in_words(offset: float) -> str:
     """What is to be added to the ticks of an axis, for its label; digits in groups of three."""
-    return f" ({offset:+,.12g})".replace(",", "\u202f").replace("-", "−") if offset else ""
+    return f" ({offset:+,.12g})".replace(",", " ").replace("-", "−") if offset else ""
 
 
 def label_coordinates(ax, axis: str, unit: str) -> None:
     """The label and the ticks of a coordinate axis in the limits it has: X, Y or Z."""
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import Formatter
 
     of = getattr(ax, f"{axis}axis")
     low, high = sorted(of.get_view_interval())
     offset, _ = label_ticks([tick for tick in of.get_majorticklocs() if low <= tick <= high])
 
-    def name(value: float, place: int | None) -> str:
-        if place is None:  # of the pointer
+    class WithoutOffset(Formatter):
+        def __call__(self, value, place=None):
+            """The whole coordinate, at the pointer."""
             return f"{value:.10g}"
-        return name_ticks(np.array(formatter.locs) - offset)[place]
 
-    formatter = FuncFormatter(name)
-    of.set_major_formatter(formatter)
+        def format_ticks(self, values):
+            return name_ticks(np.array(values) - offset)
+
+    of.set_major_formatter(WithoutOffset())
     label(ax, axis, axis.upper(), unit)
     of.set_label_text(of.get_label_text() + offset_in_words(offset))
 

@@ -43,9 +43,9 @@ ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2)."""
 def network_plan(adjustment, ax=None):
     """The network seen from above: points by role, cameras, error ellipses of X and Y.
 
-    The ellipses are 1σ (a posteriori) and exaggerated; the legend states the factor, and of which
-    points they are drawn (`choose_ellipses`). A camera is the pyramid of its image corners, with its
-    projection centre and viewing direction.
+    The ellipses are 1σ (a posteriori) and exaggerated; legend and title state the factor, and of
+    which points they are drawn (`choose_ellipses`). A camera is the pyramid of its image corners,
+    with its projection centre and viewing direction.
 
     **Returns:** matplotlib `Axes`, in the object unit.
     """
@@ -210,7 +210,8 @@ def _points(adjustment):
 def _lighter(role: str, number: int):
     """Smaller marks for many tie points."""
     style = ROLE_STYLE[role]
-    return style if role != "tie" else style | {"s": style["s"] / (1 if number <= 300 else 2 if number <= 3000 else 8)}
+    factor = 1 if role != "tie" or number <= 300 else 2 if number <= 3000 else 8
+    return style | {"s": style["s"] / factor}
 
 
 class Ellipses(NamedTuple):

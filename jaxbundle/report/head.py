@@ -253,12 +253,12 @@ def image_precision(adjustment) -> str:
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
             size = abs(next(iter(pitch))[0])
-            parts.append(f"{span(adjustment.sigma0 * ends / size)} px")
+            parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
     kind = "estimated" if adjustment.sigma_factors else "a priori"
-    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends)} {unit})"
+    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends, 4)} {unit})"
 
 
-def span(values, digits: int = 3) -> str:
+def span(values, digits: int = 5) -> str:
     """From the smallest to the largest; one number if they are equal to these digits."""
     return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 

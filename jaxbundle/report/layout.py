@@ -73,7 +73,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     if 1e-5 <= abs(value) < 10.0 ** max(digits, 6):
         places = decimals_of(abs(value), digits)
         text = f"{value:.{max(places, 0)}f}"
-        return text.rstrip("0").rstrip(".") if digits > 6 and "." in text else text
+        return text.rstrip("0").rstrip(".") if digits >= WITHOUT_SIGMA and "." in text else text
     return f"{value:.{digits - 1}e}"
 
 
@@ -85,9 +85,8 @@ def fixed(value: float | None, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def column_decimals(sigma, digits: int = 2, most: int = 9) -> int:
-    """One number of decimal places for a whole column: `digits` digits of nearly every σ in it, by
-    default two, which suffice for an uncertainty (GUM, JCGM 100:2008, 7.2.6).
+def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:
+    """One number of decimal places for a whole column: `digits` digits of nearly every σ in it.
 
     The smallest tenth of the σ may show fewer, so that one odd value does not widen all rows.
     """
@@ -96,6 +95,12 @@ def column_decimals(sigma, digits: int = 2, most: int = 9) -> int:
     if not len(sigma):
         return 4
     return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, most))
+
+
+def coordinate_decimals(sigma) -> int:
+    """Decimal places of a column of coordinates: two digits of nearly every σ in it, which suffice
+    for an uncertainty (GUM, JCGM 100:2008, 7.2.6); map coordinates have many digits before them."""
+    return column_decimals(sigma, 2)
 
 
 # --- words ----------------------------------------------------------------------------------

@@ -156,7 +156,7 @@ def components(adjustment) -> list[str]:
     absolute."""
     rows = [
         (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
-         significant(c.sigma, 4), span(c.estimated))
+         significant(c.sigma, 4), span(c.estimated, 3))
         for name, c in adjustment.variance_components.items()
     ]  # fmt: skip
     header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")

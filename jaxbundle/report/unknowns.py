@@ -11,6 +11,7 @@ from jaxbundle.report.layout import (
     bar,
     clean,
     column_decimals,
+    coordinate_decimals,
     estimate,
     facts,
     fixed,
@@ -139,7 +140,7 @@ def images(adjustment, most: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
     found = adjustment.images
     unit, angle = adjustment.image_unit, adjustment.network.angle_unit
-    places = [column_decimals(found[f"s{name}"]) for name in EXTERIOR]
+    places = [coordinate_decimals(found[f"s{name}"]) for name in EXTERIOR]
     scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
     rms_places = column_decimals(scale * found["rms"])
     rows = []
@@ -243,7 +244,7 @@ def _list_of_points(adjustment, most) -> list[str]:
     found = adjustment.points
     total = len(found["id"])
     shown = np.arange(min(total, most))
-    places = [column_decimals(found[f"s{axis}"]) for axis in "XYZ"]
+    places = [coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"]
     rows = [
         (
             found["id"][i],

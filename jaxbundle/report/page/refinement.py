@@ -84,7 +84,8 @@ def _judge(result, used, w) -> list[Finding]:
                 f"weakly controlled (r < 0.1), {loose} uncontrolled"),
         Finding("Blunders", DOUBTFUL if over else GOOD,
                 f"{large} of {count(len(w), 'coordinate')} with |w| over {CRITICAL_W} (by chance "
-                f"about {significant(expected, 2)}); {len(result.removed)} removed by data snooping"),
+                f"about {significant(expected, 2)}); {len(result.removed)} removed by data "
+                "snooping"),
     ]  # fmt: skip
     check = result.check
     if check is not None:

@@ -23,9 +23,9 @@ MOST_OF_SIZE = 0.15
 
 
 def describe_network(adjustment) -> dict:
-    """Centre, size and unit of the network; its error ellipsoids: the factor, the rows of points and
-    stations that have one, in words, and whether those of stations are too wide to be drawn; the
-    pyramid of every image (projection centre and four corners, relative to the centre)."""
+    """Centre, size and unit of the network; its error ellipsoids: the factor, the rows of points
+    and stations that have one, in words, and whether those of stations are too wide to be drawn;
+    the pyramid of every image (projection centre and four corners, relative to the centre)."""
     centres = adjustment.image_values[:, :3]
     near = adjustment.point_values[adjustment.located]
     centre, size = extent(np.concatenate([near, centres]))
