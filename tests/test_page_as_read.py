@@ -19,7 +19,7 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.plotting import views
 from jaxbundle.plotting.ticks import label_coordinates, label_ticks, offset_in_words
 from jaxbundle.plotting.views import LARGEST_ELLIPSES, PROBABILITY, SAMPLED_ELLIPSES, thin_out
-from jaxbundle.report.layout import coordinate_decimals, digits_of, estimate, significant
+from jaxbundle.report.layout import coordinate_decimals, digits_of, estimate
 from jaxbundle.report.page import Addition, InputFile, Origin, compose, compose_failure
 from jaxbundle.report.page.charts import Curve, draw_curves
 from jaxbundle.report.page.markup import grid
@@ -343,7 +343,3 @@ def test_a_date_that_is_none_is_refused(given, monkeypatch):
     monkeypatch.setenv(clock.VARIABLE, given)
     with pytest.raises(InputError, match="SOURCE_DATE_EPOCH: expected seconds since 1970, got"):
         clock.now()
-
-
-def test_a_count_by_chance_is_read_as_a_count():
-    assert significant(130.24, 2) == "130" and significant(0.08, 2) == "0.080"

@@ -12,7 +12,7 @@ TICK_DIGITS = 6
 """Largest number of digits of a tick: as many as fit beside an axis."""
 
 
-def label_ticks(ticks: Sequence[float]) -> tuple[float, list[str]]:
+def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float, list[str]]:
     """A common offset of evenly spaced ticks, and the short text of each without it.
 
     Neighbours differ in their text. The offset is 0, or a round number where ticks would need more
