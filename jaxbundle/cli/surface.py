@@ -68,7 +68,7 @@ def surface(
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import numpy as np
 
-    from jaxbundle.cli.outputs import check_json
+    from jaxbundle.cli.outputs import check_json, trace_files
     from jaxbundle.cli.progress import counting
     from jaxbundle.cli.surface_outputs import (
         choose,
@@ -79,6 +79,7 @@ def surface(
     from jaxbundle.io.results.result_json import without_nan
     from jaxbundle.io.text.csv_tables import write_text
     from jaxbundle.io.writing.folders import check_folder, replace_folder
+    from jaxbundle.report.page import head_line
     from jaxbundle.surface.dsm import make_dsm, write_dsm
     from jaxbundle.surface.files import report_of, text_of, write_cloud_csv
     from jaxbundle.surface.orthophoto import mosaic, write_orthophoto
@@ -102,6 +103,7 @@ def surface(
     chosen = choose(made.views, orthophoto_of) if orthophoto or orthophoto_of else []
     found = made.surface
     report = report_of(found, check=given if check else made.check)
+    told = head_line(trace_files(input, {})) + text_of(report)
     text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"
     with replace_folder(out, "surface", FILES, force) as folder:
         write_cloud_csv(found.cloud, folder / "cloud.csv")
@@ -113,13 +115,13 @@ def surface(
                 values = mosaic(chosen, model, made.to_views)
                 write_orthophoto(values, model, folder / "orthophoto.tif")
         write_text(folder / "surface.json", text)
-        write_text(folder / "report.txt", text_of(report) + "\n")
+        write_text(folder / "report.txt", told + "\n")
     if json == "-":
         write_json(text)
     elif json:
         write_text(Path(json), text)
     if not quiet and json != "-":
-        print(text_of(report))
+        print(told)
 
 
 def _heights(zmin: float | None, zmax: float | None) -> tuple[float, float] | None:

@@ -31,8 +31,8 @@ def browser(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pages(convergent4, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
-    camera = Camera("cam", "opencv", {"fx": 1223.827160493827, "fy": 1223.0, "cx": 959.5,
-                                      "cy": 539.5, "k1": -0.01}, image_size=(1920, 1080))  # fmt: skip
+    values = {"fx": 1223.827160493827, "fy": 1223.0, "cx": 959.5, "cy": 539.5, "k1": -0.01}
+    camera = Camera("cam", "opencv", values, image_size=(1920, 1080))
     content = {
         "report": "".join(compose(convergent4, ORIGIN)),
         "network": page_file(NetworkView(convergent4, ORIGIN), {}, live=False).content.decode(),

@@ -10,15 +10,13 @@ import base64
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from jaxbundle.network.columns import count
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import markup
 from jaxbundle.report.page.columns import Column, encode_table, script_text
-from jaxbundle.report.page.origin import UNKNOWN, Origin, software_versions
+from jaxbundle.report.page.origin import UNKNOWN, Origin, software_versions, stamp
 from jaxbundle.system.clock import in_words, now
 
 SCRIPTS = (
@@ -127,10 +125,7 @@ def _origin(page: Page) -> Section:
 
 
 def _beginning(page: Page, date: str) -> str:
-    from jaxbundle import __version__
-
-    made = [_source(page.origin), f"computed {date}", f"jaxbundle {__version__}"]
-    made = " · ".join(clean(words) for words in made if words)
+    made = " · ".join(map(clean, stamp(page.origin._replace(computed=date))))
     # Repeated in the margin of every printed page, by browsers that know margin boxes.
     margins = (
         f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; font-size: 8pt; }} '
@@ -152,16 +147,6 @@ def _beginning(page: Page, date: str) -> str:
         f"{icon}<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f"<header><h1>{title}</h1>{markup.paragraph(made, 'made')}</header>\n<main>\n"
     )
-
-
-def _source(origin: Origin) -> str:
-    """The first input file, which is that of the project, in its folder, and the number of
-    others."""
-    if not origin.inputs:
-        return ""
-    others = len(origin.inputs) - 1
-    name = "/".join(Path(origin.inputs[0].name).parts[-2:])
-    return name + (f" and {count(others, 'other file')}" if others else "")
 
 
 def _css_text(words: str) -> str:

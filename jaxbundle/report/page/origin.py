@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from jaxbundle.network.columns import count
 from jaxbundle.system.file_content import is_plain
 
 PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "numpy", "scipy")
@@ -49,6 +50,24 @@ def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
         except OSError:
             continue
     return tuple(found.values())
+
+
+def stamp(origin: Origin) -> list[str]:
+    """What a page or report is of: the first input file, which is that of the project, in its
+    folder, and the number of others; date; version."""
+    from jaxbundle import __version__
+
+    said = [f"computed {origin.computed}"] if origin.computed else []
+    if origin.inputs:
+        others = len(origin.inputs) - 1
+        name = "/".join(Path(origin.inputs[0].name).parts[-2:])
+        said.insert(0, name + (f" and {count(others, 'other file')}" if others else ""))
+    return [*said, f"jaxbundle {__version__}"]
+
+
+def head_line(origin: Origin) -> str:
+    """The stamp as the first line of a report; empty if the date is not known."""
+    return f"{', '.join(stamp(origin))}\n" if origin.computed else ""
 
 
 def software_versions() -> list[tuple[str, str]]:
