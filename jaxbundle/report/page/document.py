@@ -125,7 +125,7 @@ def _origin(page: Page) -> Section:
 
 
 def _beginning(page: Page, date: str) -> str:
-    made = " · ".join(map(clean, stamp(page.origin._replace(computed=date))))
+    made = " · ".join(map(clean, stamp([file.name for file in page.origin.inputs], date)))
     # Repeated in the margin of every printed page, by browsers that know margin boxes.
     margins = (
         f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; font-size: 8pt; }} '

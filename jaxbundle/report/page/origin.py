@@ -4,7 +4,7 @@ software."""
 import hashlib
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -52,22 +52,24 @@ def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
     return tuple(found.values())
 
 
-def stamp(origin: Origin) -> list[str]:
+def stamp(files: Sequence[str], computed: str) -> list[str]:
     """What a page or report is of: the first input file, which is that of the project, in its
     folder, and the number of others; date; version."""
     from jaxbundle import __version__
 
-    said = [f"computed {origin.computed}"] if origin.computed else []
-    if origin.inputs:
-        others = len(origin.inputs) - 1
-        name = "/".join(Path(origin.inputs[0].name).parts[-2:])
-        said.insert(0, name + (f" and {count(others, 'other file')}" if others else ""))
-    return [*said, f"jaxbundle {__version__}"]
+    said = [f"computed {computed}", f"jaxbundle {__version__}"]
+    if not files:
+        return said
+    others = len(files) - 1
+    name = "/".join(Path(files[0]).parts[-2:])
+    return [name + (f" and {count(others, 'other file')}" if others else ""), *said]
 
 
 def head_line(origin: Origin) -> str:
     """The stamp as the first line of a report; empty if the date is not known."""
-    return f"{', '.join(stamp(origin))}\n" if origin.computed else ""
+    if not origin.computed:
+        return ""
+    return f"{', '.join(stamp([file.name for file in origin.inputs], origin.computed))}\n"
 
 
 def software_versions() -> list[tuple[str, str]]:
