@@ -46,7 +46,14 @@ class Table {
     const { names, places, digits } = this.columns[name];
     const value = this.numbers(name)[row];
     if (names !== undefined) return names[value];
-    return formatNumber(value, digits === undefined ? places : -unpack(digits, this.length)[row]);
+    return formatNumber(value, digits === undefined ? places : -this.digits(name)[row]);
+  }
+
+  // By row the number of significant digits of a column.
+  digits(name) {
+    const column = this.columns[name];
+    column.unpackedDigits ??= unpack(column.digits, this.length);
+    return column.unpackedDigits;
   }
 
   row(wanted, name = "id") {
