@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-VOID = {"meta", "input", "img", "br"}
+VOID = {"meta", "input", "img", "br", "link"}
 
 
 class Page(HTMLParser):

@@ -1,6 +1,7 @@
 """The pages of batches, reconstructions and several cameras: their contents agree with the
 result."""
 
+import dataclasses
 import datetime
 import json
 
@@ -54,7 +55,7 @@ def test_a_batch_shows_its_population(rows):
     fit = [row for row in rows if row["status"] == "converged"]
     fx = np.array([row["parameters"]["fx"]["value"] for row in fit])
     spread = 1.4826 * np.median(np.abs(fx - np.median(fx)))
-    assert f"{np.median(fx):g}" in cells and f"{spread:.3f}" in cells
+    assert f"{np.median(fx):.3f}" in cells and f"{spread:.3f}" in cells
     outlying = [words for words in cells if "robust σ from the median" in words]
     assert outlying == [f"fx {(1100 - np.median(fx)) / spread:.0f} robust σ from the median"]
     assert "misfit; gross errors" in cells and f"singular; {HOSTILE}" in cells
@@ -103,6 +104,8 @@ def test_a_reconstruction_names_what_it_left_out(convergent4):
         (part,), {f"{HOSTILE}.jpg": "too few matches"}, ("a note",),
         (("a.jpg", "b.jpg", 100, 60, "general"),), {name: None for name in "abcde"},
     )  # fmt: skip
+    named = dataclasses.replace(found, name="gravel pit")
+    assert Page("".join(compose_part(named, part))).texts["title"] == ["gravel pit: reconstruction"]
     text = "".join(compose_part(found, part))
     page = Page(text)
     cells = page.texts["td"]

@@ -23,7 +23,7 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import extent, round_number
-from jaxbundle.plotting.views import camera_pyramids, error_ellipses
+from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses
 
 matplotlib.use("Agg")
 
@@ -275,7 +275,8 @@ def test_plan(convergent4, axes):
 
 
 def test_error_ellipses_lean_as_the_covariance(convergent4):
-    polygons = error_ellipses(convergent4, 1.0)[:, :-1]
+    all_of_them = Ellipses(np.arange(len(convergent4.points["id"])), 0, 1.0)
+    polygons = error_ellipses(convergent4, all_of_them)[:, :-1]
     away = polygons - polygons.mean(1, keepdims=True)
     moment = np.einsum("pni,pnj->pij", away, away) / away.shape[1]
     expected = convergent4.point_covariance[:, :2, :2]

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbundle.batch.population import FEWEST, LEVEL, OUTLIER_LIMIT, Population
 from jaxbundle.network.columns import count
-from jaxbundle.report.layout import fixed, significant
+from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of, estimate, fixed, significant
 from jaxbundle.report.page import (
     UNKNOWN,
     Finding,
@@ -16,12 +16,11 @@ from jaxbundle.report.page import (
     Origin,
     Page,
     Section,
-    describe_origin,
     give_verdict,
     write,
 )
 from jaxbundle.report.page.charts import draw_histogram
-from jaxbundle.report.page.columns import Column
+from jaxbundle.report.page.columns import Column, estimates
 from jaxbundle.report.page.document import NOTHING
 from jaxbundle.report.page.markup import figure, grid, paragraph
 from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
@@ -46,7 +45,7 @@ def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarra
     first = give_verdict(_judge(found), (), "<h3>Status</h3>\n", _states(found))
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
-    return Page(title, [first, *sections], describe_origin((), origin), {"results": listed})
+    return Page(title, [first, *sections], origin, tables={"results": listed})
 
 
 def _judge(found: Population) -> list[Finding]:
@@ -99,9 +98,8 @@ def _parameters(found: Population) -> list[Section]:
         sigma = found.spread(found.sigma[name])[0]
         there = values[found.fit & np.isfinite(values)]
         if len(there):
-            rows.append((name, len(there), significant(middle, 7), significant(deviation),
-                         significant(sigma), significant(there.min(), 7),
-                         significant(there.max(), 7)))  # fmt: skip
+            ends = (significant(x, digits_of(x, deviation)) for x in (there.min(), there.max()))
+            rows.append((name, len(there), *estimate(middle, deviation), significant(sigma), *ends))
     if not rows:
         return []
     note = paragraph("Converged cameras. Robust σ: 1.4826 times the median absolute deviation. A "
@@ -163,9 +161,11 @@ def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, 
         for name, values in found.numbers.items() if np.isfinite(values).any()
     }  # fmt: skip
     for name, values in found.values.items():
-        columns |= {name: Column(values, name, -8, True),
+        columns |= {name: estimates(values, found.sigma[name], name),
                     f"sigma_{name}": Column(found.sigma[name], f"σ {name}")}  # fmt: skip
     if np.isfinite(found.farthest).any():
         columns["farthest"] = Column(found.farthest, "largest deviation [robust σ]", 1)
-    columns |= {f"with {n}": Column(values, n, -8, True) for n, values in against.items()}
+    columns |= {
+        f"with {n}": Column(values, n, -WITHOUT_SIGMA, True) for n, values in against.items()
+    }
     return columns | {"remark": Column(found.remark, "remark")}

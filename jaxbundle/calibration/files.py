@@ -43,7 +43,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
-from jaxbundle.report.page import UNKNOWN, Origin
+from jaxbundle.report.page import UNKNOWN, Origin, head_line
 from jaxbundle.types import Progress
 
 COMMAND = "calibrate"
@@ -115,7 +115,7 @@ def _fill(
 ) -> None:  # fmt: skip
     name = file_name(calibration.name)
     folder.mkdir(exist_ok=True)
-    write_text(folder / REPORT, calibration.report())
+    write_text(folder / REPORT, head_line(origin) + calibration.report())
     write_text(folder / PAGE, compose_calibration(calibration, origin, choice))
     write_text(folder / RESULT, json_text(calibration.to_dict()))
     if not calibration.converged:
@@ -164,13 +164,14 @@ def fill_calibrations(
     found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None,
     progress: Progress | None = None,
 ) -> None:  # fmt: skip
-    """Write a calibration into an existing folder; `origin` and `choice` are for the page."""
+    """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
+    the page."""
     if len(found.cameras) == 1:
         one = next(iter(found.cameras.values()))
         return _fill(one, folder, plots, origin, choice, progress)
     for name, one in found.cameras.items():
         _fill(one, folder / file_name(name), plots, origin, progress=progress)
-    write_text(folder / REPORT, found.report())
+    write_text(folder / REPORT, head_line(origin) + found.report())
     write_text(folder / PAGE, compose_calibrations(found, origin))
     write_text(folder / RESULT, json_text(calibrations_dict(found)))
     if found.rig is not None:

@@ -29,13 +29,12 @@ from jaxbundle.report.page import (
     Page,
     Section,
     compose,
-    describe_origin,
     find,
     give_verdict,
     write,
 )
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_field
-from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
@@ -112,20 +111,25 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
     parts.append("</div>\n")
     title = f"Quality of camera {name}" if name else "Quality"
     link = "Quality" if number == 0 else ""
-    return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link, True)
+    return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link)
 
 
 def _validation(calibration) -> Section:
     """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
-    x = np.log10(distances)
-    curves = [Curve("middle of the image", x, np.log10(middle)),
-              Curve("worst corner", x, np.log10(corners), kind="second")]  # fmt: skip
+    # σ is 0 everywhere if the measurements fit exactly, and no number without a ray
+    known = [(name, np.log10(distances[s > 0]), np.log10(s[s > 0]), kind) for name, s, kind in (
+        ("middle of the image", middle, "first"), ("worst corner", corners, "second")
+    )]  # fmt: skip
+    curves = [Curve(name, x, y, kind=kind) for name, x, y, kind in known if len(x)]
     unit = _unit(calibration)
-    drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
-                          (float(np.log10(reported[0, 0])), "median distance of the board"))
-    parts = [figure(drawing, "Uncertainty against the distance of the point, in the scene"),
-             "<h3>Cross-validation</h3>\n"]  # fmt: skip
+    if curves:
+        drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
+                              (float(np.log10(reported[0, 0])), "median distance of the board"))
+        shown = figure(drawing, "Uncertainty against the distance of the point, in the scene")
+    else:
+        shown = paragraph("The measurements fit exactly: σ of a projected point is 0.")
+    parts = [shown, "<h3>Cross-validation</h3>\n"]
     parts += [paragraph(words[:1].upper() + words[1:])
               for words in cross_validation_in_words(calibration)]  # fmt: skip
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
@@ -169,7 +173,7 @@ def _describe_several(found, origin: Origin) -> Page:
             maps = rig.reported_maps(name)
             sections.append(_quality(rig.coverage(name), maps, unit, f"{name} in the rig", number))
         sections.append(show_residuals(rig.residuals["tau"]))
-        listed = table_of_residuals(rig.residuals)
+        listed = table_of_residuals(rig.residuals, rig.sigma0)
         tables["observations"] = Listing("Observations of the rig", listed, "result.json")
     else:
         for number, (name, one) in enumerate(found.cameras.items()):
@@ -179,7 +183,7 @@ def _describe_several(found, origin: Origin) -> Page:
     more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
     first = give_verdict(findings, (), more)
-    return Page(title, [first, *sections], describe_origin((), origin), tables)
+    return Page(title, [first, *sections], origin, tables=tables)
 
 
 def _rig(rig, unit: str) -> Section:
@@ -190,7 +194,7 @@ def _rig(rig, unit: str) -> Section:
     for name in rig.names:
         parts += [f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",
                   grid(("parameter", "value", "σ"), rig_parameter_rows(rig, name))]  # fmt: skip
-    return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig", True)
+    return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig")
 
 
 def _table_of_cameras(found) -> Listing:
@@ -205,5 +209,6 @@ def _table_of_cameras(found) -> Listing:
     return Listing("Cameras, calibrated separately", {
         "camera": Column(words(camera), "camera"), "model": Column(words(model), "model"),
         "parameter": Column(words(parameter), "parameter"),
-        "value": Column(numbers(value), "value", -9, True), "sigma": Column(numbers(sigma), "σ"),
+        "value": estimates(numbers(value), numbers(sigma), "value"),
+        "sigma": Column(numbers(sigma), "σ"),
     }, "result.json")  # fmt: skip

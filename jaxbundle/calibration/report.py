@@ -6,6 +6,7 @@ from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
+    WITHOUT_SIGMA,
     clean,
     cut_lines,
     estimate,
@@ -62,7 +63,7 @@ def _camera(calibration):
         if name in free:
             rows.append((name, *estimate(value, free[name])))
         elif value != 0:
-            rows.append((name, significant(value, 10), "held"))
+            rows.append((name, significant(value, WITHOUT_SIGMA), "held"))
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     lines += ["", f"RMS of an image point {calibration.rms:.4f} px"]
     return lines

@@ -95,7 +95,8 @@ def adjust(
     from jaxbundle.io.networks.control import select_checks
     from jaxbundle.io.writing.fingerprints import of_input
     from jaxbundle.leastsquares.quality.snooping import check_test
-    from jaxbundle.report.page import UNKNOWN
+    from jaxbundle.report.page import Origin
+    from jaxbundle.system.clock import in_words, now
 
     jaxbundle.use_cores(cores)
     print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
@@ -116,7 +117,7 @@ def adjust(
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
     check_targets(input, network, json, out, control, force, html, save)
-    origin = UNKNOWN
+    origin = Origin(computed=in_words(now()))
     if html or out is not None:
         origin = trace_origin(input, network, control, {
             "--set": ", ".join(set or ()), "--check": ", ".join(check or ()),
@@ -147,7 +148,7 @@ def adjust(
     if save and result.converged:
         result.save(save)
     if print_report and result.converged:
-        print(report.text(result, budget=found))
+        print(report.text(result, budget=found, date=origin.computed))
         for doubt in result.doubts:
             print(f"warning: {doubt}")
     if not result.converged:

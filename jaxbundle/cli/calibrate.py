@@ -102,7 +102,7 @@ def calibrate(
     from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.measure.views import photographs
     from jaxbundle.photographs.opencv import need_opencv
-    from jaxbundle.report.page import UNKNOWN, compose_failure
+    from jaxbundle.report.page import UNKNOWN, compose_failure, head_line
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
@@ -167,7 +167,7 @@ def calibrate(
             document["models"] = choice.to_dict()
         text = json_text(document) if json else ""
         silent = json == "-" or (quiet and is_in_file(json, out, html))
-        report = "" if silent else (choice or found).report()
+        report = "" if silent else head_line(origin) + (choice or found).report()
         bar.update(task, description="writing")
         show = lambda stage, done, total: bar.update(
             task, description=stage, completed=done, total=total

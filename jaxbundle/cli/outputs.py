@@ -34,6 +34,7 @@ from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.budget import describe_budget
+from jaxbundle.system.clock import in_words, now
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Progress
 
@@ -77,7 +78,7 @@ def trace_origin(
 def trace_files(files: Iterable[str | Path], settings: Mapping[str, object]) -> Origin:
     """The fingerprints of files, and the chosen settings."""
     chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
-    return Origin(fingerprint_files(files), chosen)
+    return Origin(fingerprint_files(files), chosen, in_words(now()))
 
 
 def check_writable(
@@ -236,7 +237,7 @@ def write_targets(
     with write_result(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
-                fill_results(result, new, plots, also=also, budget=budget, progress=progress)
+                fill_results(result, new, plots, "", also, budget, progress, origin.computed)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
@@ -244,14 +245,15 @@ def write_targets(
 
 def fill_results(
     result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING,
-    budget: Budget | None = None, progress: Progress | None = None,
+    budget: Budget | None = None, progress: Progress | None = None, date: str = "",
 ) -> None:  # fmt: skip
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
-    `note`: text before the report; `also`: further JSON entries; `budget`: the error budget."""
+    `note`: text before the report; `also`: further JSON entries; `budget`: the error budget;
+    `date` of the computation, for the report."""
     tell = progress or (lambda *_: None)
     tell("writing the report", 0, 2)
-    write_text(folder / REPORT, note + report.text(result, budget=budget))
+    write_text(folder / REPORT, note + report.text(result, budget=budget, date=date))
     write_text(folder / RESULT, result_text(result, False, also))
     tell("writing the report", 1, 2)
     if result.converged:

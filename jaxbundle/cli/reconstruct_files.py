@@ -52,14 +52,14 @@ def write_reconstruction(
         if new is None:
             return
         told = f"{found}\n\n{describe_part(found, first)}"
-        _write_part(found, first, new, plots, told, also, progress)
+        _write_part(found, first, new, plots, told, also, progress, origin.computed)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
             own = (f"warning: {said}" for said in found.warnings
                    if said.startswith(f"{part.name}:"))  # fmt: skip
             note = "\n".join([*own, describe_part(found, part)])
-            _write_part(found, part, folder, plots, note, {}, progress)
+            _write_part(found, part, folder, plots, note, {}, progress, origin.computed)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
@@ -68,9 +68,9 @@ def write_reconstruction(
 
 def _write_part(
     found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also,
-    progress: Progress | None,
+    progress: Progress | None, date: str,
 ) -> None:  # fmt: skip
-    fill_results(part.adjustment, folder, plots, note, also, progress=progress)
+    fill_results(part.adjustment, folder, plots, note, also, progress=progress, date=date)
     _write_tables(part, folder)
     if plots:
         read = lambda name: _thumbnail(found.photographs[name])

@@ -78,12 +78,15 @@ def surface(
     )
     from jaxbundle.io.results.result_json import without_nan
     from jaxbundle.io.text.csv_tables import write_text
+    from jaxbundle.io.writing.fingerprints import input_files
     from jaxbundle.io.writing.folders import check_folder, replace_folder
+    from jaxbundle.report.page import stamp
     from jaxbundle.surface.dsm import make_dsm, write_dsm
     from jaxbundle.surface.files import report_of, text_of, write_cloud_csv
     from jaxbundle.surface.orthophoto import mosaic, write_orthophoto
     from jaxbundle.surface.point_files import read_cloud, write_cloud
     from jaxbundle.surface.scanner_inputs import is_ground_image
+    from jaxbundle.system.clock import in_words, now
 
     heights = _heights(zmin, zmax)
     check_json(json)
@@ -102,6 +105,8 @@ def surface(
     chosen = choose(made.views, orthophoto_of) if orthophoto or orthophoto_of else []
     found = made.surface
     report = report_of(found, check=given if check else made.check)
+    files = [str(file) for one in input for file in input_files(one)]
+    told = f"{', '.join(stamp(files, in_words(now())))}\n{text_of(report)}"
     text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"
     with replace_folder(out, "surface", FILES, force) as folder:
         write_cloud_csv(found.cloud, folder / "cloud.csv")
@@ -113,13 +118,13 @@ def surface(
                 values = mosaic(chosen, model, made.to_views)
                 write_orthophoto(values, model, folder / "orthophoto.tif")
         write_text(folder / "surface.json", text)
-        write_text(folder / "report.txt", text_of(report) + "\n")
+        write_text(folder / "report.txt", told + "\n")
     if json == "-":
         write_json(text)
     elif json:
         write_text(Path(json), text)
     if not quiet and json != "-":
-        print(text_of(report))
+        print(told)
 
 
 def _heights(zmin: float | None, zmax: float | None) -> tuple[float, float] | None:

@@ -32,8 +32,8 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import micrometres
 from jaxbundle.report.equations import equations
-from jaxbundle.report.layout import clean, significant
-from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
+from jaxbundle.report.layout import clean, digits_of, significant
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
@@ -174,9 +174,8 @@ class CameraView:
             sections.append(Section("photo-section", "Undistorted photograph", place("photo"),
                                     "Photograph"))  # fmt: skip
         title = f"camera {clean(self.camera.id)}: explorer"
-        chosen = describe_origin([("model", self.model.name)], self.origin)
-        return make_page(title, sections, chosen, live, "camera", self.answer(given),
-                         given=values)  # fmt: skip
+        return make_page(title, sections, self.origin, live, "camera", self.answer(given),
+                         [("model", self.model.name)], given=values)  # fmt: skip
 
     # --- drawings ---------------------------------------------------------------------------
 
@@ -226,7 +225,8 @@ class CameraView:
             given, sigma = self.values[name], self.sigma.get(name, 0)
             change = value - given
             by_sigma = significant(change / sigma) if sigma > 0 else ""
-            rows.append((name, f"{given:.8g}", f"{value:.8g}", significant(change), by_sigma))
+            both = (significant(x, digits_of(x, sigma)) for x in (given, value))
+            rows.append((name, *both, significant(change), by_sigma))
         table = grid(("parameter", "as given", "now", "difference", "difference/σ"), rows)
         view = field_of_view_of_rays(self.model, values, self.size, self.camera.pixel_size)
         degrees = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)

@@ -41,7 +41,6 @@ from jaxbundle.report.page import (
     Origin,
     Page,
     Section,
-    describe_origin,
     find,
     give_verdict,
 )
@@ -55,8 +54,6 @@ from jaxbundle.statistics.precision import Precision, precision
 
 MOST_ROWS = 200
 """Points whose σ before and after are listed, those that change most first."""
-MOST_ELLIPSOIDS = 3000
-"""Maximum number of points whose ellipsoids are redrawn."""
 UPPER = [0, 1, 2, 4, 5, 8]
 """The six independent ones of the nine elements of a covariance."""
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
@@ -170,17 +167,19 @@ class NetworkView:
     def answer(self, given: Given) -> dict[str, Any]:
         """`parts`; `stations`: by id the values of those moved, in the units of the network, and
         their pyramids; `sigma`: before and after, of points, the cameras' parameters and images;
-        `ellipsoids`: after, of not too many points and of stations, six elements each."""
+        `ellipsoids`: after, of those drawn, the rows and six elements each."""
         moves = self.moves(given)
         if not moves:
             return {"parts": {"moved": paragraph("No station is moved.", "hint")}, "stations": {}}
         before, after = self.before, self.sigma(self.start(moves))
         parts = [self._say_visibility(moves), self._compare(moves, before, after)]
         six = lambda C: C.reshape(-1, 9)[:, UPPER].ravel().tolist()
-        few = len(after.points) <= MOST_ELLIPSOIDS
+        covariance = {"points": after.point_covariance, "images": after.centre_covariance}
         return {
-            "ellipsoids": {"points": six(after.point_covariance) if few else [],
-                           "images": six(after.centre_covariance)},
+            "ellipsoids": {
+                table: {"rows": rows, "elements": six(covariance[table][np.array(rows, int)])}
+                for table, rows in self._scene["ellipsoids"].items()
+            },
             "parts": {"moved": "".join(parts)},
             "stations": {self.ids[m.row]: self._describe(m) for m in moves},
             "sigma": {
@@ -301,8 +300,8 @@ class NetworkView:
         ]  # fmt: skip
         state = {"moves": given.get("moves", {}), "aim": given.get("aim", True)}
         return make_page(
-            title, sections, describe_origin((), self.origin), live, "network", answer,
-            collect_tables(found), drawings, state,
+            title, sections, self.origin, live, "network", answer, tables=collect_tables(found),
+            drawings=drawings, given=state,
         )  # fmt: skip
 
     def _move_section(self, given: Given, live: bool) -> Section:
@@ -320,7 +319,7 @@ class NetworkView:
         parts = [
             paragraph("Where would a station be better? Same measurements, new geometry: σ to "
                       "first order, times σ0, with image points as they would be seen from there. "
-                      "The error ellipsoids of the drawing stay those of the adjustment.", "hint"),
+                      "The error ellipsoids of the drawing are then the expected ones.", "hint"),
             '<div class="controls"><label><span>station</span><select id="move-station"></select>'
             '</label></div>\n',
             f'<div class="controls">\n{fields}</div>\n', aim,
@@ -328,7 +327,7 @@ class NetworkView:
             "</button></div>\n",
             draw_tools(live), place("moved"),
         ]  # fmt: skip
-        return Section("move", "Move a station", "".join(parts), "Move a station", True)
+        return Section("move", "Move a station", "".join(parts), "Move a station")
 
 
 def _selection() -> Section:

@@ -71,7 +71,7 @@ from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, trajectory_in_pieces
 from jaxbundle.report.layout import clean, significant
-from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
 from jaxbundle.report.page.markup import figure, grid, paragraph
 
@@ -292,8 +292,8 @@ class ScannerView:
         ]  # fmt: skip
         title = f"{clean(self.name)}: explorer"
         rows = [(key.replace("_", " "), value) for key, value in values.items()]
-        return make_page(title, sections, describe_origin(rows, self.origin), live, "scanner",
-                         {} if live else self.answer(given), given=values)  # fmt: skip
+        return make_page(title, sections, self.origin, live, "scanner",
+                         {} if live else self.answer(given), rows, given=values)  # fmt: skip
 
     # --- numbers ----------------------------------------------------------------------------
 

@@ -22,6 +22,7 @@ from jaxbundle.plotting.style import (
     quiet,
     title,
 )
+from jaxbundle.plotting.ticks import label_coordinates
 
 EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 SIZE = 0.12
@@ -132,8 +133,8 @@ def places_tried(designed: Design, ax=None):
     ax.scatter(*network.images.position[new, :2].T, s=120, color=RUST, marker="*", label="chosen")
     ax.set_aspect("equal")
     quiet(ax)
-    label(ax, "x", "X", network.object_unit)
-    label(ax, "y", "Y", network.object_unit)
+    for name in "xy":
+        label_coordinates(ax, name, network.object_unit)
     title(ax, "where should the next photograph be taken?")
     legend(ax)
     return ax

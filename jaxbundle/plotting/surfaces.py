@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbundle.plotting.style import axes, axes_3d
+from jaxbundle.plotting.ticks import label_coordinates
 
 if TYPE_CHECKING:  # with them come scanners and matching, which an adjustment does without
     from jaxbundle.surface.cloud import Cloud
@@ -32,7 +33,8 @@ def cloud_perspective(cloud: Cloud, ax=None, axis: str = "Z"):
     drawn = ax.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
     ax.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
     ax.figure.colorbar(drawn, ax=ax, label=f"σ{axis}", shrink=0.6)
-    ax.set(xlabel="X", ylabel="Y", zlabel="Z")
+    for name in "xyz":
+        label_coordinates(ax, name, "")
     return ax
 
 
@@ -57,5 +59,7 @@ def dsm_relief(dsm: Dsm, ax=None):
     colour[..., 3] = np.isfinite(dsm.height)
     rows, columns = Z.shape
     ax.imshow(colour, extent=(dsm.x, dsm.x + columns * dsm.size, dsm.y - rows * dsm.size, dsm.y))
-    ax.set(xlabel="X", ylabel="Y", aspect="equal")
+    ax.set_aspect("equal")
+    for name in "xy":
+        label_coordinates(ax, name, "")
     return ax

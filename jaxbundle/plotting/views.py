@@ -1,10 +1,12 @@
 """The network as a map and in perspective: points by role, cameras as pyramids, error ellipses."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model, image_ray
 from jaxbundle.geometry import matrix_from_quaternion
@@ -19,26 +21,31 @@ from jaxbundle.plotting.style import (
     axes,
     axes_3d,
     extent,
-    label,
     legend,
     plain,
     quiet,
     round_number,
     title,
 )
+from jaxbundle.plotting.ticks import label_coordinates
 from jaxbundle.system.programs import compile_once
 
 LETTER, LINE, GAP = 4.9, 8.0, 4.0
 """Width of a letter, height of a line and distance from the place, of ids, in points."""
-ELLIPSES = 2000
-"""Maximum number of points with error ellipses."""
+LARGEST_ELLIPSES, SAMPLED_ELLIPSES = 20, 280
+"""Of more points than these together, the largest error ellipses are drawn, and as many others at
+most, spread evenly: an image of 1000 pixels has room for about 300 that can be told apart."""
+PROBABILITY = {2: "39 %", 3: "20 %"}
+"""Probability that a normally distributed error of 2 or 3 coordinates is inside its 1σ ellipse or
+ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2)."""
 
 
 def network_plan(adjustment, ax=None):
     """The network seen from above: points by role, cameras, error ellipses of X and Y.
 
-    The ellipses are 1σ (a posteriori) and exaggerated; the legend states the factor. A camera is
-    the pyramid of its image corners, with its projection centre and viewing direction.
+    The ellipses are 1σ (a posteriori) and exaggerated; legend and title state the factor, and of
+    which points they are drawn (`choose_ellipses`). A camera is the pyramid of its image corners,
+    with its projection centre and viewing direction.
 
     **Returns:** matplotlib `Axes`, in the object unit.
     """
@@ -56,12 +63,12 @@ def network_plan(adjustment, ax=None):
     axis = np.stack([centres, pyramids[:, 1:].mean(1)], 1)[:, :, :2]
     ax.add_collection(LineCollection(list(axis), colors=INK, linewidths=1.0, zorder=3))
     ax.scatter(centres[:, 0], centres[:, 1], s=9, color=INK, zorder=4, label="cameras")
-    for role, style in ROLE_STYLE.items():
+    for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
             ax.scatter(chosen[:, 0], chosen[:, 1], label=f"{role} points", linewidths=0, zorder=5,
-                       **_lighter(style, len(points["id"])))  # fmt: skip
-    ellipses = _draw_ellipses(adjustment, ax, size)
+                       **_lighter(role, len(points["id"])))  # fmt: skip
+    ellipses, selection = _draw_ellipses(adjustment, ax, size)
     away = centres - pyramids[:, 1:].mean(1)
     drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
     low, high = _inside(np.concatenate(drawn))
@@ -70,15 +77,15 @@ def network_plan(adjustment, ax=None):
     ax.set_aspect("equal")
     quiet(ax)
     unit = adjustment.network.object_unit
-    label(ax, "x", "X", unit)
-    label(ax, "y", "Y", unit)
-    title(ax, f"{adjustment.network.name}: plan")
+    for name in "xy":
+        label_coordinates(ax, name, unit)
+    title(ax, f"{adjustment.network.name}: plan", selection and f"error ellipses {selection}")
     below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
     legend(ax, loc="upper left", bbox_to_anchor=(0, 0), bbox_transform=below, ncols=5,
            frameon=False, borderaxespad=0, handletextpad=0.3, columnspacing=1.5)  # fmt: skip
     ids = [(adjustment.images["id"], centres, INK, LABELLED // 2, away / size),
            (points["id"], points["xyz"], BLUE, LABELLED, None)]  # fmt: skip
-    places = np.concatenate([centres, points["xyz"][:ELLIPSES]])[:, :2]
+    places = np.concatenate([centres, points["xyz"][: 50 * LABELLED]])[:, :2]
     _write_ids(ax, [table for table in ids if len(table[0]) <= table[3]], places)
     return ax
 
@@ -98,11 +105,11 @@ def network_perspective(adjustment, ax=None):
     ax.add_collection3d(faces)
     ax.add_collection3d(Line3DCollection(_pyramid_lines(pyramids), colors=GREY, linewidths=0.7))
     ax.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
-    for role, style in ROLE_STYLE.items():
+    for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
             ax.scatter(*chosen.T, label=f"{role} points", linewidths=0, depthshade=False,
-                       **_lighter(style, len(points["id"])))  # fmt: skip
+                       **_lighter(role, len(points["id"])))  # fmt: skip
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
@@ -110,12 +117,12 @@ def network_perspective(adjustment, ax=None):
     ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
     unit = adjustment.network.object_unit
     for name in "xyz":
-        label(ax, name, name.upper(), unit)
         axis = getattr(ax, f"{name}axis")
         axis.set_pane_color((1, 1, 1, 0))
         axis._axinfo["grid"].update(color=PALE, linewidth=0.6)
         ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
         ax.locator_params(axis=name, nbins=5)
+        label_coordinates(ax, name, unit)
     ax.view_init(elev=24, azim=-58)
     title(ax, f"{adjustment.network.name}: perspective")
     legend(ax, frameon=False, loc="upper right")
@@ -200,52 +207,95 @@ def _points(adjustment):
     return {"id": id, "role": role, "xyz": xyz}
 
 
-def _lighter(style, number: int):
-    """Smaller marks for many points."""
-    return style | {"s": style["s"] / (1 if number <= 300 else 2 if number <= 3000 else 8)}
+def _lighter(role: str, number: int):
+    """Smaller marks for many tie points."""
+    style = ROLE_STYLE[role]
+    factor = 1 if role != "tie" or number <= 300 else 2 if number <= 3000 else 8
+    return style | {"s": style["s"] / factor}
 
 
-def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
-    """Closed polygons [points, corners, 2] of the ellipses of X and Y of the estimated points."""
+class Ellipses(NamedTuple):
+    """Error ellipses to draw: the rows of their points, the number of points that have one, and the
+    factor of their exaggeration."""
+
+    rows: Int[np.ndarray, " drawn"]
+    total: int
+    factor: float
+
+    @property
+    def exaggeration(self) -> str:
+        """The factor in words."""
+        return f"× {self.factor:,.12g}".replace(",", " ")
+
+    @property
+    def selection(self) -> str:
+        """Which ones are drawn if there are more."""
+        drawn = len(self.rows)
+        if drawn == self.total:
+            return ""
+        return (f"of {drawn} of {self.total} points: the {LARGEST_ELLIPSES} largest and "
+                f"{drawn - LARGEST_ELLIPSES} others")  # fmt: skip
+
+
+def choose_ellipses(adjustment, size: float) -> Ellipses:
+    """The error ellipses of points for a network of this size: at most `LARGEST_ELLIPSES` +
+    `SAMPLED_ELLIPSES`, in a visible and comparable size."""
     covariance = adjustment.point_covariance[:, :2, :2]
-    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    there = adjustment.located & np.isfinite(covariance).all((1, 2))
-    there &= (np.trace(covariance, axis1=1, axis2=2) > 0)
-    square, direction = np.linalg.eigh(covariance[there])
+    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    there = np.flatnonzero(adjustment.located & np.isfinite(large) & (large > 0))
+    if not len(there):
+        return Ellipses(there, 0, 1.0)
+    rows = there[thin_out(adjustment.point_values[there], large[there])]
+    neighbour = _neighbour(adjustment.point_values[rows, :2])
+    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
+    return Ellipses(rows, len(there), round_number(reach / np.median(large[rows])))
+
+
+def thin_out(
+    xyz: Float[np.ndarray, "n 3"], large: Float[np.ndarray, " n"]
+) -> Int[np.ndarray, " drawn"]:
+    """The rows to draw, ascending: all if they are few, else the largest, and of the others the
+    first in each cell of a grid across the two wider axes."""
+    if len(large) <= LARGEST_ELLIPSES + SAMPLED_ELLIPSES:
+        return np.arange(len(large))
+    first, others = np.split(np.argsort(-large, kind="stable"), [LARGEST_ELLIPSES])
+    others = np.sort(others)
+    low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
+    wide = np.argsort(low - high)[:2]
+    sides = np.maximum((high - low)[wide], 1e-12 * max(float((high - low).max()), 1e-300))
+    cells = np.maximum(np.sqrt(SAMPLED_ELLIPSES * sides / sides[::-1]).astype(int), 1)
+    cells = np.minimum(cells, SAMPLED_ELLIPSES)
+    at = np.clip((xyz[others][:, wide] - low[wide]) / sides * cells, 0, cells - 1).astype(int)
+    _, sample = np.unique(at[:, 0] * cells[1] + at[:, 1], return_index=True)
+    return np.sort(np.concatenate([first, others[sample[:SAMPLED_ELLIPSES]]]))
+
+
+def error_ellipses(adjustment, ellipses: Ellipses, corners: int = 49) -> np.ndarray:
+    """Closed polygons [drawn, corners, 2] of ellipses of X and Y."""
+    covariance = adjustment.point_covariance[ellipses.rows, :2, :2]
+    square, direction = np.linalg.eigh(0.5 * (covariance + covariance.transpose(0, 2, 1)))
     t = np.linspace(0, 2 * np.pi, corners)
     circle = np.stack([np.cos(t), np.sin(t)])
-    shape = direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
-    return adjustment.point_values[there, None, :2] + factor * (shape @ circle).transpose(0, 2, 1)
+    shape = ellipses.factor * direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
+    return adjustment.point_values[ellipses.rows, None, :2] + (shape @ circle).transpose(0, 2, 1)
 
 
-def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
-    """The number of points with an error ellipse of X and Y, and the exaggeration for
-    a network of this size, so that they are visible and comparable."""
-    covariance = adjustment.point_covariance[:, :2, :2]
-    there = adjustment.located
-    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[there]
-    large = large[np.isfinite(large) & (large > 0)]
-    if not len(large):
-        return 0, 1.0
-    neighbour = _neighbour(adjustment.point_values[there, :2])
-    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
-    return len(large), round_number(reach / np.median(large))
-
-
-def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
-    """Draw the error ellipses in a visible, comparable size; returns their polygons."""
+def _draw_ellipses(adjustment, ax, size: float) -> tuple[np.ndarray, str]:
+    """Draw the error ellipses in a visible, comparable size; returns their polygons, and which are
+    drawn, in words."""
     from matplotlib.collections import LineCollection
 
-    number, factor = ellipse_factor(adjustment, size)
-    if not 0 < number <= ELLIPSES:
-        return np.zeros((0, 1, 2))
-    polygons = error_ellipses(adjustment, factor)
-    ellipses = LineCollection(
-        list(polygons), colors=BLUE, linewidths=0.8, alpha=0.8, zorder=3,
-        label=f"error ellipses (1σ) × {factor:,.12g}".replace(",", " "),
+    ellipses = choose_ellipses(adjustment, size)
+    if not ellipses.total:
+        return np.zeros((0, 1, 2)), ""
+    polygons = error_ellipses(adjustment, ellipses)
+    drawn = LineCollection(
+        list(polygons), colors=BLUE, linewidths=0.8, zorder=3,
+        alpha=0.8 if len(ellipses.rows) == ellipses.total else 0.5,
+        label=f"error ellipses (1σ, {PROBABILITY[2]}) {ellipses.exaggeration}",
     )  # fmt: skip
-    ax.add_collection(ellipses)
-    return polygons
+    ax.add_collection(drawn)
+    return polygons, ellipses.selection
 
 
 def _write_ids(ax, tables, places) -> None:

@@ -15,6 +15,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.report.layout import significant
+from jaxbundle.system.clock import in_words, now
 
 DOWNWARD = 0.7
 """Least cosine between the viewing directions and the vertical of a block with a flying height and
@@ -86,7 +87,7 @@ class Block:
             first, last = (t.strftime("%Y-%m-%d %H:%M") for t in self.taken)
             rows.append(("Taken", first if first == last else f"{first} to {last}"))
         rows += [
-            ("Computed", self.computed.strftime("%Y-%m-%d %H:%M")),
+            ("Computed", in_words(self.computed)),
             ("Coordinate system", self.system),
             ("Ground sample distance", f"{significant(self.ground_sample_distance)} {self.unit} a "
              "pixel, median"),
@@ -173,7 +174,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     taken = sorted(t for t in times if t is not None)
     on_ties = tie[point]
     return Block(
-        len(X0), (taken[0], taken[-1]) if taken else None, datetime.datetime.now(),
+        len(X0), (taken[0], taken[-1]) if taken else None, now(),
         system or ("local, to scale" if network.object_unit == "m" else
                    "arbitrary: neither control, satellite positions nor scale bars"),
         network.object_unit, float(np.nanmedian(of_image * pixel)), float(np.nanmedian(of_image)),

@@ -37,7 +37,7 @@ def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
 
 def describe_part(found, part) -> str:
     """What a surveyor asks of a part, as text: the block, control and check points."""
-    lines = heading(f"{found.name}, {part.name}" if found.name else part.name)[1:]
+    lines = heading(_name(found, part))[1:]
     lines += text_facts(part.block.facts())
     if part.no_control:
         lines += ["", *text_paragraph(f"Control is not used: {part.no_control}")]
@@ -66,7 +66,15 @@ def _describe(found, part) -> Addition:
     return Addition(
         "reconstruction", (*findings, *_judge_control(part)), overview=overview,
         warnings=found.warnings, sections=tuple(sections), tables={"pairs": _pairs(found)},
+        name=_name(found, part),
         without=(*WITHOUT, *CONTROL) if part.control is not None or part.no_control else WITHOUT,
+    )  # fmt: skip
+
+
+def _name(found, part) -> str:
+    """The name of the reconstruction, with that of the part if there are several."""
+    return found.name if found.name and len(found.parts) == 1 else ", ".join(
+        filter(None, (found.name, part.name))
     )  # fmt: skip
 
 
@@ -123,7 +131,7 @@ def _control(part) -> list[Section]:
     """Control and check points."""
     if part.control is None:
         return []
-    points = grid(HEADER, part.control.rows())
+    points = grid(HEADER, part.control.rows(), "remarks")
     said = items([part.control.sigma, *part.control.notes])
     title = f"Control and check points: adjusted − given, in {clean(part.control.unit)}"
     return [Section("control", title, points + said, "Control")]

@@ -198,7 +198,7 @@ def convergence(adjustment) -> list[str]:
     rows = [
         (
             "start" if i == 0 else str(i),
-            f"{vtpv[i]:.8e}" if np.isfinite(vtpv[i]) else "not finite",
+            f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
             "–" if i == 0 else f"{damping[i]:.1e}" if damping[i] else "0",
             "" if i == 0 else "accepted" if accepted[i] else "rejected",
         )
@@ -311,7 +311,7 @@ def variance_factor(adjustment) -> list[str]:
 def variance_facts(adjustment) -> list[tuple[str, str]]:
     """vᵀPv, redundancy, σ0, the precision of an image coordinate, the global test."""
     return [
-        ("vᵀPv", significant(adjustment.vtpv, 7)),
+        ("vᵀPv", significant(adjustment.vtpv, 6)),
         ("Redundancy", str(adjustment.redundancy)),
         ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), dimensionless"),
         ("Image coordinate", image_precision(adjustment)),

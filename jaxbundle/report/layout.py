@@ -12,6 +12,9 @@ import numpy as np
 
 WIDTH = 100
 MISSING = "–"
+WITHOUT_SIGMA = 6
+"""Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.1 pixel.
+"""
 
 
 # --- numbers --------------------------------------------------------------------------------
@@ -23,15 +26,25 @@ def decimals_of(sigma: float, digits: int = 3) -> int:
     return digits - 1 - exponent
 
 
+def digits_of(value: float, sigma: float | None = None, digits: int = 3) -> int:
+    """Significant digits of a value: to the decimal place where its σ has `digits` digits, at least
+    one; without σ `WITHOUT_SIGMA`."""
+    if sigma is None or not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
+        return WITHOUT_SIGMA
+    if value == 0:
+        return 1
+    return max(decimals_of(sigma, digits) + math.floor(math.log10(abs(value))) + 1, 1)
+
+
 def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, str]:
     """A value and its σ as text: σ with `digits` digits, the value to the same decimal place.
 
-    Small numbers get an exponent each; a value without σ is shown with ten digits.
+    Small numbers get an exponent each.
     """
     if not math.isfinite(value):
         return MISSING, MISSING
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
-        return significant(value, 10), MISSING
+        return significant(value, WITHOUT_SIGMA), MISSING
     places = decimals_of(sigma, digits)
     if 0 <= places <= 7 and max(abs(value), sigma) >= 1e-3:
         return f"{value:.{places}f}", f"{sigma:.{places}f}"
@@ -60,7 +73,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     if 1e-5 <= abs(value) < 10.0 ** max(digits, 6):
         places = decimals_of(abs(value), digits)
         text = f"{value:.{max(places, 0)}f}"
-        return text.rstrip("0").rstrip(".") if digits > 6 and "." in text else text
+        return text.rstrip("0").rstrip(".") if digits >= WITHOUT_SIGMA and "." in text else text
     return f"{value:.{digits - 1}e}"
 
 
@@ -82,6 +95,12 @@ def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:
     if not len(sigma):
         return 4
     return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, most))
+
+
+def coordinate_decimals(sigma) -> int:
+    """Decimal places of a column of coordinates: two digits of nearly every σ in it, which suffice
+    for an uncertainty (GUM, JCGM 100:2008, 7.2.6); map coordinates have many digits before them."""
+    return column_decimals(sigma, 2)
 
 
 # --- words ----------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
         f"critical value {significant(critical_value(adjustment, test), 3)} for one observation at "
         f"0.1 %. v and σ (a priori) of image coordinates in {adjustment.image_unit}, of control "
         "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
-        "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times that of the tables); "
+        "that the test of w finds (α 0.1 %, power 80 %), with σ a priori; "
         "ext. (external reliability) its largest effect on an unknown, in σ of that unknown."
     )
     lines.append("")
@@ -84,7 +84,7 @@ def _rows(adjustment, chosen) -> list[str]:
                 fixed(found["r"][i], 3),
                 significant(found["w"][i], 3),
                 fixed(found["tau"][i], 2),
-                to_place_of(sigma0 * found["mdb"][i], sigma0 * sigma),
+                to_place_of(found["mdb"][i], sigma),
                 significant(found["external"][i], 3),
             )
         )

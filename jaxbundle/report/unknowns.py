@@ -7,9 +7,11 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.equations import equations
 from jaxbundle.report.layout import (
+    WITHOUT_SIGMA,
     bar,
     clean,
     column_decimals,
+    coordinate_decimals,
     estimate,
     facts,
     fixed,
@@ -51,7 +53,7 @@ def _one_camera(entry, model: CameraModel) -> list[str]:
     rows, held = [], []
     for name, found in entry["parameters"].items():
         if not found["free"]:
-            held.append(f"{name} {significant(found['value'], 10)}")
+            held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
         value, sigma = estimate(found["value"], found["sigma"])
         t, total = found["t"], found["total_correlation"]
@@ -138,7 +140,7 @@ def images(adjustment, most: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
     found = adjustment.images
     unit, angle = adjustment.image_unit, adjustment.network.angle_unit
-    places = [column_decimals(found[f"s{name}"]) for name in EXTERIOR]
+    places = [coordinate_decimals(found[f"s{name}"]) for name in EXTERIOR]
     scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
     rms_places = column_decimals(scale * found["rms"])
     rows = []
@@ -242,7 +244,7 @@ def _list_of_points(adjustment, most) -> list[str]:
     found = adjustment.points
     total = len(found["id"])
     shown = np.arange(min(total, most))
-    places = [column_decimals(found[f"s{axis}"]) for axis in "XYZ"]
+    places = [coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"]
     rows = [
         (
             found["id"][i],

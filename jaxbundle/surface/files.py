@@ -109,7 +109,7 @@ def text_of(report: Mapping[str, Any]) -> str:
     for c in found["classes"]:
         upper = "∞" if c["to"] is None else f"{c['to']:g}"
         lines.append(f"σ from {c['from']:g} to {upper}: {c['points']} points")
-    lines.append(f"σ holds: {', '.join(report['sigma_includes'])}")
+    lines.append(f"σ contains: {', '.join(report['sigma_includes'])}")
     check = report.get("check_points", {})
     if check.get("points"):
         lines.append(f"{check['points']} check points: RMS of heights {check['rms_Z']:.4g}, "

@@ -54,7 +54,8 @@ def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     assert "no chessboard" in " ".join(said) and "--sigma-image" in Page(page).texts["th"]
     sizes = {str(path.stat().st_size) for path in folder.glob("*.jpg")}
     assert sizes <= set(said)  # the photographs with their fingerprints
-    assert (out / "report.txt").read_text().strip() in told
+    text = (out / "report.txt").read_text()
+    assert text.strip() in told and "computed 20" in text.splitlines()[0]
 
 
 def test_two_cameras_and_brief_json_alone(calibrate, folder, tmp_path, monkeypatch):

@@ -46,7 +46,7 @@ from jaxbundle.pushbroom.accuracy import ground_errors
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.simulate import measured_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground, Plane
-from jaxbundle.report.page import Section
+from jaxbundle.report.page import UNKNOWN, Section
 from jaxbundle.report.page.scene import describe_network
 from jaxbundle.statistics.expected import expected_precision
 
@@ -85,8 +85,7 @@ class Doubling:
         x = number(given, "x", 1.0)
         content = draw_controls([Number("x", "x", x, "", -5.0, 5.0)], live) + draw_tools(live)
         sections = [Section("one", "Doubling", content + place("twice"))]
-        origin = Section("origin", "Origin", "", "Origin")
-        return make_page("doubling", sections, origin, live, "doubling", self.answer(given))
+        return make_page("doubling", sections, UNKNOWN, live, "doubling", self.answer(given))
 
     def answer(self, given):
         check_keys(given, ["x"])

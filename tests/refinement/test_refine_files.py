@@ -92,7 +92,9 @@ def test_the_command_writes_what_locate_reads(folder):
     assert len(result["image_points"]) == COUNT
     points = read_csv(folder / "out" / "points.csv")
     assert len(points) == COUNT and set(points.values["role"]) == {"control"}
-    text = (folder / "out" / "report.html").read_text()
+    text, plain = ((folder / "out" / name).read_text() for name in ("report.html", "report.txt"))
+    for words in ("refine.toml", "computed 20", "jaxbundle"):
+        assert words in plain.splitlines()[0] and words in "".join(Page(text).texts["p"])
     assert Page(text).texts["h2"][0] == "Verdict"
     v = np.array([row["v"] for row in result["image_points"]])
     np.testing.assert_allclose(column(text, "observations", "v").reshape(-1, 2), v, rtol=1e-6)

@@ -16,6 +16,7 @@ from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.compare import compare
 from jaxbundle.surface.dsm import NO_DATA, Dsm, make_dsm, write_dsm
+from jaxbundle.surface.files import text_of
 from jaxbundle.surface.filtering import drop_isolated, drop_weak, thin
 from jaxbundle.surface.orthophoto import orthophoto
 from jaxbundle.surface.point_files import read_cloud, write_cloud
@@ -144,6 +145,14 @@ def test_the_report_counts_by_classes(plane):
     at = at_check_points(plane, check, 2.0)
     assert at["points"] == 2 and at["rms_Z"] < 0.05
     assert to_plane(plane.X)["rms"] == pytest.approx(0.05 * np.sqrt(2.5) / np.sqrt(1.05), rel=0.05)
+
+
+def test_the_report_says_what_its_sigma_contains(plane):
+    told = text_of({
+        "points": len(plane), "rays": {}, "images": [], "accuracy": accuracy_of(plane),
+        "sigma_includes": ["matching", "orientation"],
+    })  # fmt: skip
+    assert "σ contains: matching, orientation" in told.splitlines() and "holds" not in told
 
 
 def test_clouds_are_compared_along_normals(plane):

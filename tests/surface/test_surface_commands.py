@@ -43,7 +43,8 @@ def project(tmp_path_factory):
     return folder, truth
 
 
-def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
+def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1000000000")
     folder, truth = project
     out, check = tmp_path / "out", tmp_path / "check.csv"
     x, y = (a.ravel() for a in np.meshgrid([-3, 1.5, 2.5], [-2, 1.5, 2]))
@@ -62,6 +63,8 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
     e = cloud.X[:, 2] - truth[0][v, u][:, 2]
     assert np.median(np.abs(e)) < 0.02 and (np.abs(e) > 0.3).mean() < 0.01
     assert report["sigma_includes"] == ["matching"]
+    first, *_ = (out / "report.txt").read_text().splitlines()
+    assert "project.toml" in first and "computed 2001-09-09 01:46 UTC, jaxbundle" in first
     assert report["check_points"]["points"] == 9 and report["check_points"]["rms_Z"] < 0.05
     with rasterio.open(out / "dsm.tif") as raster, rasterio.open(out / "orthophoto.tif") as photo:
         assert raster.res == photo.res == (0.25, 0.25) and photo.dtypes == ("uint8",)

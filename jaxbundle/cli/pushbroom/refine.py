@@ -42,7 +42,7 @@ def refine(
     from jaxbundle.io.writing.fingerprints import files_read
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
     from jaxbundle.refinement import refine as refine_images
-    from jaxbundle.report.page import UNKNOWN
+    from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
 
     file = read_refinement(input)
@@ -60,7 +60,7 @@ def refine(
         snooping=file.snooping, significance=file.significance,
     )  # fmt: skip
     result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
-    text, document = report(result), without_nan(to_json(result))
+    text, document = head_line(origin) + report(result), without_nan(to_json(result))
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:

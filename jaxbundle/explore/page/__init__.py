@@ -5,7 +5,8 @@ from importlib.resources import files
 from typing import Any, NamedTuple
 
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.report.page import Listing, Page, Section
+from jaxbundle.report.layout import WITHOUT_SIGMA
+from jaxbundle.report.page import Listing, Origin, Page, Section
 from jaxbundle.report.page.markup import text
 
 STYLE = "explore.css"
@@ -53,7 +54,9 @@ def draw_controls(controls: Iterable[Control], live: bool) -> str:
 def _control(one: Control, dead: str) -> str:
     key = f'data-key="{text(one.key)}"{dead}'
     if isinstance(one, Number):
-        field = f'<input type="number" step="any" value="{one.value!r}" {key}>'
+        shown = f"{one.value:.{WITHOUT_SIGMA}g}"
+        exact = f' data-exact="{one.value!r}"' if float(shown) != one.value else ""
+        field = f'<input type="number" step="any" value="{shown}"{exact} {key}>'
         slider = "" if one.low is None else (
             f'<input type="range" step="any" min="{one.low!r}" max="{one.high!r}" '
             f'value="{one.value!r}" data-slides="{text(one.key)}" aria-label="{text(one.label)}"'
@@ -88,15 +91,16 @@ def draw_tools(live: bool, exports: Mapping[str, str] = NOTHING) -> str:
 
 
 def make_page(
-    title: str, sections: Iterable[Section], origin: Section, live: bool, kind: str,
-    answer: Mapping[str, Any], tables: Mapping[str, Listing] = NOTHING,
-    drawings: Mapping[str, Any] = NOTHING, given: Mapping[str, Any] = NOTHING,
+    title: str, sections: Iterable[Section], origin: Origin, live: bool, kind: str,
+    answer: Mapping[str, Any], settings: Sequence[tuple[str, object]] = (),
+    tables: Mapping[str, Listing] = NOTHING, drawings: Mapping[str, Any] = NOTHING,
+    given: Mapping[str, Any] = NOTHING,
 ) -> Page:  # fmt: skip
     """A page of the explorer with the answer to the values `given`."""
     state = {"live": live, "kind": kind, "given": dict(given), "answer": dict(answer)}
     state = without_nan(state)
     return Page(
-        title, sections, origin, tables, {**drawings, "explore": state},
+        title, sections, origin, settings, tables, {**drawings, "explore": state},
         tuple(_read(name) for name in SCRIPTS), _read(STYLE), live,
     )  # fmt: skip
 

@@ -12,6 +12,9 @@ function readControls() {
 function valueOf(field) {
   if (field.type === "checkbox") return field.checked;
   if (field.type !== "number") return field.value;
+  // What is shown of a long number is rounded; unchanged, it stands for the whole.
+  const { exact } = field.dataset;
+  if (exact !== undefined && field.value === field.defaultValue) return Number(exact);
   return field.value === "" ? null : Number(field.value);
 }
 
@@ -112,7 +115,8 @@ function connectControls() {
       ask();
     });
     slider?.addEventListener("input", () => {
-      field.value = slider.value;
+      const places = 3 - Math.floor(Math.log10(slider.max - slider.min));
+      field.value = Number(Number(slider.value).toFixed(Math.min(Math.max(places, 0), 100)));
       ask();
     });
   }

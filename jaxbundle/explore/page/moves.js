@@ -36,7 +36,7 @@ class Moves {
     this.corners = network.corners.slice();
     // Its ellipsoids, and those of all others, are then those to expect.
     this.expected = new Map();
-    network.covarianceOf = (table, row) => this.expected.get(table)?.slice(6 * row, 6 * row + 6)
+    network.covarianceOf = (table, row) => this.expected.get(table)?.get(row)
       ?? NetworkView.prototype.covarianceOf.call(network, table, row);
   }
 
@@ -99,7 +99,7 @@ class Moves {
     const row = table.row(id);
     if (row < 0) return "";
     const told = table.shown.map(name => `${table.columns[name].label} ${table.cell(name, row)}`);
-    const six = this.expected.get(table)?.slice(6 * row, 6 * row + 6);
+    const six = this.expected.get(table)?.get(row);
     if (six !== undefined) {
       const names = table === this.tables.images ? STATION : POINT;
       const sigma = [six[0], six[3], six[5]].map(v => Math.sqrt(Math.max(v, 0)).toPrecision(3));
@@ -112,7 +112,7 @@ class Moves {
     const { images } = this.tables, id = this.select.value, row = images.row(id);
     const values = this.moved[id] ?? POSE.map(name => images.numbers(name)[row]);
     this.fields.forEach((field, i) => {
-      field.value = values[i] === null ? "" : Number(values[i].toPrecision(12));
+      field.value = values[i] === null ? "" : Number(values[i].toFixed(images.columns[POSE[i]].places));
     });
   }
 
@@ -128,11 +128,11 @@ class Moves {
   }
 
   show({ stations, ellipsoids }) {
-    const { network } = this, { images, points } = this.tables;
+    const { network } = this, { images } = this.tables;
     this.expected.clear();
-    if (ellipsoids !== undefined) {
-      this.expected.set(images, ellipsoids.images);
-      if (ellipsoids.points.length > 0) this.expected.set(points, ellipsoids.points);
+    for (const [name, { rows, elements }] of Object.entries(ellipsoids ?? {})) {
+      const six = (row, k) => [row, elements.slice(6 * k, 6 * k + 6)];
+      this.expected.set(this.tables[name], new Map(rows.map(six)));
     }
     network.corners.set(this.corners);
     this.places.clear();

@@ -19,6 +19,7 @@ from jaxbundle.report.page.origin import UNKNOWN as UNKNOWN
 from jaxbundle.report.page.origin import InputFile as InputFile
 from jaxbundle.report.page.origin import Origin as Origin
 from jaxbundle.report.page.origin import fingerprint_files as fingerprint_files
-from jaxbundle.report.page.overview import describe_origin as describe_origin
+from jaxbundle.report.page.origin import head_line as head_line
+from jaxbundle.report.page.origin import stamp as stamp
 from jaxbundle.report.page.overview import give_verdict as give_verdict
 from jaxbundle.report.page.verdict import Finding as Finding

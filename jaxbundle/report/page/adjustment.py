@@ -10,7 +10,7 @@ from jaxbundle.report.page import sections
 from jaxbundle.report.page.document import NOTHING, Listing, Page, Section, write
 from jaxbundle.report.page.markup import facts, grid, paragraph
 from jaxbundle.report.page.origin import UNKNOWN, Origin
-from jaxbundle.report.page.overview import describe_origin, explain_failure, give_verdict
+from jaxbundle.report.page.overview import explain_failure, give_verdict
 from jaxbundle.report.page.scene import describe_frames, describe_network
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.page.verdict import Finding, judge
@@ -27,7 +27,8 @@ class Addition(NamedTuple):
 
     **Fields:** `kind`, for the title, empty if the name of the network is enough; `findings` before
     those of the adjustment; `without`: findings of the adjustment to omit; `warnings` before its
-    own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before the others.
+    own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before the others;
+    `name`, in place of that of the network.
     """
 
     kind: str = "bundle adjustment"
@@ -37,6 +38,7 @@ class Addition(NamedTuple):
     overview: str = ""
     sections: tuple[Section, ...] = ()
     tables: Mapping[str, Listing] = NOTHING
+    name: str = ""
 
 
 ALONE = Addition()
@@ -53,8 +55,7 @@ def compose(
 
     - `origin`: the files that were read, with their fingerprints (`fingerprint_files`), and
       settings to show.
-    - `date`: printed in the head as given; omitted by default, so that the same
-      adjustment always gives the same page.
+    - `date`: of the computation, printed as given; by default that of `origin`, else now.
     - `also`: additions to the page.
     """
     yield from write(describe(adjustment, origin, also), date)
@@ -66,23 +67,25 @@ def compose_failure(
     """The page of an adjustment that ended before there was a result."""
     rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
     first = explain_failure(rows, ())
-    yield from write(Page(f"no result: {kind}", [first], describe_origin((), origin)))
+    yield from write(Page(f"no result: {kind}", [first], origin))
 
 
 def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
     """The page of an adjustment, as a `Page`."""
-    title = ": ".join(filter(None, (clean(adjustment.network.name) or "network", also.kind)))
-    last = describe_origin(head.setting_facts(adjustment), origin)
+    name = clean(also.name or adjustment.network.name) or "network"
+    title = f"{name}: {also.kind}" if also.kind else name
+    settings = head.setting_facts(adjustment)
     warnings = (*also.warnings, *adjustment.warnings)
     if not adjustment.converged:
         first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
-        return Page(title, [first, *also.sections], last, also.tables)
+        return Page(title, [first, *also.sections], origin, settings, also.tables)
     first = give_verdict(find(adjustment, also), warnings, also.overview, *_whole(adjustment))
     drawings: dict[str, Any] = {
         "network-data": describe_network(adjustment), "frames": describe_frames(adjustment)
     }  # fmt: skip
     shown = [first, *also.sections, *sections.collect(adjustment)]
-    return Page(title, shown, last, {**also.tables, **collect_tables(adjustment)}, drawings)
+    tables = {**also.tables, **collect_tables(adjustment)}
+    return Page(title, shown, origin, settings, tables, drawings)
 
 
 def find(adjustment, also: Addition = ALONE) -> list[Finding]:

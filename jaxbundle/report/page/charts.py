@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbundle.plotting.ticks import label_ticks, offset_in_words
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.markup import text
 
@@ -126,7 +127,7 @@ def draw_field(values: np.ndarray, digits: int = 2) -> str:
         parts.append(
             f'<rect class="cell" x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" '
             f'fill-opacity="{shade[i, j]:.2f}"/>\n<text x="{x + wide / 2:.1f}" '
-            f'y="{y + high / 2 + 4:.1f}" text-anchor="middle">'
+            f'class="number" y="{y + high / 2 + 4:.1f}" text-anchor="middle">'
             f"{_cell(float(values[i, j]), digits)}</text>\n"
         )
     return _svg([*parts, f'<rect class="frame" width="{WIDE}" height="{HIGH}"/>\n'])
@@ -141,45 +142,71 @@ def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) ->
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     spread = high - low or abs(high) or 1.0
     low, high = low - margin * spread, high + margin * spread
+    # less than this of the value is its rounding, for which ticks have no digits
+    least = 1e-9 * max(abs(low), abs(high))
+    if high - low < least:
+        low, high = low - least / 2, high + least / 2
     return Scale(low, high if high > low else low + spread, start, end)
 
 
-def _ticks(scale: Scale, whole: bool = False) -> np.ndarray:
-    """About five round numbers within a scale; whole ones where it has at least two."""
-    rough = (scale.high - scale.low) / 5
-    if whole and np.floor(scale.high) > np.ceil(scale.low):
+class Ticks(NamedTuple):
+    """Ticks of an axis: their places on its scale, their short names, and the addition to the label
+    of the axis."""
+
+    places: np.ndarray
+    names: list[str]
+    offset: str = ""
+
+
+def _ticks(scale: Scale, logarithmic: bool, whole: bool = False) -> Ticks:
+    """About five ticks within a scale; `whole`: whole ones where it has at least two."""
+    if not logarithmic:
+        values = _round_values(scale.low, scale.high, whole)
+        offset, names = label_ticks(values)
+        return Ticks(values, names, offset_in_words(offset))
+    if scale.high - scale.low < 1:  # within a decade the powers of ten say nothing
+        values = _round_values(10.0**scale.low, 10.0**scale.high)
+        offset, names = label_ticks(values)
+        return Ticks(np.log10(values), names, offset_in_words(offset))
+    decades = np.arange(np.floor(scale.low), scale.high, np.ceil((scale.high - scale.low) / 6))
+    powers = np.add.outer(decades, np.log10([1, 2, 5] if scale.high - scale.low < 3 else [1]))
+    powers = powers[(powers >= scale.low) & (powers <= scale.high)]
+    return Ticks(powers, [f"{10.0**power:.6g}" for power in powers])
+
+
+def _round_values(low: float, high: float, whole: bool = False) -> np.ndarray:
+    """About five round numbers between two; `whole`: whole ones where there are at least two."""
+    rough = (high - low) / 5
+    if whole and np.floor(high) > np.ceil(low):
         rough = max(rough, 1.0)
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(s * power for s in (1, 2, 5, 10) if s * power >= rough * (1 - 1e-9))
-    first = np.ceil(scale.low / step - 1e-9)
-    return step * np.arange(first, np.floor(scale.high / step + 1e-9) + 1)
+    first = np.ceil(low / step - 1e-9)
+    return step * np.arange(first, np.floor(high / step + 1e-9) + 1)
 
 
 def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "",
           whole: bool = False) -> str:  # fmt: skip
     """Axes with their ticks; `whole`: y counts."""
     parts = []
-    for tick in _ticks(x, "x" in logarithmic):
-        at = float(x(tick))
+    across = _ticks(x, "x" in logarithmic)
+    for at, name in zip(x(across.places), across.names):
         parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
                      f'y2="{HIGH - BOTTOM}"/>\n'
-                     f'<text x="{at:.1f}" y="{HIGH - BOTTOM + 16}" text-anchor="middle">'
-                     f"{_name(tick, 'x' in logarithmic)}</text>\n")  # fmt: skip
-    for tick in _ticks(y, whole or "y" in logarithmic):
-        at, name = float(y(tick)), _name(tick, "y" in logarithmic)
+                     f'<text class="tick" x="{at:.1f}" y="{HIGH - BOTTOM + 16}" '
+                     f'text-anchor="middle">{name}</text>\n')  # fmt: skip
+    up = _ticks(y, "y" in logarithmic, whole)
+    for at, name in zip(y(up.places), up.names):
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
                      f'y2="{at:.1f}"/>\n'
-                     f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{name}</text>\n')
+                     f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" '
+                     f'text-anchor="end">{name}</text>\n')  # fmt: skip
     middle = (TOP + HIGH - BOTTOM) / 2
     parts.append(f'<text x="{(LEFT + WIDE - RIGHT) / 2}" y="{HIGH - 8}" text-anchor="middle">'
-                 f"{text(x_label)}</text>\n"
+                 f"{text(x_label + across.offset)}</text>\n"
                  f'<text x="14" y="{middle}" text-anchor="middle" '
-                 f'transform="rotate(-90 14 {middle})">{text(y_label)}</text>\n')  # fmt: skip
+                 f'transform="rotate(-90 14 {middle})">{text(y_label + up.offset)}</text>\n')
     return "".join(parts)
-
-
-def _name(tick: float, logarithmic: bool) -> str:
-    return f"{10.0**tick:.3g}" if logarithmic else f"{tick + 0.0:.6g}"
 
 
 def _places(x: Scale, y: Scale, xs, ys) -> str:

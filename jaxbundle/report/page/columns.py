@@ -12,17 +12,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of
+
 INTEGERS = ("<u1", "<u2", "<i4")
 
 
 class Column(NamedTuple):
     """A column: `label` in the header, None where it is only drawn; decimal `places`, or minus the
-    number of significant digits; `exact`: 64-bit floats."""
+    number of significant digits; `exact`: 64-bit floats; `digits`: significant ones by row, in
+    place of `places`."""
 
     values: np.ndarray
     label: str | None = None
     places: int = -3
     exact: bool = False
+    digits: np.ndarray | None = None
+
+
+def estimates(values: np.ndarray, sigma: np.ndarray, label: str) -> Column:
+    """A column of values of different kinds, each with the digits that its σ gives it."""
+    return Column(values, label, -WITHOUT_SIGMA, True, np.array(
+        [digits_of(value, s) for value, s in zip(values, sigma)], int
+    ))  # fmt: skip
 
 
 def encode_table(columns: Mapping[str, Column]) -> dict[str, Any]:
@@ -32,6 +43,7 @@ def encode_table(columns: Mapping[str, Column]) -> dict[str, Any]:
         "length": length,
         "columns": {
             name: {"label": column.label, "places": column.places}
+            | ({} if column.digits is None else {"digits": _pack(column.digits)})
             | encode_values(column.values, column.exact)
             for name, column in columns.items()
         },

@@ -43,9 +43,17 @@ class Table {
   }
 
   cell(name, row) {
-    const { names, places } = this.columns[name];
+    const { names, places, digits } = this.columns[name];
     const value = this.numbers(name)[row];
-    return names === undefined ? formatNumber(value, places) : names[value];
+    if (names !== undefined) return names[value];
+    return formatNumber(value, digits === undefined ? places : -this.digits(name)[row]);
+  }
+
+  // By row the number of significant digits of a column.
+  digits(name) {
+    const column = this.columns[name];
+    column.unpackedDigits ??= unpack(column.digits, this.length);
+    return column.unpackedDigits;
   }
 
   row(wanted, name = "id") {

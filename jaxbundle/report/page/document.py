@@ -13,8 +13,11 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from jaxbundle.report.layout import clean
 from jaxbundle.report.page import markup
 from jaxbundle.report.page.columns import Column, encode_table, script_text
+from jaxbundle.report.page.origin import UNKNOWN, Origin, software_versions, stamp
+from jaxbundle.system.clock import in_words, now
 
 SCRIPTS = (
     "data.js", "table.js", "canvas.js", "pointer.js", "network.js", "photograph.js", "start.js",
@@ -25,14 +28,13 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Section(NamedTuple):
-    """A section: its `id`, heading and HTML; `link`: its name in the contents, empty: not listed;
-    `breaks`: on a new page when printed."""
+    """A section: its `id`, heading and HTML; `link`: its name in the contents, empty: not
+    listed."""
 
     id: str
     title: str
     content: str
     link: str = ""
-    breaks: bool = False
 
 
 class Listing(NamedTuple):
@@ -46,13 +48,15 @@ class Listing(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A page: its title; its sections, the verdict first; its non-empty tables by name; data of
-    script drawings, by id; the section on its origin. `scripts` run after those of every page,
-    `style` adds to its style; `asks`: the scripts may send requests to the page's server."""
+    """A page: its title; its sections, the verdict first; the origin of the result, and `settings`
+    by name to show with it; its non-empty tables by name; data of script drawings, by id. `scripts`
+    run after those of every page, `style` adds to its style; `asks`: the scripts may send requests
+    to the page's server."""
 
     title: str
     sections: Iterable[Section]
-    origin: Section
+    origin: Origin = UNKNOWN
+    settings: Sequence[tuple[str, object]] = ()
     tables: Mapping[str, Listing] = NOTHING
     drawings: Mapping[str, Any] = NOTHING
     scripts: Sequence[str] = ()
@@ -61,7 +65,7 @@ class Page(NamedTuple):
 
 
 def write(page: Page, date: str | None = None) -> Iterator[str]:
-    """The page as HTML, in pieces; `date` is printed in its head as it is given."""
+    """The page as HTML, in pieces; `date`: of the computation, by default that of its origin."""
     tables = {
         id: table
         for id, table in page.tables.items()
@@ -71,9 +75,10 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
     listed = [_listing(id, table) for id, table in tables.items()]
     if listed:
         listed[0] = listed[0]._replace(link="Tables")
-    yield _beginning(page, date)
+    last = _origin(page)
+    yield _beginning(page, date or page.origin.computed or in_words(now()))
     yield _section(first)
-    yield _contents([*sections, *listed, page.origin])
+    yield _contents([*sections, *listed, last])
     yield from map(_section, sections)
     if listed:
         yield markup.paragraph(
@@ -81,7 +86,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         )
         yield NO_SCRIPT
         yield from map(_section, listed)
-    yield _section(page.origin)
+    yield _section(last)
     for id, table in tables.items():
         yield _data(f"data-{id}", encode_table(table.columns))
     for id, value in page.drawings.items():
@@ -103,13 +108,30 @@ def _contents(sections: Iterable[Section]) -> str:
 
 
 def _section(section: Section) -> str:
-    return markup.section(section.id, section.title, section.content, breaks=section.breaks)
+    return markup.section(section.id, section.title, section.content)
 
 
-def _beginning(page: Page, date: str | None) -> str:
-    from jaxbundle import __version__
+def _origin(page: Page) -> Section:
+    """Settings, fingerprints of the files read, versions of the software."""
+    origin = page.origin
+    parts = [markup.facts([*page.settings, *origin.settings.items()])]
+    if origin.inputs:
+        rows = [(file.name, file.size, file.sha256) for file in origin.inputs]
+        listed = markup.grid(("file", "bytes", "SHA-256"), rows, "words files")
+        parts += ["<h3>Input files</h3>\n", listed]
+    parts += ["<h3>Software</h3>\n", markup.facts(software_versions())]
+    title = "Settings and origin"
+    return Section("origin", title, "".join(parts), title)
 
-    style, script = _read(STYLE) + page.style, _script(page)
+
+def _beginning(page: Page, date: str) -> str:
+    made = " · ".join(map(clean, stamp([file.name for file in page.origin.inputs], date)))
+    # Repeated in the margin of every printed page, by browsers that know margin boxes.
+    margins = (
+        f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; font-size: 8pt; }} '
+        f'@bottom-left {{ content: "{_css_text(made)}"; font-size: 8pt; }} }}\n'
+    )
+    style, script = _read(STYLE) + margins + page.style, _script(page)
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
         f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
@@ -118,14 +140,18 @@ def _beginning(page: Page, date: str | None) -> str:
     icon = '<link rel="icon" href="data:,">\n' if page.asks else ""
     policy += "; connect-src 'self'" if page.asks else ""
     title = markup.text(page.title)
-    made = f"jaxbundle {__version__}" + (f", {date}" if date else "")
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"{icon}<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
-        f"<header><h1>{title}</h1>{markup.paragraph(made)}</header>\n<main>\n"
+        f"<header><h1>{title}</h1>{markup.paragraph(made, 'made')}</header>\n<main>\n"
     )
+
+
+def _css_text(words: str) -> str:
+    """Text in a string of CSS: letters and digits as they are, all else by its code."""
+    return "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in words)
 
 
 def _data(id: str, value) -> str:

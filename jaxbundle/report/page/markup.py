@@ -11,10 +11,9 @@ def text(value: object) -> str:
     return escape(clean(value))
 
 
-def section(id: str, title: str, *content: str, breaks: bool = False) -> str:
-    """A section with its heading; `breaks`: on a new page when printed."""
-    kind = ' class="breaks"' if breaks else ""
-    return f'<section id="{id}"{kind}><h2>{text(title)}</h2>\n{"".join(content)}</section>\n'
+def section(id: str, title: str, *content: str) -> str:
+    """A section with its heading."""
+    return f'<section id="{id}"><h2>{text(title)}</h2>\n{"".join(content)}</section>\n'
 
 
 def paragraph(words: object, kind: str = "") -> str:
@@ -37,13 +36,14 @@ def facts(rows: Iterable[tuple[object, object]]) -> str:
 
 
 def grid(header: Sequence[object], rows: Iterable[Sequence[object]], kind: str = "") -> str:
-    """A table with a header; all but the first column are numbers."""
+    """A table with a header, which scrolls where it is wider than the page; all but the first
+    column are numbers, of the kind `remarks` also the last are words, of the kind `words` all."""
     head = "".join(f'<th scope="col">{text(cell)}</th>' for cell in header)
     body = "".join(
         "<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>\n" for row in rows
     )
     cells = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>"
-    return f"<table{_class(kind)}>\n{cells}</table>\n"
+    return f'<div class="wide"><table{_class(kind)}>\n{cells}</table></div>\n'
 
 
 def figure(drawing: str, caption: object) -> str:

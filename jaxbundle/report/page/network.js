@@ -6,7 +6,7 @@ const SHAPES = {
 };
 const PYRAMID = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]];
 const VIEWS = { "from above": [0, 0], "from the front": [0, Math.PI / 2], oblique: [0.6, 1.0] };
-const MOST_ELLIPSOIDS = 3000, MOST_RAYS = 3000, NEAR = 10, MANY = 3000;
+const MOST_RAYS = 3000, NEAR = 10, MANY = 3000;
 const STATION = ["X0", "Y0", "Z0"], POINT = ["X", "Y", "Z"];
 
 class NetworkView {
@@ -56,6 +56,8 @@ class NetworkView {
         this.draw();
       });
     }
+    addButton(place, "closer", () => this.change({ zoom: this.zoom * 1.5 }));
+    addButton(place, "farther", () => this.change({ zoom: this.zoom / 1.5 }));
     for (const name of Object.keys(this.show)) {
       const box = make("input", { type: "checkbox", checked: this.show[name] });
       box.addEventListener("change", () => {
@@ -132,18 +134,19 @@ class NetworkView {
 
   // The outline of an ellipsoid seen in parallel is the ellipse of its covariance on the screen.
   drawEllipsoids(context) {
-    let left = MOST_ELLIPSOIDS;
-    context.strokeStyle = COLOURS.ink;
+    const { points, images } = this.ellipsoids;
+    context.strokeStyle = points.length < this.points.length ? "rgba(38,52,60,.5)" : COLOURS.ink;
     context.lineWidth = 0.7;
-    const wanted = table => table.has("c00")
-      && (table === this.images ? this.show["ellipsoids of stations"] : this.show.ellipsoids);
-    for (const [table, names] of this.placed.filter(([table]) => wanted(table))) {
-      for (let row = 0; row < table.length && left > 0; row++) {
+    const wanted = [
+      [this.points, POINT, this.show.ellipsoids ? points : []],
+      [this.images, STATION, this.show["ellipsoids of stations"] ? images : []],
+    ];
+    for (const [table, names, rows] of wanted) {
+      for (const row of rows) {
         const at = this.findInside(table, row, names);
         if (at === null) continue;
         const { a, b, turn } = this.outline(table, row);
         if (!(a > 0)) continue;
-        left -= 1;
         context.beginPath();
         context.ellipse(...at, a, b, turn, 0, 2 * Math.PI);
         context.stroke();
@@ -223,8 +226,7 @@ class NetworkView {
     const roles = this.points.names("role").map(role => `${SHAPES[role][0]}: ${role} point`);
     document.getElementById("network-legend").textContent = [
       "pyramid: station and image corners", ...roles,
-      `error ellipsoids: 1σ a posteriori, drawn ${this.factor} times as large `
-        + `(at most ${MOST_ELLIPSOIDS})`,
+      this.drawn,
       "the bar is the scale of the network",
     ].join("; ");
   }

@@ -1,14 +1,16 @@
-"""Origin of a result: fingerprints of the input files, versions of the software."""
+"""Origin of a result: when it was computed, fingerprints of the input files, versions of the
+software."""
 
 import hashlib
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from jaxbundle.network.columns import count
 from jaxbundle.system.file_content import is_plain
 
 PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "numpy", "scipy")
@@ -23,10 +25,12 @@ class InputFile(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The origin of a result: the input files, and further settings by displayed name."""
+    """The origin of a result: the input files, the first of which names the project; further
+    settings by displayed name; the date of the computation in words, empty: that of the page."""
 
     inputs: tuple[InputFile, ...] = ()
     settings: Mapping[str, object] = MappingProxyType({})
+    computed: str = ""
 
 
 UNKNOWN = Origin()
@@ -46,6 +50,26 @@ def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
         except OSError:
             continue
     return tuple(found.values())
+
+
+def stamp(files: Sequence[str], computed: str) -> list[str]:
+    """What a page or report is of: the first input file, which is that of the project, in its
+    folder, and the number of others; date; version."""
+    from jaxbundle import __version__
+
+    said = [f"computed {computed}", f"jaxbundle {__version__}"]
+    if not files:
+        return said
+    others = len(files) - 1
+    name = "/".join(Path(files[0]).parts[-2:])
+    return [name + (f" and {count(others, 'other file')}" if others else ""), *said]
+
+
+def head_line(origin: Origin) -> str:
+    """The stamp as the first line of a report; empty if the date is not known."""
+    if not origin.computed:
+        return ""
+    return f"{', '.join(stamp([file.name for file in origin.inputs], origin.computed))}\n"
 
 
 def software_versions() -> list[tuple[str, str]]:

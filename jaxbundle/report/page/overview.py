@@ -1,11 +1,10 @@
-"""The first and the last section of every page: the verdict, and the origin of the result."""
+"""The first section of every page of a result: the verdict."""
 
 from collections.abc import Iterable, Sequence
 
 from jaxbundle.report import head
 from jaxbundle.report.page.document import Section
 from jaxbundle.report.page.markup import facts, grid, items, paragraph
-from jaxbundle.report.page.origin import Origin, software_versions
 from jaxbundle.report.page.verdict import Finding, in_words
 
 
@@ -26,17 +25,6 @@ def explain_failure(
     """The verdict without a result, and the remedy."""
     content = [paragraph(head.NO_RESULT, "verdict not-met"), _warnings(warnings), facts(rows)]
     return Section("overview", "Verdict", "".join([*content, *parts]))
-
-
-def describe_origin(chosen: Iterable[tuple[str, object]], origin: Origin) -> Section:
-    """Settings, fingerprints of the files read, versions of the software."""
-    parts = [facts([*chosen, *origin.settings.items()])]
-    if origin.inputs:
-        rows = [(file.name, file.size, file.sha256) for file in origin.inputs]
-        parts += ["<h3>Input files</h3>\n", grid(("file", "bytes", "SHA-256"), rows, "words")]
-    parts += ["<h3>Software</h3>\n", facts(software_versions())]
-    title = "Settings and origin"
-    return Section("origin", title, "".join(parts), title, True)
 
 
 def _warnings(lines: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
 from jaxbundle.report.page.markup import facts, grid
 from jaxbundle.report.page.origin import UNKNOWN, Origin
-from jaxbundle.report.page.overview import describe_origin, give_verdict
+from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
 from jaxbundle.report.page.verdict import DOUBTFUL, GOOD, Finding, judge_fit
@@ -51,7 +51,7 @@ def _describe(result, origin: Origin) -> Page:
     }  # fmt: skip
     title = f"{', '.join(one.id for one in result.images)}: {KIND}"
     frames = {"frames": _frames(result)}
-    return Page(title, sections, describe_origin((), origin), tables, frames)
+    return Page(title, sections, origin, tables=tables, drawings=frames)
 
 
 def _words(values) -> np.ndarray:
@@ -84,7 +84,8 @@ def _judge(result, used, w) -> list[Finding]:
                 f"weakly controlled (r < 0.1), {loose} uncontrolled"),
         Finding("Blunders", DOUBTFUL if over else GOOD,
                 f"{large} of {count(len(w), 'coordinate')} with |w| over {CRITICAL_W} (by chance "
-                f"about {expected:.2g}); {len(result.removed)} removed by data snooping"),
+                f"about {significant(expected, 2)}); {len(result.removed)} removed by data "
+                "snooping"),
     ]  # fmt: skip
     check = result.check
     if check is not None:
@@ -132,7 +133,7 @@ def _unknowns(result) -> Section:
     if shows_matrix:
         parts += ["<h3>Correlations in %</h3>\n",
                   show_correlations(numbered, result.correlation, range(1, len(rows) + 1))]
-    return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns", True)
+    return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns")
 
 
 def _images(result, used) -> Columns:

@@ -6,7 +6,13 @@ from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import principal_point
 from jaxbundle.plotting.frame import image_frame
 from jaxbundle.plotting.style import extent, micrometres, round_number
-from jaxbundle.plotting.views import camera_pyramids, ellipse_factor, pyramid_size
+from jaxbundle.plotting.views import (
+    PROBABILITY,
+    camera_pyramids,
+    choose_ellipses,
+    pyramid_size,
+    thin_out,
+)
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page.columns import encode_values
 
@@ -17,25 +23,32 @@ MOST_OF_SIZE = 0.15
 
 
 def describe_network(adjustment) -> dict:
-    """Centre, size and unit of the network, the factor of its error ellipsoids, whether those of
-    stations are too wide to be drawn with it, and the pyramid of every image (projection centre and
-    four corners, relative to the centre)."""
+    """Centre, size and unit of the network; its error ellipsoids: the factor, the rows of points
+    and stations that have one, in words, and whether those of stations are too wide to be drawn;
+    the pyramid of every image (projection centre and four corners, relative to the centre)."""
     centres = adjustment.image_values[:, :3]
     near = adjustment.point_values[adjustment.located]
     centre, size = extent(np.concatenate([near, centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
-    number, factor = ellipse_factor(adjustment, size)
+    ellipsoids = choose_ellipses(adjustment, size)
     largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
-    if not number and largest.max(initial=0.0) > 0:
+    if not ellipsoids.total and largest.max(initial=0.0) > 0:
         factor = round_number(OF_STATIONS * size / largest.max())
+        ellipsoids = ellipsoids._replace(factor=factor)
     return {
         "centre": centre.tolist(),
         "size": size,
         "unit": clean(adjustment.network.object_unit),
-        "factor": factor,
-        "wide": bool(factor * largest.max(initial=0.0) > MOST_OF_SIZE * size),
+        "factor": ellipsoids.factor,
+        "ellipsoids": {"points": ellipsoids.rows.tolist(),
+                       "images": thin_out(centres, np.nan_to_num(largest)).tolist()},
+        "drawn": " ".join([
+            f"error ellipsoids: 1σ a posteriori (probability {PROBABILITY[3]}), drawn",
+            ellipsoids.exaggeration, ellipsoids.selection,
+        ]).rstrip(),
+        "wide": bool(ellipsoids.factor * largest.max(initial=0.0) > MOST_OF_SIZE * size),
         "pyramids": encode_values(pyramids.ravel()),
-    }
+    }  # fmt: skip
 
 
 def describe_frames(adjustment) -> dict[str, dict]:

@@ -19,6 +19,8 @@ from jaxbundle.report.unknowns import validity
 
 MOST_CAMERAS = 20
 """Largest number of cameras with drawn distortion and correlations."""
+LEAST_FALL = 1e-5
+"""Smallest relative change of vᵀPv that is drawn: its table has six digits."""
 
 
 def collect(adjustment) -> Iterator[Section]:
@@ -41,7 +43,7 @@ def network() -> Section:
         '<p class="legend" id="network-legend"></p>\n',
         '<p id="network-said" aria-live="polite"></p>\n',
     ]  # fmt: skip
-    return Section("network", "Network", "".join(parts), "Network", True)
+    return Section("network", "Network", "".join(parts), "Network")
 
 
 def photographs(test: str = "τ") -> Section:
@@ -55,7 +57,7 @@ def photographs(test: str = "τ") -> Section:
         '<p id="photograph-said" aria-live="polite"></p>\n',
     ]  # fmt: skip
     title = "Photographs: residuals and redundancy"
-    return Section("photographs", title, "".join(parts), "Photographs", True)
+    return Section("photographs", title, "".join(parts), "Photographs")
 
 
 def cameras(adjustment) -> Iterator[Section]:
@@ -73,7 +75,7 @@ def cameras(adjustment) -> Iterator[Section]:
         if others and number == len(chosen) - 1:
             parts.append(paragraph(f"{others} other cameras are in the table."))
         id, link = ("distortion", "Distortion") if number == 0 else (f"distortion-{number}", "")
-        yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link, True)
+        yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link)
 
 
 def _distortion(adjustment, camera: str) -> str:
@@ -133,7 +135,7 @@ def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "")
         draw_histogram(edges, counted, f"normalised residual {symbol}", "observations", expected),
         f"Normalised residuals of {counted.sum()} controlled observations; outer classes are open",
     )
-    return Section("residuals", "Normalised residuals", drawing + more, "Residuals", True)
+    return Section("residuals", "Normalised residuals", drawing + more, "Residuals")
 
 
 def convergence(adjustment) -> Section:
@@ -142,12 +144,12 @@ def convergence(adjustment) -> Section:
     there = np.isfinite(vtpv) & (vtpv > 0)
     step = np.arange(len(vtpv))
     drawing = ""
-    if there.sum() > 1:
+    if there.sum() > 1 and vtpv[there].max() > (1 + LEAST_FALL) * vtpv[there].min():
         curve = Curve("vᵀPv", step[there], np.log10(vtpv[there]))
         drawing = figure(draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
                          f"{head.result_in_words(adjustment)}: {adjustment.termination}")
     rows = [
-        (i or "start", f"{vtpv[i]:.8e}" if np.isfinite(vtpv[i]) else "not finite",
+        (i or "start", f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
          f"{damping[i]:.1e}" if i else "", ("accepted" if accepted[i] else "rejected") if i else "")
         for i in step
     ]  # fmt: skip

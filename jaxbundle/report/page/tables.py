@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.report.layout import clean, column_decimals
-from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.layout import clean, coordinate_decimals
+from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.document import Listing
 
 MOST_ROWS = 500_000
@@ -43,7 +43,7 @@ def cameras(adjustment) -> Columns:
         "camera": Column(found["camera"], "camera"),
         "model": Column(found["model"], "model"),
         "parameter": Column(found["parameter"], "parameter"),
-        "value": Column(numbers(found["value"]), "value", -9, True),
+        "value": estimates(numbers(found["value"]), numbers(found["sigma"]), "value"),
         "sigma": Column(numbers(found["sigma"]), "σ"),
         "free": Column(found["free"].astype(bool), "free"),
         "t": Column(numbers(found["t"]), "t = |value|/σ"),
@@ -57,7 +57,7 @@ def images(adjustment) -> Columns:
     unit, angle = clean(given.object_unit), given.angle_unit
     units = dict(zip(EXTERIOR, [unit] * 3 + [angle] * 3))
     label = lambda name: f"{ANGLES.get(name, name)} [{units[name]}]"
-    places = {name: column_decimals(found[f"s{name}"]) for name in EXTERIOR}
+    places = {name: coordinate_decimals(found[f"s{name}"]) for name in EXTERIOR}
     ids = np.array([camera.id for camera in given.cameras], dtype=object)
     return (
         {"id": Column(found["id"], "image"), "camera": Column(ids[given.images.camera], "camera")}
@@ -74,7 +74,7 @@ def images(adjustment) -> Columns:
 def points(adjustment) -> Columns:
     """Coordinates with σ; the covariance, and whether a point is near enough to be drawn."""
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
-    places = {axis: column_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    places = {axis: coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"}
     return (
         {"id": Column(found["id"], "point"), "role": Column(found["role"], "role")}
         | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
@@ -113,7 +113,7 @@ def checks(adjustment) -> Columns:
     found, unit = adjustment.table("checks"), clean(adjustment.network.object_unit)
     if not found:
         return {}
-    places = {axis: column_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    places = {axis: coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"}
     return (
         {"id": Column(found["id"], "point")}
         | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
@@ -126,11 +126,11 @@ def checks(adjustment) -> Columns:
 def observations(adjustment) -> Columns:
     """All observations, of very many those with the largest |τ|; `measured` of image points."""
     return table_of_residuals(
-        adjustment.residuals | {"measured": measured_coordinates(adjustment)}
+        adjustment.residuals | {"measured": measured_coordinates(adjustment)}, adjustment.sigma0
     )
 
 
-def table_of_residuals(found: Mapping[str, np.ndarray]) -> Columns:
+def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Columns:
     """The columns there are of a table of residuals."""
     chosen = choose_largest(found["tau"], MOST_ROWS)
     labels = {
@@ -138,7 +138,8 @@ def table_of_residuals(found: Mapping[str, np.ndarray]) -> Columns:
         "v": "v", "sigma": "σ a priori", "r": "r", "w": "w", "tau": "τ", "mdb": "MDB (σ a priori)",
         "external": "ext.", "weight": "weight",
     }  # fmt: skip
-    places = {"r": 3, "tau": 2, "w": 2, "measured": 4}
+    of_images = found["sigma"][found["kind"] == "image"]
+    places = {"r": 3, "tau": 2, "w": 2, "measured": coordinate_decimals(sigma0 * of_images)}
     return {
         name: Column(found[name][chosen], label, places.get(name, -3))
         for name, label in labels.items()

@@ -122,7 +122,7 @@ def _blunders(adjustment) -> Finding:
     largest = significant(np.fmax.reduce(tau, initial=np.nan))
     words = (
         f"{over} of {count(len(tau), 'observation')} over the critical value {significant(limit)} "
-        f"of |τ| at 0.1 % (by chance about {expected:.2g}); largest {largest}"
+        f"of |τ| at 0.1 % (by chance about {significant(expected, 2)}); largest {largest}"
     )
     removed, suspects = len(adjustment.removed), len(adjustment.suspects)
     if removed or suspects:

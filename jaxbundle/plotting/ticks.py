@@ -1,0 +1,83 @@
+"""Ticks of axes in figures and pages: short texts, and one offset for what all have in common."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.plotting.style import label
+
+TICK_DIGITS = 6
+"""Largest number of digits of a tick: as many as fit beside an axis."""
+
+
+def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float, list[str]]:
+    """A common offset of evenly spaced ticks, and the short text of each without it.
+
+    Neighbours differ in their text. The offset is 0, or a round number where ticks would need more
+    than `TICK_DIGITS` digits because they are far from 0, as in map coordinates.
+    """
+    values = np.asarray(ticks, float)
+    if len(values) < 2:
+        return 0.0, name_ticks(values)
+    span, largest = float(values[-1] - values[0]), float(np.abs(values).max())
+    digits = math.log10(max(largest, 1.0)) + max(_places(values), 0)
+    if largest <= 10 * span or digits < TICK_DIGITS:
+        return 0.0, name_ticks(values)
+    unit = 10.0 ** math.ceil(math.log10(span) - 1e-9)
+    offset = math.floor(values[0] / unit + 1e-6) * unit
+    return offset, name_ticks(values - offset)
+
+
+def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
+    """The text of evenly spaced ticks, with the decimal places that their step needs."""
+    if len(values) < 2:
+        return [f"{value:.{TICK_DIGITS}g}" for value in values]
+    places, largest = _places(values), float(np.abs(values).max())
+    # + 0.0: no minus before a zero
+    values = np.where(np.abs(values) < 1e-6 * (values[1] - values[0]), 0.0, values) + 0.0
+    if 1e-4 <= largest < 10.0**TICK_DIGITS:
+        return [f"{value:.{max(places, 0)}f}" for value in values]
+    return [_with_exponent(value, places) for value in values]
+
+
+def _places(values: Float[np.ndarray, " n"]) -> int:
+    """Decimal places of the step, which is 1, 2, 2.5 or 5 times a power of ten; negative for tens,
+    hundreds, …"""
+    step = float(values[1] - values[0])
+    first = -math.floor(math.log10(step) + 1e-9)
+    whole = step * 10.0**first
+    return first if abs(whole - round(whole)) < 1e-3 else first + 1
+
+
+def offset_in_words(offset: float) -> str:
+    """What is to be added to the ticks of an axis, for its label; digits in groups of three."""
+    return f" ({offset:+,.12g})".replace(",", " ").replace("-", "−") if offset else ""
+
+
+def label_coordinates(ax, axis: str, unit: str) -> None:
+    """The label and the ticks of a coordinate axis in the limits it has: X, Y or Z."""
+    from matplotlib.ticker import Formatter
+
+    of = getattr(ax, f"{axis}axis")
+    low, high = sorted(of.get_view_interval())
+    offset, _ = label_ticks([tick for tick in of.get_majorticklocs() if low <= tick <= high])
+
+    class WithoutOffset(Formatter):
+        def __call__(self, value, place=None):
+            """The whole coordinate, at the pointer."""
+            return f"{value:.10g}"
+
+        def format_ticks(self, values):
+            return name_ticks(np.array(values) - offset)
+
+    of.set_major_formatter(WithoutOffset())
+    label(ax, axis, axis.upper(), unit)
+    of.set_label_text(of.get_label_text() + offset_in_words(offset))
+
+
+def _with_exponent(value: float, places: int) -> str:
+    if value == 0:
+        return "0"
+    return f"{value:.{max(math.floor(math.log10(abs(value)) + 1e-9) + places, 0)}e}"
