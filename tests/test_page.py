@@ -24,7 +24,7 @@ from jaxbundle.report.page import InputFile, Origin, compose, compose_failure, f
 from jaxbundle.report.page.columns import Column, encode_table, encode_values
 from jaxbundle.report.page.document import SCRIPTS, STYLE
 from jaxbundle.report.page.tables import choose_largest
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, Finding, in_words, judge
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Finding, in_words, judge
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "convergent4" / "project.toml"

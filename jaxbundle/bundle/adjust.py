@@ -188,8 +188,8 @@ class _First:
         """Adjust again, with everything left out because of start values that agrees with the
         adjusted orientation, until nothing more does."""
         if self.oriented is not None:
-            said = (f"start values found, {self.oriented.frame}", self.oriented.finding)
-            given = given.warn(*filter(None, said))
+            given = given.note(f"start values found, {self.oriented.frame}")
+            given = given.warn(*filter(None, [self.oriented.finding]))
         rounds, final = 0, Undetermined()
         while inspect_solution(found[0].with_factor(), found[1]):
             problem, minimum, check, gone, current = found
@@ -207,7 +207,7 @@ class _First:
                             f"would still come back after {rounds} repeated adjustments"
                         )
                     network = problem.network.replace(
-                        warnings=whole.warnings, left_out=whole.left_out
+                        warnings=whole.warnings, notes=whole.notes, left_out=whole.left_out
                     )
                     return dataclasses.replace(problem, network=network), minimum, check
                 carried = partial(carry, before=problem, values=minimum.values)

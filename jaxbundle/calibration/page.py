@@ -39,7 +39,7 @@ from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, in_words
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, in_words
 
 KIND = "calibration of cameras"
 BOARD = ("Control",)

@@ -54,8 +54,10 @@ def calibrate(
         bool, typer.Option("--board-free", help="estimate the points of the board")
     ] = False,
     sigma_image: Annotated[
-        float, typer.Option(help="a priori σ of an image coordinate, pixels")
-    ] = 0.1,
+        float | None,
+        typer.Option(help="a priori σ of an image coordinate, pixels; default: 0.1, a unit of "
+                     "weight that no test is about"),
+    ] = None,
     snooping: Annotated[
         str, choice((*TESTS, "none"), "removal of gross errors and of rig epochs")
     ] = "pope",

@@ -12,7 +12,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.tables import Camera, Network, Points
+from jaxbundle.network.tables import STATED, Camera, Network, Points
 
 LARGEST_RADIUS = 10.0
 """Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
@@ -112,15 +112,15 @@ def name_degrees(points: Points) -> str:
 
 def name_sigma_unit(network: Network, sigma0: float) -> str:
     """The unit in which the a priori σ of image coordinates would agree with σ0, in words; empty if
-    σ0 is not far from 1, or no unit does."""
+    nobody stated them, σ0 is not far from 1, or no unit does."""
+    if network.observations.sigma_origin != STATED:
+        return ""
     if SIGMA0_RANGE[0] < sigma0 < SIGMA0_RANGE[1] or not sigma0 > 0:
         return ""
     camera, sigma = network.cameras[0], float(np.median(network.observations.sigma))
     unit, pitch = get_model(camera.model).unit, camera.pixel_size and abs(camera.pixel_size[0])
     if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
         unit, sigma = "px", sigma / pitch
-    if sigma == 1.0:  # Unit weights: nothing was meant.
-        return ""
     if unit == "mm":
         meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
     else:

@@ -22,7 +22,7 @@ from jaxbundle.report.page import (
 )
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD
 
 WITHOUT = ("χ² test",)
 """Findings of an adjustment that do not apply: σ are estimated from the residuals."""

@@ -10,10 +10,12 @@ report with reason and remedy, without numbers of a solution.
 
 from jaxbundle.report import head, observations, unknowns
 from jaxbundle.report.budget import budget_lines
-from jaxbundle.report.head import unit_weights as unit_weights
+from jaxbundle.report.head import unit_of_weight as unit_of_weight
 from jaxbundle.report.summary import html as html
 from jaxbundle.report.summary import one_line as one_line
 from jaxbundle.report.summary import short as short
+from jaxbundle.report.verdict import Verdict as Verdict
+from jaxbundle.report.verdict import conclude as conclude
 
 
 def text(
@@ -45,11 +47,11 @@ def text(
         raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
     lines = [*head.title(adjustment, date), *head.settings(adjustment), *head.counts(adjustment)]
     if not adjustment.converged:
-        lines += [*head.why_not_solved(adjustment), *head.warnings(adjustment)]
+        lines += [*head.why_not_solved(adjustment), *head.messages(adjustment)]
         return _join(lines)
     lines += head.convergence(adjustment)
     lines += head.variance_factor(adjustment)
-    lines += head.warnings(adjustment)
+    lines += head.messages(adjustment)
     lines += unknowns.cameras(adjustment)
     lines += unknowns.images(adjustment, max_rows)
     lines += unknowns.points(adjustment, max_rows, accuracy_unit)

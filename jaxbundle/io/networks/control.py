@@ -212,14 +212,14 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
         points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **given
     )
     lost = [id for id in control.id if id not in index]
-    warnings = []
+    warnings, notes = [], []
     if dropped:
         points = count(len(dropped), "control point")
         warnings.append(f"{points} of the input not in {control.source.name} became tie points: "
                         f"{list_some(dropped)}")  # fmt: skip
     if lost:
-        warnings.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
-    return network.warn(*warnings)
+        notes.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
+    return network.warn(*warnings).note(*notes)
 
 
 def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> Network:
@@ -260,7 +260,7 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
         images=Images(images.id, images.camera, images.position @ A.T + t, angles_of(M),
                       images.sigma, images.source),
         points=dataclasses.replace(points, position=position),
-    ).warn(
+    ).note(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
     )  # fmt: skip

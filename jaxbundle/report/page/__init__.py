@@ -21,4 +21,4 @@ from jaxbundle.report.page.origin import Origin as Origin
 from jaxbundle.report.page.origin import fingerprint_files as fingerprint_files
 from jaxbundle.report.page.overview import describe_origin as describe_origin
 from jaxbundle.report.page.overview import give_verdict as give_verdict
-from jaxbundle.report.page.verdict import Finding as Finding
+from jaxbundle.report.verdict import Finding as Finding
