@@ -103,6 +103,7 @@ def calibrate(
     from jaxbundle.io.results.result_json import unsolved_text
     from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.measure.views import photographs
+    from jaxbundle.network.columns import count
     from jaxbundle.photographs.opencv import need_opencv
     from jaxbundle.report.page import UNKNOWN, compose_failure
 
@@ -186,9 +187,11 @@ def calibrate(
     if failed:
         names = found.cameras[failed[0]].adjustment.undetermined
         what = f"; not determined: {', '.join(names[:12])}" if names else ""
+        more = f"; nor {count(len(failed) - 1, 'other camera')}: {', '.join(failed[1:])}"
         raise NotSolvedError(
             f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
             f"{what}; free fewer parameters (--free), or take photographs from more directions"
+            f"{more if len(failed) > 1 else ''}"
         )
 
 
