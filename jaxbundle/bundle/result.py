@@ -163,8 +163,8 @@ class Adjustment:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is good to know and spoils nothing, in words: where start values come from, what was
-        left out."""
-        return tuple(dict.fromkeys(self.problem.network.notes))
+        left out, how uncertain the georeference is."""
+        return tuple(dict.fromkeys((*self.problem.network.notes, *self.weakness.notes)))
 
     @functools.cached_property
     def verdict(self) -> report.Verdict:

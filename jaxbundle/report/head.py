@@ -21,7 +21,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
-from jaxbundle.statistics.global_test import test_in_words
+from jaxbundle.statistics.global_test import describe_test
 from jaxbundle.statistics.weakness import ADVICE_FOR
 
 METHODS = {
@@ -61,16 +61,16 @@ def title(adjustment, date: str | None) -> list[str]:
     return [first, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
 
 
-def settings(adjustment) -> list[str]:
+def settings(adjustment, verdict=None) -> list[str]:
     """What to know first; method, datum, domain of the residuals, units."""
-    return ["", *facts([*first_facts(adjustment), *setting_facts(adjustment)])]
+    return ["", *facts([*first_facts(adjustment, verdict), *setting_facts(adjustment)])]
 
 
-def first_facts(adjustment) -> list[tuple[str, str]]:
+def first_facts(adjustment, verdict=None) -> list[tuple[str, str]]:
     """The verdict with its reasons, likely causes of a bad fit, and how much was left out."""
     rows = []
     if adjustment.converged:
-        _, words, findings = adjustment.verdict
+        _, words, findings = verdict or adjustment.verdict
         rows = [("Verdict", words), *((f.about, f.words) for f in findings if f.lowers)]
     rows += [("Attention", clean(text)) for text in adjustment.findings]
     if words := left_out_in_words(adjustment):
@@ -266,7 +266,8 @@ def image_precision(adjustment) -> str:
 
 def unit_of_weight(adjustment) -> str:
     """The σ of image coordinates with their unit, as a unit of weight."""
-    return f"{span(image_sigmas(adjustment)[[0, -1]], 4)} {adjustment.image_unit}"
+    ends = dict.fromkeys(f"{sigma:.4g}" for sigma in image_sigmas(adjustment)[[0, -1]])
+    return f"{' to '.join(ends)} {adjustment.image_unit}"
 
 
 def span(values, digits: int = 5) -> str:
@@ -278,7 +279,7 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
     """The global test in words."""
     found = adjustment.global_test(level)
     failed = found["passed"] is False and found["vtpv"] > found["high"]
-    words = test_in_words(found, unit_of_weight(adjustment), level)
+    words = describe_test(found, unit_of_weight(adjustment), level)
     return f"{words}, see Warnings" if failed and adjustment.doubts else words
 
 

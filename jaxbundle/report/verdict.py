@@ -6,6 +6,7 @@ network, a few things left out. `doubtful` is a test that a good result fails on
 were stated are contradicted.
 """
 
+from collections.abc import Container, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -63,18 +64,20 @@ def in_words(findings: list[Finding], warnings: int) -> tuple[str, str]:
              for state in (NOTED, DOUBTFUL, BAD)}  # fmt: skip
     doubtful = [*brief[DOUBTFUL], *([count(warnings, "warning")] if warnings else [])]
     if brief[BAD]:
-        also = f"; also {', '.join(doubtful)}" if doubtful else ""
-        return BAD, f"The result does not meet its tests: {', '.join(brief[BAD])}{also}."
+        return BAD, f"The result does not meet its tests: {', '.join(brief[BAD])}."
     if doubtful:
         return DOUBTFUL, f"Use the result with care: {', '.join(doubtful)}."
     noted = f" (noted: {', '.join(brief[NOTED])})" if brief[NOTED] else ""
     return GOOD, f"The result meets its tests{noted}."
 
 
-def conclude(adjustment) -> Verdict:
-    """The verdict on a solved adjustment."""
-    findings = judge(adjustment)
-    return Verdict(*in_words(findings, len(adjustment.warnings)), tuple(findings))
+def conclude(
+    adjustment, findings: Iterable[Finding] = (), without: Container[str] = (), warnings: int = 0
+) -> Verdict:
+    """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
+    those of the adjustment, and with further `warnings`."""
+    found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
+    return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
 
 
 def _fit(adjustment) -> Finding:
@@ -132,16 +135,23 @@ def _control(adjustment) -> Finding:
     largest, limit, words = _tested(adjustment, adjustment.residuals["kind"] == "control")
     if np.isnan(largest):
         return _held_control(adjustment, parts)
-    state = GOOD if largest <= limit else BAD
-    return Finding("Control", state, f"{parts}; largest |τ| {words}", "control contradicted")
+    words = f"{parts}; largest |τ| {words}"
+    if largest > limit:
+        return Finding("Control", BAD, words, "control contradicted")
+    if vague := adjustment.weakness.georeference:
+        brief = vague.partition(",")[0]
+        return Finding("Control", NOTED, f"{words}; {vague}", brief)
+    return Finding("Control", GOOD, words)
 
 
 def _free_network(adjustment) -> Finding:
     """Without control a network is complete: in its datum, which is named."""
     open_part = open_datum(adjustment)
     if not open_part:
+        vague = adjustment.weakness.georeference
         words = "no control points; the datum is given by other observations (Datum)"
-        return Finding("Control", NOTED, words, "no control points")
+        brief = vague.partition(",")[0] or "no control points"
+        return Finding("Control", NOTED, f"{words}; {vague}" if vague else words, brief)
     words = (f"no control points: a free network, {open_part} are those of the start values (datum "
              f"{adjustment.network.datum})")  # fmt: skip
     return Finding("Control", NOTED, words, "free network")

@@ -32,7 +32,7 @@ def chi_squared_test(
     return {"vtpv": vtpv, "low": low, "high": high, "passed": passed, "sigma_origin": origin}
 
 
-def test_in_words(found: dict, unit: str, significance: float = LEVEL) -> str:
+def describe_test(found: dict, unit: str, significance: float = LEVEL) -> str:
     """The conclusion of a `chi_squared_test`, or why there is none; `unit`: of weight, such as
     "1 mm"."""
     if found["low"] is None:

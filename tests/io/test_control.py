@@ -62,7 +62,7 @@ def test_control_replaces_that_of_any_input(tmp_path, form, frame):
     turn = TURN if frame == "another" else np.eye(3)
     for mine, given in zip(net.images.angles, ANGLES):
         assert_allclose(matrix(mine), matrix(given) @ turn.T, atol=1e-12)
-    said = " ".join(net.warnings)
+    said = " ".join((*net.warnings, *net.notes))
     assert ("in another frame" in said) == (frame == "another") and "a posteriori" not in said
     assert ("became tie points: '11'" in said) == (form is photomodeler)
     assert "held as fixed" not in said

@@ -211,8 +211,10 @@ def fill_project(network: Network, folder: Path) -> None:
         folder / "points.csv", POINT_COLUMNS, (points.id, points.role), points.position,
         POINT_SIGMAS, points.sigma, {np.inf: "free"},
     )  # fmt: skip
-    if rays.sigma_origin == UNIT and np.allclose(sigma, 1.0, rtol=UNIT_DIGITS, atol=0):
-        sigma = np.full_like(sigma, np.nan)  # Nobody gave them.
+    origin = rays.sigma_origin
+    if origin == UNIT and np.allclose(sigma, 1.0, rtol=UNIT_DIGITS, atol=0):
+        # Nobody gave them: where none are written, they are units of weight again.
+        sigma, origin = np.full_like(sigma, np.nan), STATED
     _write_table(
         folder / "observations.csv", OBSERVATION_COLUMNS,
         ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]), xy,
@@ -225,7 +227,7 @@ def fill_project(network: Network, folder: Path) -> None:
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
     for further in among(network):
         _write_further(folder, further, radians)
-    write_text(folder / FILE_NAME, _document_text(network))
+    write_text(folder / FILE_NAME, _document_text(network, origin))
 
 
 def _write_table(path, header, ids, values, sigma_header, sigma, words):
@@ -252,10 +254,10 @@ def _cells(numbers, words=MappingProxyType({})):
     return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
 
 
-def _document_text(network: Network) -> str:
+def _document_text(network: Network, origin: str) -> str:
     said = (*network.warnings, *network.notes)
     lines = [f"# {' '.join(line.split())}" for line in said]
-    of_sigma, origin = ("sigma_image", "sigma_origin"), network.observations.sigma_origin
+    of_sigma = "sigma_image", "sigma_origin"
     settings = {key: getattr(network, key) for key in SETTINGS if key not in of_sigma}
     if origin != STATED:
         settings["sigma_origin"] = origin

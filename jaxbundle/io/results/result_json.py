@@ -72,7 +72,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     if brief:
         return head
     return head | {
-        "verdict": _verdict(adjustment),
+        "verdict": verdict_dict(adjustment.verdict),
         "variance_components": _components(adjustment),
         "points": dict(_points(adjustment.points)),
         "residuals": list(_residuals(adjustment.residuals)),
@@ -94,7 +94,8 @@ def result_text(
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return
-    more = {"verdict": _verdict(adjustment), "variance_components": _components(adjustment)}
+    more = {"verdict": verdict_dict(adjustment.verdict)}
+    more |= {"variance_components": _components(adjustment)}
     yield _text({**more, **head})[:-1]
     yield ', "points": {'
     yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
@@ -123,8 +124,9 @@ def without_nan(value):
     return value
 
 
-def _verdict(adjustment) -> dict:
-    state, words, findings = adjustment.verdict
+def verdict_dict(verdict) -> dict:
+    """A verdict (`report.verdict`) as plain dicts."""
+    state, words, findings = verdict
     return {"state": state, "words": words, "findings": [
         {"about": f.about, "state": f.state, "words": f.words} for f in findings
     ]}  # fmt: skip

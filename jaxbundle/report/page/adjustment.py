@@ -19,7 +19,7 @@ from jaxbundle.report.page.overview import (
 from jaxbundle.report.page.scene import describe_frames, describe_network
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
-from jaxbundle.report.verdict import Finding
+from jaxbundle.report.verdict import Finding, Verdict, conclude
 
 A_POSTERIORI = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
@@ -42,6 +42,10 @@ class Addition(NamedTuple):
     overview: str = ""
     sections: tuple[Section, ...] = ()
     tables: Mapping[str, Listing] = NOTHING
+
+    def conclude(self, adjustment) -> Verdict:
+        """The verdict of the command on its adjustment."""
+        return conclude(adjustment, self.findings, self.without, len(self.warnings))
 
 
 ALONE = Addition()
@@ -95,8 +99,7 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
 
 def find(adjustment, also: Addition = ALONE) -> list[Finding]:
     """The findings of a solved adjustment, those of an addition first."""
-    own = (f for f in adjustment.verdict.findings if f.about not in also.without)
-    return [*also.findings, *own]
+    return list(also.conclude(adjustment).findings)
 
 
 def _whole(adjustment) -> list[str]:

@@ -24,7 +24,7 @@ from jaxbundle.report.verdict import (
     describe_reliability,
     judge_fit,
 )
-from jaxbundle.statistics.global_test import test_in_words
+from jaxbundle.statistics.global_test import describe_test
 
 KIND = "refinement of scanner images"
 MOST_CORRELATED = 40
@@ -89,7 +89,7 @@ def _judge(result, used, w) -> list[Finding]:
     )
     likely = f"{count(int((size > limit).sum()), 'blunder')} likely"
     findings = [
-        judge_fit(found, test_in_words(found, UNIT_OF_WEIGHT), result.sigma0,
+        judge_fit(found, describe_test(found, UNIT_OF_WEIGHT), result.sigma0,
                   bool(np.isfinite(result.prior_sigma).any()), result.redundancy),
         describe_reliability(np.concatenate([row["r"] for row in used]), "coordinate"),
         Finding("Blunders", DOUBTFUL if largest > limit else GOOD, blunders, likely),
