@@ -38,6 +38,8 @@ AGREEING = 4.0
 """Largest ratio of σ0 to the ratio of two units: a guessed σ is right to about this factor."""
 FINEST_PIXELS = 0.005
 """No image point is measured more precisely, in pixels."""
+SMALL_PITCH = 1e-3
+"""Pixels of 1 µm are the smallest of cameras, mm."""
 MILLIMETRE_RATIOS = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
@@ -55,8 +57,13 @@ def check_units(network: Network) -> Network:
         xy = network.observations.xy[of_camera == c]
         if len(xy):
             said.append(_check_field(camera, xy))
-    said += [_control_against_ties(network), _distances_against_control(network)]
-    return network.warn(*filter(None, said))
+    return network.warn(*filter(None, [*said, *name_lengths(network)]))
+
+
+def name_lengths(network: Network) -> list[str]:
+    """Lengths that seem to be in mm and in m in one network, in words."""
+    said = _control_against_ties(network), _distances_against_control(network)
+    return [line for line in said if line]
 
 
 def _check_field(camera: Camera, xy) -> str:
@@ -123,6 +130,8 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
         unit, sigma = "px", sigma / pitch
     if unit == "mm":
         meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
+        if sigma < FINEST_PIXELS * (pitch or SMALL_PITCH):
+            meant["m"] = 1e3
     else:
         meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < FINEST_PIXELS else {}
     near = {u: f for u, f in meant.items() if 1 / AGREEING < sigma0 / f < AGREEING}

@@ -436,9 +436,11 @@ def far_away(shift=0.0, scale=1.0):
     return make_network(**given)
 
 
-@pytest.mark.parametrize("shift, scale", [(0.0, 1e150), (1e17, 1.0), (1e13, 1e-4)])
+@pytest.mark.parametrize("shift, scale", [
+    (0.0, 1e150), (1e17, 1.0), (1e13, 1e-4), (1e20, 1.0), (0.0, 1e-150)
+])
 def test_coordinates_that_cannot_be_computed_with_are_refused(shift, scale):
-    with pytest.raises(InputError, match="within ±1e|subtract a common offset"):
+    with pytest.raises(InputError, match="within ±1e|subtract a common offset|in a smaller unit"):
         check_network(far_away(shift, scale))
 
 

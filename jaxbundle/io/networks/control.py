@@ -40,6 +40,9 @@ which it is none: of points in random order it is about 1."""
 LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
+MILLIMETRES = 1.01
+"""Scale of a similarity to a thousand, or a thousandth, from which start values and control are in
+mm and in m: a scale in an arbitrary unit is within 1 % of them by chance once in hundreds."""
 EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
 """A selection of check points, such as `every 3rd`."""
 
@@ -253,7 +256,14 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
             f"{list_some(worst, 3, str)}; check names and units of the table, or leave out the "
             "start values of the input"
         )
-    scale = np.cbrt(np.linalg.det(A))
+    scale = float(np.cbrt(np.linalg.det(A)))
+    if abs(abs(np.log(scale)) - np.log(1000)) < np.log(MILLIMETRES):
+        times = "a thousand times" if scale > 1 else "a thousandth"
+        network = network.warn(
+            f"the control of {source_name} is {times} "
+            "as large as the start values: is one of them in mm, the other in m? The result is in "
+            "the unit of the control"
+        )
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     return network.replace(
