@@ -52,16 +52,18 @@ def write_reconstruction(
     with write_result(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
-        told = f"{found}\n\n{describe_part(found, first)}"
+        verdict = f"{first.name}: {conclude_part(found, first).words}"
+        told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
         _write_part(found, first, new, plots, told, also, progress)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
             own = (f"warning: {said}" for said in found.warnings
                    if said.startswith(f"{part.name}:"))  # fmt: skip
-            note = "\n".join([*own, describe_part(found, part)])
-            own = {"verdict": verdict_dict(conclude_part(found, part))}
-            _write_part(found, part, folder, plots, note, own, progress)
+            verdict = conclude_part(found, part)
+            note = "\n".join([verdict.words, *own, describe_part(found, part)])
+            more = {"verdict": verdict_dict(verdict)}
+            _write_part(found, part, folder, plots, note, more, progress)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
