@@ -207,7 +207,7 @@ def test_exact_observations_have_no_components(simulation):
     """Residuals that are rounding keep their weights, and the result says so."""
     exact = adjust(simulation.truth, estimate_components=True)
     assert exact.converged and exact.sigma_factors == {}
-    assert any("image coordinates fit exactly" in warning for warning in exact.warnings)
+    assert any("image coordinates fit exactly" in warning for warning in exact.notes)
 
 
 def test_gauss_newton_finds_the_same_minimum(simulation, result):

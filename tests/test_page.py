@@ -24,7 +24,7 @@ from jaxbundle.report.page import InputFile, Origin, compose, compose_failure, f
 from jaxbundle.report.page.columns import Column, encode_table, encode_values
 from jaxbundle.report.page.document import SCRIPTS, STYLE
 from jaxbundle.report.page.tables import choose_largest
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, Finding, in_words, judge
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, NOTED, Finding, in_words, judge
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "convergent4" / "project.toml"
@@ -76,7 +76,7 @@ def test_the_same_result_gives_the_same_page(convergent4, monkeypatch):
 def test_words_and_numbers_are_those_of_the_protocol(convergent4, page):
     said = set(page.texts["td"])
     assert {str(convergent4.redundancy), "80", "64"} <= said
-    assert any(words.startswith("not meaningful: unit weights") for words in said)
+    assert any(words.startswith("no a priori σ was given: 1 mm") for words in said)
     assert set(convergent4.warnings) <= set(page.texts.get("li", []))
     assert hashlib.sha256(EXAMPLE.read_bytes()).hexdigest() in said
     assert jaxbundle.__version__ in said and np.__version__ in said
@@ -190,12 +190,15 @@ def test_a_fit_that_the_test_refuses_is_not_met(convergent4):
     scaled = dataclasses.replace(
         problem.data, image_weight=1.5 * np.asarray(problem.data.image_weight)
     )
-    changed = Adjustment(convergent4.network, problem.with_data(scaled), convergent4.minimum)
+    problem, network = problem.with_data(scaled), problem.network
+    rays = dataclasses.replace(network.observations, sigma_origin="stated")
+    problem = dataclasses.replace(problem, network=network.replace(observations=rays))
+    changed = Adjustment(convergent4.network, problem, convergent4.minimum)
     states = {}
     for vtpv in (11.0, 12.0, 38.0, 39.0):
         changed.__dict__["vtpv"] = vtpv
         states[vtpv] = next(f.state for f in judge(changed) if f.about == "χ² test")
-    assert states == {11.0: DOUBTFUL, 12.0: GOOD, 38.0: GOOD, 39.0: BAD}
+    assert states == {11.0: NOTED, 12.0: GOOD, 38.0: GOOD, 39.0: BAD}
 
 
 # --- files ----------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 from jaxbundle.report.page import Addition, Finding, Section, compose
 from jaxbundle.report.page.charts import draw_field, draw_histogram
-from jaxbundle.report.page.verdict import BAD
+from jaxbundle.report.verdict import BAD
 
 HOSTILE = "</script><b>"
 

@@ -37,7 +37,8 @@ def with_free(network, free, domain="corrected"):
 
 @pytest.fixture(scope="module")
 def network():
-    return jaxbundle.read_network(EXAMPLES / "convergent4" / "project.toml")
+    project = EXAMPLES / "convergent4" / "project.toml"
+    return jaxbundle.read_network(project, overrides=("sigma_image=1", "sigma_origin=unit"))
 
 
 @pytest.mark.parametrize("free, domain, redundancy, vtv, sigma0", SOLUTIONS)

@@ -176,3 +176,75 @@ def test_names_that_blanks_split_are_said(tmp_path):
     path.write_text("id X Y Z\nP1 10.0 20.0 3.0\nP 2 11.0 20.0 3.0\n")
     with pytest.raises(InputError, match="control.txt, line 3: .* is 'P 2' one name. .* by commas"):
         read_control(path)
+
+
+# --- control of a mirrored system -----------------------------------------------------------
+
+CONTROL = {"control": (0, 4, 20, 24), "control_sigma": 0.002, "datum": "control"}
+FREE = dataclasses.replace(MM, free=("c",))
+
+
+def with_control_at(given, change):
+    points, held = given.points, given.points.has_role("control")
+    position = points.position.copy()
+    position[held] = change(position[held])
+    return given.replace(points=dataclasses.replace(points, position=position))
+
+
+@pytest.mark.parametrize("start", [True, False])
+@pytest.mark.parametrize("change", [
+    lambda X: X * [1, -1, 1], lambda X: X[:, [1, 0, 2]]
+], ids=["Y in the other direction", "X and Y exchanged"])  # fmt: skip
+def test_control_of_a_left_handed_system_is_named(change, start):
+    """The nearly plane object has a mirror image that fits its control to 8 σ: no point is blamed
+    for it, and the right system has a σ0 of 1."""
+    given = network(FREE, **CONTROL)
+    mirrored = with_control_at(given, change)
+    result = jaxbundle.adjust(mirrored if start else without_start_values(mirrored))
+    (said,) = result.findings
+    assert said.startswith("the control points fit the mirror image of the network (σ0 1.0")
+    assert "X and Y of the control are exchanged" in said
+    assert said[:60] in " ".join(result.report()[:1500].split())
+    assert result.verdict.state == "not met"
+
+
+def test_flipped_images_without_start_values_are_named():
+    given = with_xy(network(FREE, **CONTROL), lambda xy: xy * [1, -1])
+    (said,) = jaxbundle.adjust(without_start_values(given)).findings
+    assert "y (or x) of the image coordinates is (expected are mm" in said
+
+
+def test_control_in_mm_beside_start_values_in_m_is_named_where_nothing_is_solved():
+    result = jaxbundle.adjust(with_control_at(network(FREE, **CONTROL), lambda X: 1000 * X))
+    assert "is one of them in mm, the other in m?" in " ".join(result.findings)
+
+
+def test_a_sigma_in_metres_for_mm_is_named():
+    given = network(MM)
+    sigma = np.full_like(given.observations.sigma, 2e-6)
+    given = given.replace(observations=dataclasses.replace(given.observations, sigma=sigma))
+    assert "2e-06 mm, looks like one in m" in name_sigma_unit(given, 900.0)
+    unknown = given.replace(observations=dataclasses.replace(
+        given.observations, sigma_origin="unit"
+    ))  # fmt: skip
+    assert name_sigma_unit(unknown, 900.0) == ""  # Nobody stated them.
+
+
+# --- numbers beyond what can be computed with -------------------------------------------------
+
+
+@pytest.mark.parametrize("change, said", [
+    (lambda x: np.where(np.arange(x.size).reshape(x.shape) == 2, 1e300, x), "got 1e+300"),
+    (lambda x: 1e150 * x, "expected X within"), (lambda x: x + 1e17, "subtract a common offset"),
+    (lambda x: x + 1e20, "subtract a common offset"),
+])  # fmt: skip
+def test_numbers_that_cannot_be_computed_with_end_in_one_line(command, tmp_path, change, said):
+    given = network(MM)
+    images = dataclasses.replace(given.images, position=change(given.images.position))
+    points = given.points
+    if said != "got 1e+300":
+        points = dataclasses.replace(points, position=change(points.position))
+    path = jaxbundle.write_project(given.replace(images=images, points=points), tmp_path / "given")
+    told = command("adjust", path, "--out", tmp_path / "out")
+    assert told.status == 2 and said in told.err and not (tmp_path / "out").exists()
+    assert len(told.err.strip().splitlines()) == 1

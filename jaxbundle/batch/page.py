@@ -23,7 +23,7 @@ from jaxbundle.report.page.charts import draw_histogram
 from jaxbundle.report.page.columns import Column, estimates
 from jaxbundle.report.page.document import NOTHING
 from jaxbundle.report.page.markup import figure, grid, paragraph
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD
 
 MOST_OUTLYING = 30
 """Number of cameras listed as outlying; the table has all."""

@@ -32,6 +32,7 @@ from jaxbundle.bundle.minimum import (
     start_with,
     weakness_without_solution,
 )
+from jaxbundle.bundle.mirrored import name_mirrored
 from jaxbundle.bundle.orient import orient, orient_again, screen
 from jaxbundle.bundle.readjust import (
     adjust_robustly,
@@ -52,7 +53,7 @@ from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.network.unit_mistakes import name_pixels, name_sigma_unit
+from jaxbundle.network.unit_mistakes import name_lengths, name_pixels, name_sigma_unit
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
@@ -153,7 +154,28 @@ def adjust(
             found.estimate_components(again)
         if eliminate:
             found.eliminate_parameters(again, critical_t)
-    return found.adjustment(check)
+    result = found.adjustment(check)
+    unexplained = all(CONTRADICTORY_CONTROL in line for line in result.findings)
+    if not also and unexplained and _is_misfit(found):
+        sigma0 = _sigma0(found.problem, found.minimum)
+        again = partial(_try_mirrored, reduction, options)
+        if mirrored := name_mirrored(given, sigma0, again):
+            result.findings = (mirrored,)
+    return result
+
+
+def _is_misfit(found: "_Found") -> bool:
+    return not found.inspection or _sigma0(found.problem, found.minimum) > MISFIT
+
+
+def _try_mirrored(reduction: str | None, options, network: Network) -> float | None:
+    """σ0 of a network from computed start values; None without a solution."""
+    options = {name: value for name, value in options.items() if name != "progress"}
+    problem, minimum, _ = _First(reduction, (), _place(orient(network)), options).find(
+        network, outliers=False
+    )
+    solved = inspect_solution(problem.with_factor(), minimum)
+    return _sigma0(problem, minimum) if solved else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,8 +210,8 @@ class _First:
         """Adjust again, with everything left out because of start values that agrees with the
         adjusted orientation, until nothing more does."""
         if self.oriented is not None:
-            said = (f"start values found, {self.oriented.frame}", self.oriented.finding)
-            given = given.warn(*filter(None, said))
+            given = given.note(f"start values found, {self.oriented.frame}")
+            given = given.warn(*filter(None, [self.oriented.finding]))
         rounds, final = 0, Undetermined()
         while inspect_solution(found[0].with_factor(), found[1]):
             problem, minimum, check, gone, current = found
@@ -207,7 +229,7 @@ class _First:
                             f"would still come back after {rounds} repeated adjustments"
                         )
                     network = problem.network.replace(
-                        warnings=whole.warnings, left_out=whole.left_out
+                        warnings=whole.warnings, notes=whole.notes, left_out=whole.left_out
                     )
                     return dataclasses.replace(problem, network=network), minimum, check
                 carried = partial(carry, before=problem, values=minimum.values)
@@ -384,11 +406,13 @@ def _likely_causes(
         causes = name_image_convention(network) if far else "", name_sigma_unit(network, sigma0)
         return tuple(filter(None, causes))
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
+    mirrored = name_image_convention(network)
     causes = (
-        name_pixels(network), name_angle_unit(network), name_image_convention(network),
+        name_pixels(network), name_angle_unit(network), *name_lengths(network), mirrored,
         name_image_extent(network),
         name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
-        "" if told else name_contradiction(network),
+        # Control fits no mirrored image: the points would be blamed for it.
+        "" if told or mirrored else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
     )  # fmt: skip

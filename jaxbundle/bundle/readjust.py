@@ -107,18 +107,18 @@ def with_components(problem: Problem, minimum, again):
     whole, of = Inspection(problem, minimum.values).solution, groups(problem)
     found, factors, unsettled = estimate(whole, of, repeat)
     components = variance_components(found, of, factors)
-    network = problem.network.warn(*_doubts(components, unsettled))
+    network = problem.network.note(*_unchanged(components))
+    if unsettled:
+        network = network.warn(
+            f"the variance components did not converge in {ROUNDS} rounds "
+            f"({', '.join(unsettled)}): their σ are not final"
+        )
     problem = dataclasses.replace(problem.with_system(found.problem), network=network)
     return problem, repeat.minimum, factors
 
 
-def _doubts(components: dict[str, Component], unsettled: list[str]):
-    """Warnings about an estimate of variance components."""
-    if unsettled:
-        yield (
-            f"the variance components did not converge in {ROUNDS} rounds "
-            f"({', '.join(unsettled)}): their σ are not final"
-        )
+def _unchanged(components: dict[str, Component]):
+    """Notes on groups whose variance component cannot be estimated."""
     for name, component in components.items():
         if not component.usable:
             why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"

@@ -43,7 +43,7 @@ from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, 
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import data_frame, list_some
 from jaxbundle.network.declare import LEAST_IMAGES
-from jaxbundle.network.tables import Network, Observations, Points, units_of
+from jaxbundle.network.tables import ESTIMATED, UNIT, Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
@@ -51,12 +51,15 @@ from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints, intersect_check_points
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.far_points import FarPoints, find_far_points
-from jaxbundle.statistics.global_test import chi_squared_test
+from jaxbundle.statistics.global_test import chi_squared_test, is_tested
 from jaxbundle.statistics.inspection import Inspection, OfNetwork
-from jaxbundle.statistics.misfit import doubt_of_fit
+from jaxbundle.statistics.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.statistics.validity import Reach, distortion_reach
 from jaxbundle.statistics.weakness import Weakness, weakness
 from jaxbundle.system.programs import compile_once
+
+SIMILARITY = 7
+"""Parameters of a similarity, which a datum fixes."""
 
 
 @print_anywhere
@@ -147,8 +150,8 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Excluded or suspicious data, in words; also poorly determined unknowns, distortions that
-        are not one-to-one, and a σ0 far from 1."""
+        """Suspicious data, in words; also poorly determined unknowns, distortions that
+        are not one-to-one, and a σ0 far above 1. See also `notes`."""
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
         lines = (
@@ -156,6 +159,19 @@ class Adjustment:
             *self.doubts,
         )  # fmt: skip
         return tuple(dict.fromkeys(lines))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is good to know and spoils nothing, in words: where start values come from, what was
+        left out, how uncertain the georeference is."""
+        return tuple(dict.fromkeys((*self.problem.network.notes, *self.weakness.notes)))
+
+    @functools.cached_property
+    def verdict(self) -> report.Verdict:
+        """Whether the result meets its tests: `state` ("met", "doubtful", "not met"), a sentence,
+        and the findings: subject, state, numbers in words."""
+        self._require_solved()
+        return report.conclude(self)
 
     @functools.cached_property
     def weakness(self) -> Weakness:
@@ -182,8 +198,13 @@ class Adjustment:
         global test that clearly fails."""
         if not self.converged:
             return self.given_doubts
+        if self.sigma_origin == UNIT and self.weights_matter:
+            unit = report.unit_of_weight(self)
+            doubt = doubt_of_unit(self.sigma0, self.redundancy, unit)
+            return self.given_doubts if doubt is None else (*self.given_doubts, doubt)
         doubt, downweighted = None, self.robust and self.sigma0 < 1
-        if not (self.sigma_factors or downweighted or report.unit_weights(self)):
+        tested = is_tested(self.redundancy, self.sigma_origin)
+        if tested and not downweighted and (self.sigma0 > 1 or self.weights_matter):
             in_pixels = bool(name_pixels(self.problem.network))
             doubt = doubt_of_fit(self.sigma0, self._scale, self.redundancy, in_pixels)
         return self.given_doubts if doubt is None else (*self.given_doubts, doubt)
@@ -236,13 +257,27 @@ class Adjustment:
         """Pope's τ = w/σ0 from Baarda's w; NaN if all observations fit exactly."""
         return w / (self.sigma0 or float("nan"))
 
-    def global_test(self, significance: float = 0.05) -> dict:
-        """χ² test of vᵀPv against a variance factor of 1 (two-sided).
+    @property
+    def sigma_origin(self) -> str:
+        """Where the a priori σ of image coordinates come from (`network.tables.SIGMA_ORIGINS`)."""
+        if self.sigma_factors:
+            return ESTIMATED
+        return self.problem.network.observations.sigma_origin
 
-        `passed` is None with estimated variance components, which make σ0 = 1.
+    @property
+    def weights_matter(self) -> bool:
+        """Whether the ratio of the σ of image coordinates to those of other observations has an
+        effect: there are more of these than the datum needs."""
+        return self.counts.pseudo_observations > SIMILARITY - self.counts.datum
+
+    def global_test(self, significance: float = 0.05) -> dict:
+        """χ² test of vᵀPv against a variance factor of 1 (two-sided): `vtpv`, the interval `low` to
+        `high`, `passed`, and `sigma_origin`.
+
+        `passed` is None if nothing is tested: nobody stated a priori σ, or they were estimated from
+        the residuals, or there is no redundancy.
         """
-        found = chi_squared_test(self.vtpv, self.redundancy, significance)
-        return found | {"passed": None} if self.sigma_factors else found
+        return chi_squared_test(self.vtpv, self.redundancy, self.sigma_origin, significance)
 
     # --- cofactors --------------------------------------------------------------------------
 

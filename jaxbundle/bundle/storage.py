@@ -80,7 +80,7 @@ CLASSES = (*NETWORK, Stored, State, Removed, Suspect, Name)
 def network_fingerprint(network: Network) -> str:
     """16 hex digits of a network's content: cameras, start values, measurements, settings; not of
     where it was read."""
-    network = with_named_models(network).replace(warnings=(), left_out=(), name="")
+    network = with_named_models(network).replace(warnings=(), notes=(), left_out=(), name="")
     return fingerprint(network, NETWORK, without=(Source,))
 
 

@@ -59,13 +59,18 @@ def advice(
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
             "model or the board does not fit (--model, --board-sigma)"
         )
-    weak = [name for name, value in t.items() if value < SMALLEST_T and name not in model.core]
-    if weak and not model.prior:
-        found.append(
-            f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "
-            f"{'it' if len(weak) == 1 else 'them'} (--free) the others are better determined"
-        )
     return found
+
+
+def suggest(t: dict[str, float], model: CameraModel) -> list[str]:
+    """Suggestions in words, for a calibration that may be good as it is."""
+    weak = [name for name, value in t.items() if value < SMALLEST_T and name not in model.core]
+    if not weak or model.prior:
+        return []
+    return [
+        f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "
+        f"{'it' if len(weak) == 1 else 'them'} (--free) the others are better determined"
+    ]
 
 
 def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:

@@ -37,13 +37,13 @@ from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import STATED, UNIT, Camera, Network
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Progress, present
 
 SIGMA = 0.1
-"""A priori σ of an image coordinate in pixels; σ0 of the result shows the actual one."""
+"""σ of an image coordinate in pixels where none is stated: a unit of weight, which σ0 estimates."""
 ECCENTRICITY_ROUNDS = 2
 
 
@@ -55,7 +55,7 @@ def calibrate(
     free: Sequence[str] | None = None,
     given: Mapping[str, float] | None = None,
     pixel_size: float | tuple[float, float] | None = None,
-    sigma_image: float = SIGMA,
+    sigma_image: float | None = None,
     board_sigma: float | None = None,
     board_free: bool = False,
     robust: str | None = None,
@@ -75,7 +75,7 @@ def calibrate(
     - `model`, `free`: camera model, by name or a `CameraModel`, and the parameters to estimate; the
       model's standard ones by default. `given`: values of parameters, held if they are not free.
     - `pixel_size`: mm, for models in mm.
-    - `sigma_image`: a priori σ of an image coordinate, pixels.
+    - `sigma_image`: a priori σ of an image coordinate, pixels; None: `SIGMA`, a unit of weight.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
       estimated. Default: the board is exact.
     - `robust`: "huber", "cauchy" or "tukey": points that fit badly are downweighted instead of
@@ -145,7 +145,7 @@ def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
 def board_network(
     start: Start,
     camera: Camera,
-    sigma_image: float,
+    sigma_image: float | None,
     *,
     board_sigma: float | None = None,
     board_free: bool = False,
@@ -156,7 +156,7 @@ def board_network(
     board = views.board
     view, point = np.nonzero(views.visible)
     xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
-    sx, sy = sigma_image * np.array(unit_size(model, camera.pixel_size))
+    sx, sy = (sigma_image or SIGMA) * np.array(unit_size(model, camera.pixel_size))
     role = "tie" if board_free else "fixed" if board_sigma is None else "control"
     X, Y, Z = board.points.T
     points = {"id": board.ids, "role": [role] * len(X), "X": X, "Y": Y, "Z": Z}
@@ -171,6 +171,7 @@ def board_network(
         points,
         {"image": names[view], "point": ids[point], "x": xy[:, 0], "y": xy[:, 1],
          "sx": np.full(len(xy), sx), "sy": np.full(len(xy), sy)},
+        sigma_origin=UNIT if sigma_image is None else STATED,
         datum="inner" if board_free else "control", residuals="measured",
         angle_unit="deg", image_unit=model.unit, object_unit=object_unit,
         name=f"Calibration of {camera.id}",
@@ -269,7 +270,8 @@ def _check_given(model: CameraModel, given) -> None:
 
 
 def _check(sigma_image, board_sigma, board_free) -> None:
-    positive("sigma_image", sigma_image)
+    if sigma_image is not None:
+        positive("sigma_image", sigma_image)
     if board_sigma is not None:
         positive("board_sigma", board_sigma)
     if board_free and board_sigma is not None:

@@ -4,12 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
-    coverage_in_words,
-    cross_validation_in_words,
     map_rows,
     model_rows,
     models_legend,
@@ -19,6 +16,8 @@ from jaxbundle.calibration.report import (
     rig_facts,
     rig_parameter_rows,
 )
+from jaxbundle.calibration.verdict import WITHOUT, coverage_in_words, cross_validation_in_words
+from jaxbundle.calibration.verdict import find as find_own
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import (
     UNKNOWN,
@@ -36,13 +35,12 @@ from jaxbundle.report.page import (
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_field
 from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
+from jaxbundle.report.page.overview import list_messages
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, in_words
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, in_words
 
 KIND = "calibration of cameras"
-BOARD = ("Control",)
-"""Findings of the adjustment page that do not apply to a board."""
 
 
 def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
@@ -74,27 +72,15 @@ def _describe_one(calibration, choice=None) -> Addition:
         _quality(calibration.coverage, calibration.reported_maps, _unit(calibration)),
         _validation(calibration), *_list_failed(views),
     ]  # fmt: skip
-    findings = (_coverage(calibration.coverage), *_halves(calibration))
+    overview += list_messages("Advice", calibration.suggestions)
     return Addition(
-        "", findings, BOARD, tuple(calibration.advice), overview, tuple(sections)
-    )
+        "", tuple(find_own(calibration)), WITHOUT, tuple(calibration.shortcomings), overview,
+        tuple(sections),
+    )  # fmt: skip
 
 
 def _unit(calibration) -> str:
     return clean(calibration.adjustment.network.object_unit)
-
-
-def _coverage(covered) -> Finding:
-    good = covered.part >= PART and covered.reach >= REACH
-    return Finding("Coverage", GOOD if good else DOUBTFUL, coverage_in_words(covered))
-
-
-def _halves(calibration) -> list[Finding]:
-    checked = calibration.cross_validation
-    if checked is None:
-        return []
-    state = DOUBTFUL if checked.test > LARGEST_TEST else GOOD
-    return [Finding("Cross-validation", state, " ".join(cross_validation_in_words(calibration)))]
 
 
 def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Section:

@@ -275,7 +275,7 @@ def at_result(network: Network, result, keep=None) -> Network:
         images=dataclasses.replace(
             network.images, position=exterior[:, :3], angles=exterior[:, 3:]),
         observations=network.observations.take(kept_rays(result) if keep is None else keep),
-        warnings=(),
+        warnings=(), notes=(),
     )  # fmt: skip
 
 

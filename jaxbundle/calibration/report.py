@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from jaxbundle.io.results.result_json import result_dict
+from jaxbundle.calibration.verdict import (
+    conclude_calibration,
+    coverage_in_words,
+    cross_validation_in_words,
+)
+from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
@@ -30,7 +35,8 @@ def text(calibration) -> str:
     if calibration.converged:
         lines += [*_camera(calibration), *_quality(calibration), *_advice(calibration)]
     body = "\n".join(line.rstrip() for line in lines)
-    return f"{body}\n\n{calibration.adjustment.report()}"
+    verdict = conclude_calibration(calibration) if calibration.converged else None
+    return f"{body}\n\n{calibration.adjustment.report(verdict=verdict)}"
 
 
 def _photographs(calibration):
@@ -111,35 +117,10 @@ def bias_in_words(bias) -> str:
     )
 
 
-def coverage_in_words(covered) -> str:
-    """The part of the image with measured points."""
-    return (
-        f"points in {100 * covered.part:.0f} % of the image's cells, out to "
-        f"{100 * covered.reach:.0f} % of the half diagonal"
-    )
-
-
 def map_rows(maps, unit: str) -> list[tuple[str, str, str]]:
     """The frame in which a point is fixed, its σ in the middle and in the corners, pixels
     (`MAPS_HEADER`)."""
     return [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3)) for m in maps]
-
-
-def cross_validation_in_words(calibration) -> list[str]:
-    """The cross-validation of the halves, in sentences."""
-    checked = calibration.cross_validation
-    if checked is None:
-        return ["too few photographs for two halves" if calibration.validated else "not made"]
-    largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
-    sentences = [
-        f"the camera of either half leaves an RMS of {checked.rms_other:.4f} px in the other half, "
-        f"where its own leaves {checked.rms_own:.4f} px. The two differ by "
-        f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
-        f"together {checked.test:.2f} (1 expected)."
-    ]
-    if checked.comparison is not None:
-        sentences.append(f"Their images, over the whole image: {checked.comparison}.")
-    return sentences
 
 
 def _held_in(m, unit: str) -> str:
@@ -171,7 +152,10 @@ def as_dict(calibration, brief: bool = False) -> dict:
     }  # fmt: skip
     if calibration.converged:
         about |= _quality_dict(calibration)
-    return {"calibration": about, **result_dict(adjustment, brief)}
+    found = {"calibration": about, **result_dict(adjustment, brief)}
+    if "verdict" in found:
+        found["verdict"] = verdict_dict(conclude_calibration(calibration))
+    return found
 
 
 def _quality_dict(calibration) -> dict:

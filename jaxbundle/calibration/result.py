@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxbundle import plotting
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration import quality
-from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.advice import advice, suggest
 from jaxbundle.calibration.bias import Bias, find_bias
 from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
@@ -126,13 +126,27 @@ class Calibration:
         its measured part."""
         return mapping_error(self.adjustment, self.name)
 
-    @functools.cached_property
+    @property
     def advice(self) -> list[str]:
         """Warnings in words, and advice on further photographs (without cross-validation)."""
-        t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
+        return [*self.shortcomings, *self.suggestions]
+
+    @property
+    def suggestions(self) -> list[str]:
+        """What would make a good calibration better."""
+        return suggest(self._significance, get_model(self.camera.model))
+
+    @property
+    def _significance(self) -> dict[str, float]:
+        """|value|/σ of the free parameters."""
+        return {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
+
+    @functools.cached_property
+    def shortcomings(self) -> list[str]:
+        """Warnings in words."""
         found = advice(
-            self.position, self.rotation, self.views.board.points.mean(0),
-            self._unit, self.coverage, self.rms, t, get_model(self.camera.model),
+            self.position, self.rotation, self.views.board.points.mean(0), self._unit,
+            self.coverage, self.rms, self._significance, get_model(self.camera.model),
             self.__dict__.get("cross_validation"),
         )  # fmt: skip
         missed = left_out(self.adjustment)

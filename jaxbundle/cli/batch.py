@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ import typer
 import jaxbundle
 from jaxbundle.choices import BOARDS
 from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
-from jaxbundle.errors import InputError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
 
 WITH_REASON = ("bad input", "not solved", "failed")
@@ -103,9 +104,10 @@ def batch(
     next to the file of results.
 
     Inputs with a line in the file are not computed again. Lines of other settings or data are
-    refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
-    status. Only one run at a time may write the file.
+    refused, or recomputed with --renew. Status 0 means that every input has a line and at least one
+    of them a result, 3 that none has. Only one run at a time may write the file.
     """
+    from jaxbundle.batch.camera import SOLVED
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
@@ -118,6 +120,7 @@ def batch(
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.text.csv_tables import read_csv, write_text
+    from jaxbundle.network.columns import count
 
     known = None
     if board:
@@ -140,7 +143,7 @@ def batch(
     if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
-    compute = partial(run_batch, part=_part(part))
+    compute, first = partial(run_batch, part=_part(part)), True
     if join or cluster:
         if part:
             raise InputError("--part with --join or --cluster: each process computes its part")
@@ -178,15 +181,21 @@ def batch(
             "--against": "" if against is None else str(against),
         })  # fmt: skip
         write_text(Path(html), compose_batch(found, origin, beside))
+    skipped = counts.pop("skipped", 0)
+    said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
+    total, solved = counts.total(), sum(counts[status] for status in SOLVED)
     if not quiet:
-        skipped = counts.pop("skipped", 0)
-        said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
         if os.path.isfile(json_lines) and any(counts[status] for status in WITH_REASON):
             reasons = [_reason(row) for row in result_rows(inputs, json_lines) if row.get("error")]
             print(*reasons[:MOST_REASONS], sep="\n")
             if len(reasons) > MOST_REASONS:
                 print(f'and {len(reasons) - MOST_REASONS} more: see "error" in {json_lines}')
+    if first and total and not solved:
+        raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")
+    if first and quiet and solved < total:
+        print(f"jaxbundle: {json_lines}: {total - solved} of {count(total, 'input')} without a "
+              f"result: {said}", file=sys.stderr)  # fmt: skip
 
 
 def _reason(row: dict) -> str:

@@ -54,8 +54,10 @@ def calibrate(
         bool, typer.Option("--board-free", help="estimate the points of the board")
     ] = False,
     sigma_image: Annotated[
-        float, typer.Option(help="a priori σ of an image coordinate, pixels")
-    ] = 0.1,
+        float | None,
+        typer.Option(help="a priori σ of an image coordinate, pixels; default: 0.1, a unit of "
+                     "weight that no test is about"),
+    ] = None,
     snooping: Annotated[
         str, choice((*TESTS, "none"), "removal of gross errors and of rig epochs")
     ] = "pope",
@@ -101,6 +103,7 @@ def calibrate(
     from jaxbundle.io.results.result_json import unsolved_text
     from jaxbundle.leastsquares.quality.snooping import check_test
     from jaxbundle.measure.views import photographs
+    from jaxbundle.network.columns import count
     from jaxbundle.photographs.opencv import need_opencv
     from jaxbundle.report.page import UNKNOWN, compose_failure, head_line
 
@@ -184,9 +187,11 @@ def calibrate(
     if failed:
         names = found.cameras[failed[0]].adjustment.undetermined
         what = f"; not determined: {', '.join(names[:12])}" if names else ""
+        more = f"; nor {count(len(failed) - 1, 'other camera')}: {', '.join(failed[1:])}"
         raise NotSolvedError(
             f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
             f"{what}; free fewer parameters (--free), or take photographs from more directions"
+            f"{more if len(failed) > 1 else ''}"
         )
 
 

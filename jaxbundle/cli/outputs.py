@@ -34,6 +34,7 @@ from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.budget import describe_budget
+from jaxbundle.report.verdict import Verdict
 from jaxbundle.system.clock import in_words, now
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Progress
@@ -246,14 +247,17 @@ def write_targets(
 def fill_results(
     result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING,
     budget: Budget | None = None, progress: Progress | None = None, date: str = "",
+    verdict: Verdict | None = None,
 ) -> None:  # fmt: skip
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
     `note`: text before the report; `also`: further JSON entries; `budget`: the error budget;
-    `date` of the computation, for the report."""
+    `date` of the computation, for the report; `verdict`: that of the command, if it has further
+    tests."""
     tell = progress or (lambda *_: None)
     tell("writing the report", 0, 2)
-    write_text(folder / REPORT, note + report.text(result, budget=budget, date=date))
+    told = report.text(result, budget=budget, date=date, verdict=verdict)
+    write_text(folder / REPORT, note + told)
     write_text(folder / RESULT, result_text(result, False, also))
     tell("writing the report", 1, 2)
     if result.converged:

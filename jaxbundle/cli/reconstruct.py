@@ -66,6 +66,7 @@ def reconstruct_command(
     from jaxbundle.measure.coded_targets import check_kind
     from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
     from jaxbundle.reconstruction.named import read_distances
+    from jaxbundle.reconstruction.page import conclude_part
     from jaxbundle.reconstruction.photographs import find_photographs
     from jaxbundle.reconstruction.reconstruct import reconstruct
     from jaxbundle.reconstruction.settings import Settings
@@ -103,6 +104,8 @@ def reconstruct_command(
     with staging(quiet or json == "-") as show:
         write_reconstruction(result, json, out, brief, plots, force, html, origin, show)
     if not quiet and json != "-":
+        for part in result.parts:
+            print(f"{part.name}: {conclude_part(result, part).words}")
         print(result)
         print(out)
     if surface:

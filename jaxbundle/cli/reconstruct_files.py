@@ -11,14 +11,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import FILES as COLMAP
 from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.results.ply import write_ply
-from jaxbundle.io.results.result_json import result_text
+from jaxbundle.io.results.result_json import result_text, verdict_dict
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.folders import read_marker, replace_folder
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
-from jaxbundle.reconstruction.page import compose_part, describe_part
+from jaxbundle.reconstruction.page import compose_part, conclude_part, describe_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
 from jaxbundle.types import Progress
@@ -45,21 +45,25 @@ def write_reconstruction(
 ) -> None:  # fmt: skip
     """Write JSON and page, and the folder with each part, its pairs and figures."""
     first, plots = found.parts[0], plots and can_plot()
-    also = {"reconstruction": _summary(found)}
+    also = {"reconstruction": _summary(found),
+            "verdict": verdict_dict(conclude_part(found, first))}  # fmt: skip
     text = result_text(first.adjustment, brief, also)
     page = partial(compose_part, found, first, origin)
     with write_result(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
-        told = f"{found}\n\n{describe_part(found, first)}"
+        verdict = f"{first.name}: {conclude_part(found, first).words}"
+        told = f"{verdict}\n{found}\n\n{describe_part(found, first)}"
         _write_part(found, first, new, plots, told, also, progress, origin.computed)
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
             own = (f"warning: {said}" for said in found.warnings
                    if said.startswith(f"{part.name}:"))  # fmt: skip
-            note = "\n".join([*own, describe_part(found, part)])
-            _write_part(found, part, folder, plots, note, {}, progress, origin.computed)
+            verdict = conclude_part(found, part)
+            note = "\n".join([verdict.words, *own, describe_part(found, part)])
+            more = {"verdict": verdict_dict(verdict)}
+            _write_part(found, part, folder, plots, note, more, progress, origin.computed)
             write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new, progress)
@@ -70,7 +74,8 @@ def _write_part(
     found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also,
     progress: Progress | None, date: str,
 ) -> None:  # fmt: skip
-    fill_results(part.adjustment, folder, plots, note, also, progress=progress, date=date)
+    fill_results(part.adjustment, folder, plots, note, also, progress=progress, date=date,
+                 verdict=conclude_part(found, part))  # fmt: skip
     _write_tables(part, folder)
     if plots:
         read = lambda name: _thumbnail(found.photographs[name])

@@ -42,13 +42,14 @@ MOST_SHOWN = 8
 @print_anywhere
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """The written output: kind and path, camera differences, what is not kept, warnings."""
+    """The written output: kind and path, camera differences, what is not kept, warnings, notes."""
 
     kind: str
     path: Path
     conversions: dict[str, Conversion]
     lost: tuple[str, ...]
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [f"{self.path}: {self.kind}"]
@@ -57,7 +58,8 @@ class Converted:
         if len(costs) > MOST_SHOWN:
             lines.append(f"and {len(costs) - MOST_SHOWN} more cameras, with smaller differences")
         lines += [f"not kept: {'; '.join(self.lost)}"] if self.lost else []
-        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+        lines += [f"warning: {warning}" for warning in self.warnings]
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
 def convert(
@@ -123,7 +125,9 @@ def convert(
             made = dataclasses.replace(made, conversions=costs)
         else:
             made = _convert_cameras(input, network.cameras, output, kind, model, camera)
-        return dataclasses.replace(made, lost=("images and points",), warnings=network.warnings)
+        return dataclasses.replace(
+            made, lost=("images and points",), warnings=network.warnings, notes=network.notes
+        )
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
     return _convert_network(network, output, kind, model, measured, force)
@@ -140,7 +144,7 @@ def _convert_network(
     else:
         with replace_folder(folder, "convert", files, force) as new:
             lost = TARGETS[kind].write(network, new)
-    return Converted(kind, output, costs, tuple(lost), network.warnings)
+    return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes)
 
 
 def _kind(output: Path, to: str | None) -> str:

@@ -362,7 +362,7 @@ def read_network(
     if given is not None:
         datum = any(one.partition("=")[0].strip() == "datum" for one in overrides)
         return with_control(network, given, datum=not datum)
-    return network.warn(*_of_adjusted_control(network)) if FORMATS[format].adjusted else network
+    return _with_adjusted_control(network) if FORMATS[format].adjusted else network
 
 
 def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
@@ -375,17 +375,19 @@ def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
     return tuple(models)
 
 
-def _of_adjusted_control(network: Network):
-    """Messages about already adjusted control points, and about held ones."""
+def _with_adjusted_control(network: Network) -> Network:
+    """The network with a warning about already adjusted control points, and a note about held
+    ones."""
     points = network.points
     held = [id for id, role in zip(points.id, points.role) if role == "fixed"]
     weighted = points.role.count("control")
     if held:
         points = count(len(held), "control point")
-        yield f"{points} without positive σ held as fixed: {list_some(held)}"
+        network = network.note(f"{points} without positive σ held as fixed: {list_some(held)}")
     if weighted:
-        yield (
+        network = network.warn(
             f"the file gives {count(weighted, 'control point')} with adjusted coordinates and a "
             "posteriori σ; adjusted again, control counts twice and σ0 is too small. Give the "
             "control as it was measured: --control FILE (id,X,Y,Z,sX,sY,sZ)"
         )
+    return network

@@ -16,6 +16,7 @@ Missing values (None, NaN, empty text) mean no start value or no σ. A σ of an 
 (the value is held), a σ of a control point "free" (this axis is not controlled).
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -29,6 +30,7 @@ from jaxbundle.network.columns import (
     NO_NUMBERS,
     Columns,
     as_columns,
+    count,
     did_you_mean,
     is_missing,
     show,
@@ -46,6 +48,9 @@ from jaxbundle.network.rules import (
 )
 from jaxbundle.network.tables import (
     EXTERIOR,
+    SIGMA_ORIGINS,
+    STATED,
+    UNIT,
     Camera,
     Distances,
     Images,
@@ -81,7 +86,8 @@ def make_network(
     datum: str = "control",
     datum_points: Sequence[Any] = (),
     residuals: str = "corrected",
-    sigma_image: float | None = 1.0,
+    sigma_image: float | None = None,
+    sigma_origin: str | None = None,
     angle_unit: str = "rad",
     image_unit: str = "mm",
     object_unit: str = "m",
@@ -98,7 +104,10 @@ def make_network(
     - `observations`: image coordinates and σ in `image_unit`; they are converted to the unit of the
       camera's model, which needs its image_size and pixel_size. A NaN or masked coordinate is an
       error (unlike in `calibrate_batch`, where it means a missing measurement).
-    - `sigma_image`: σ of image coordinates without their own (None: 1, with a warning).
+    - `sigma_image`: σ of image coordinates without their own; None: 1, a unit of weight.
+    - `sigma_origin`: where the σ of image coordinates come from (`SIGMA_ORIGINS`): "stated", which
+      the χ² test is about; "unit", of weight only; "estimated" from the residuals. None: stated,
+      unless some image coordinate has none.
     - `further`: tables of further kinds of observations, and the settings of their sections, by
       name: `antennas=table, antenna={"lever_arm": [0.1, 0, 0.3], "free": ["shift"]}`.
 
@@ -110,6 +119,8 @@ def make_network(
         check_choice(key, given[key], choices)
     if sigma_image is not None:
         check_sigma_image(sigma_image)
+    if sigma_origin is not None:
+        check_choice("sigma_origin", sigma_origin, SIGMA_ORIGINS)
     for key, value in (("object_unit", object_unit), ("name", name)):
         text(key, value)
     if isinstance(datum_points, str) or not isinstance(datum_points, Iterable):
@@ -119,8 +130,9 @@ def make_network(
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
     points = _make_points(as_columns(points, "points"))
     observations = as_columns(observations, "observations")
-    unweighted = _lacks_sigma(observations)
-    observations = _make_observations(observations, images, points, sigma_image or 1.0)
+    lacking = np.isnan(_matrix(observations, OBSERVATION_SIGMAS))
+    mixed = sigma_image is None and lacking.any() and not lacking.all()
+    observations = _make_observations(observations, images, points, sigma_image, sigma_origin)
     xy, sigma = from_image_unit(
         cameras, images.camera[observations.image], observations.xy, observations.sigma, image_unit
     )
@@ -128,9 +140,7 @@ def make_network(
         cameras=cameras,
         images=images,
         points=points,
-        observations=Observations(
-            observations.image, observations.point, xy, sigma, observations.source
-        ),
+        observations=dataclasses.replace(observations, xy=xy, sigma=sigma),
         distances=Distances.none() if distances is None else _make_distances(
             as_columns(distances, "distances"), points
         ),
@@ -142,9 +152,10 @@ def make_network(
     )
     for one in network.further:
         one.check(network)
-    if sigma_image is None and unweighted:
+    if mixed:
         network = network.warn(
-            f"sigma_image is not given: image coordinates without σ have σ = 1 {image_unit}"
+            f"{count(int(lacking.sum()), 'image coordinate')} of {lacking.size} without σ: theirs "
+            f"is 1 {image_unit}, beside those given; give sigma_image"
         )
     return network
 
@@ -327,12 +338,8 @@ def _make_points(table: Columns) -> Points:
     )
 
 
-def _lacks_sigma(table: Columns) -> bool:
-    return bool(np.isnan(_matrix(table, OBSERVATION_SIGMAS)).any())
-
-
 def _make_observations(
-    table: Columns, images: Images, points: Points, sigma_image: float
+    table: Columns, images: Images, points: Points, sigma_image: float | None, origin: str | None
 ) -> Observations:
     table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
     sigma = _matrix(table, OBSERVATION_SIGMAS)
@@ -340,8 +347,9 @@ def _make_observations(
         image=table.indices("image", "image", _index(images.id), images.source.name),
         point=table.indices("point", "point", _index(points.id), points.source.name),
         xy=_matrix(table, ("x", "y"), required=True),
-        sigma=np.where(np.isnan(sigma), sigma_image, sigma),
+        sigma=np.where(np.isnan(sigma), sigma_image or 1.0, sigma),
         source=table.source,
+        sigma_origin=origin or (UNIT if sigma_image is None and np.isnan(sigma).any() else STATED),
     )
 
 

@@ -35,6 +35,7 @@ from jaxbundle.network.single_strip import check_single_strip
 from jaxbundle.network.tables import (
     EXTERIOR,
     ROLES,
+    SIGMA_ORIGINS,
     Images,
     Network,
     Points,
@@ -49,7 +50,7 @@ def check_network(network: Network) -> Network:
     """The adjustable network, or an error that tells the user what to do.
 
     Control points without σ become fixed; unused cameras, points with too few rays, images with too
-    few points and distances between fixed points are removed, each with a warning on the network.
+    few points and distances between fixed points are removed, each with a note on the network.
     Check points are kept but not counted: remove them with `split_check_points`.
 
     **Raises:** `InputError`, one line with file, row, cause and remedy.
@@ -60,8 +61,9 @@ def check_network(network: Network) -> Network:
     check_redundancy(network)
     network = check_single_strip(network)
     network = warn_of_repetitions(network)
-    network = _warn_of_points_behind(network)
-    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
+    network = _note_points_behind(network)
+    once = lambda lines: tuple(dict.fromkeys(lines))
+    return network.replace(warnings=once(network.warnings), notes=once(network.notes))
 
 
 def check_tables(network: Network) -> Network:
@@ -70,6 +72,7 @@ def check_tables(network: Network) -> Network:
     require_network(network)
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
+    check_choice("sigma_origin", network.observations.sigma_origin, SIGMA_ORIGINS)
     _check_sizes(network)
     network = _check_cameras(check_coordinates(network))
     _check_images(network)
@@ -140,7 +143,7 @@ def _check_cameras(network: Network) -> Network:
         images.id, index.reshape(-1), images.position, images.angles, images.sigma, images.source
     )
     cameras = tuple(network.cameras[i] for i in used)
-    return network.replace(cameras=cameras, images=images).warn(
+    return network.replace(cameras=cameras, images=images).note(
         f"left out {count(len(unused), 'camera')} without images: {list_some(unused)}"
     )
 
@@ -207,12 +210,12 @@ def _check_points(network: Network) -> Network:
     unused = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
     network = network.replace(points=with_roles(with_roles(points, none, "fixed"), loose, "tie"))
     if unused.any():
-        network = network.warn(
+        network = network.note(
             f"σ of {count(unused.sum(), 'tie or fixed point')} not used (only control points "
             f"have one): {_names(points, unused)}"
         )
     if loose.any():
-        network = network.warn(
+        network = network.note(
             f"{count(loose.sum(), 'control point')} with all axes free taken as tie: "
             f"{_names(points, loose)}"
         )
@@ -276,7 +279,7 @@ def _check_distances(network: Network) -> Network:
         )
     idle = np.all(points.has_role("fixed")[distances.points], axis=1)
     if idle.any():
-        network = without_distances(network, idle).warn(
+        network = without_distances(network, idle).note(
             f"left out {count(idle.sum(), 'distance')} between fixed points: "
             f"{names[idle.argmax()]}{' …' if idle.sum() > 1 else ''}"
         )
@@ -297,7 +300,7 @@ def _check_datum_points(network: Network) -> Network:
                 "control points with σ)"
             )
     if network.datum_points and network.datum == "control":
-        return network.warn(
+        return network.note(
             "datum_points are not used: the datum is given by control; choose datum = \"inner\" or "
             "\"minimal\" for them"
         )
@@ -323,8 +326,8 @@ def _refuse_missing(table, values, names, thing):
     )  # fmt: skip
 
 
-def _warn_of_points_behind(network: Network) -> Network:
-    """A warning if a start value puts a point behind the camera that sees it (q ≥ 0); fisheyes may
+def _note_points_behind(network: Network) -> Network:
+    """A note if a start value puts a point behind the camera that sees it (q ≥ 0); fisheyes may
     see behind them."""
     images, rays = network.images, network.observations
     plain = [get_model(camera.model).image == "perspective" for camera in network.cameras]
@@ -336,7 +339,7 @@ def _warn_of_points_behind(network: Network) -> Network:
     if not len(behind):
         return network
     first = "; ".join(_sighting(network, row) for row in behind[:3])
-    return network.warn(
+    return network.note(
         f"the start values put {count(len(behind), 'image point')} behind the camera: {first}"
         f"{' …' if len(behind) > 3 else ''}; check the start values and the angle unit"
     )

@@ -17,7 +17,7 @@ from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.errors import InputError
 from jaxbundle.network.further import Edges
 from jaxbundle.network.rules import model_of
-from jaxbundle.network.tables import Camera, Network, Observations
+from jaxbundle.network.tables import Camera, Network
 
 SIZES = ("image_size", "pixel_size")
 COUNTERPARTS = (
@@ -57,7 +57,7 @@ def convert_cameras(
     units = {get_model(camera.model).unit for camera in cameras}
     converted = network.replace(
         cameras=tuple(cameras),
-        observations=Observations(rays.image, rays.point, xy, sigma, rays.source),
+        observations=dataclasses.replace(rays, xy=xy, sigma=sigma),
         image_unit=units.pop() if done and len(units) == 1 else network.image_unit,
     )
     kept = tuple(one for one in network.further if not isinstance(one, Edges))

@@ -9,7 +9,8 @@ LARGEST = 1e75
 """Normal equations and cofactors have products of four lengths; the largest number is 1.8e308."""
 FINEST, COARSEST = 1e-7, 1e-3
 """Steps between neighbouring numbers, relative to the extent of the network: σ of the best
-networks are 1e-6 to 1e-7 of it, so larger steps are noticed; at a thousandth the object is lost."""
+networks are 1e-6 to 1e-7 of it, so larger steps are noticed; at a thousandth the object is lost.
+Where nothing of the extent is left, a unit is taken for it."""
 
 
 def check_coordinates(network: Network) -> Network:
@@ -30,7 +31,13 @@ def check_coordinates(network: Network) -> Network:
     extent = np.ptp(position, 0).max() if len(position) else 0.0
     largest = np.abs(position).max(initial=0.0)
     step = np.spacing(largest)
-    if step <= FINEST * extent or extent == 0:
+    if 0 < extent < 1 / LARGEST:
+        raise InputError(
+            f"{network.points.source.name}: the network is {extent:.2g} {network.object_unit} "
+            f"wide: expected more than {1 / LARGEST:g}; give its coordinates in a smaller unit"
+        )
+    # Equal coordinates may be poor start values, or all that is left of others.
+    if step <= FINEST * extent or extent == 0 and step < COARSEST:
         return network
     what = (
         f"coordinates of {largest:.3g} are held in steps of {step:.2g} {network.object_unit}, and "

@@ -105,20 +105,21 @@ def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
     return number
 
 
-def leave_out(network: Network, thing: str, names: Iterable[str], why: str) -> Network:
-    """The network with a note, also among its warnings, that these were left out; see `LeftOut`."""
+def leave_out(
+    network: Network, thing: str, names: Iterable[str], why: str, measured: bool = True
+) -> Network:
+    """The network with a note that these were left out; see `LeftOut`."""
     names = tuple(names)
     if not names:
         return network
     text = f"left out {count(len(names), thing)} {why}: {list_some(names)}"
-    return network.replace(
-        warnings=(*network.warnings, text),
-        left_out=(*network.left_out, LeftOut(thing, names, why)),
+    return network.note(text).replace(
+        left_out=(*network.left_out, LeftOut(thing, names, why, measured))
     )
 
 
 def leave_out_undetermined(network: Network) -> Network:
-    """The network without points with too few rays and images with too few points, with warnings
+    """The network without points with too few rays and images with too few points, with notes
     that list them.
 
     **Raises:** `InputError` or `NotSolvedError` if that is half of the images or more."""
@@ -156,8 +157,8 @@ def leave_out_undetermined(network: Network) -> Network:
     names = [images.id[row] for row in np.flatnonzero(~used)]
     notes.append(("image", names, "with fewer than three points that other images determine"))
     left = keep_images(keep_points(network, keep), used)
-    for note in notes:
-        left = leave_out(left, *note)
+    for thing, those, why in notes:
+        left = leave_out(left, thing, those, why, measured=thing == "image")
     messages = []
     for one in network.further:
         gone = len(one) - len(one.among(left))
@@ -166,9 +167,9 @@ def leave_out_undetermined(network: Network) -> Network:
     lost = (~keep[distances.points].all(1)).sum()
     if lost:
         messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
-    left = left.warn(*messages)
+    left = left.note(*messages)
     if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
-        said = left.warnings[len(network.warnings) :]
+        said = left.notes[len(network.notes) :]
         raise InputError(
             f"datum_points: none is left ({'; '.join(said)}); name points with two rays"
         )

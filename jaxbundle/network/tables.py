@@ -29,6 +29,9 @@ ROLES = ("tie", "control", "fixed", "check")
 DATUMS = ("control", "inner", "minimal")
 RESIDUAL_DOMAINS = ("corrected", "measured")
 EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+STATED, UNIT, ESTIMATED = SIGMA_ORIGINS = ("stated", "unit", "estimated")
+"""Where the σ of image coordinates come from: somebody stated them; nobody did, so that they are
+units of weight; they were estimated from the residuals of the same measurements."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,13 +157,14 @@ class Points:
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
 class Observations:
-    """Measured image points: image, point, coordinates, σ."""
+    """Measured image points: image, point, coordinates, σ and their origin (`SIGMA_ORIGINS`)."""
 
     image: Int[np.ndarray, " rays"]
     point: Int[np.ndarray, " rays"]
     xy: Float[np.ndarray, "rays 2"]
     sigma: Float[np.ndarray, "rays 2"]
     source: Source = Source("observations")
+    sigma_origin: str = STATED
     __post_init__ = _fill_masked
 
     def __len__(self) -> int:
@@ -168,9 +172,9 @@ class Observations:
 
     def take(self, rows) -> "Observations":
         """The chosen rows (a mask or indices), with their source rows."""
-        return Observations(
-            self.image[rows], self.point[rows], self.xy[rows], self.sigma[rows],
-            self.source.take(rows),
+        return dataclasses.replace(
+            self, image=self.image[rows], point=self.point[rows], xy=self.xy[rows],
+            sigma=self.sigma[rows], source=self.source.take(rows),
         )
 
 
@@ -198,11 +202,12 @@ class Distances:
 class LeftOut:
     """What an adjustment leaves out for one reason: `thing` is "image", "tie point",
     "image point", …; `names` of image points are "POINT in IMAGE"; `why` completes
-    "… left out"."""
+    "… left out"; `measured`: whether they have observations enough, so that something is lost."""
 
     thing: str
     names: tuple[str, ...]
     why: str
+    measured: bool = True
 
 
 @print_in_one_screen
@@ -214,8 +219,8 @@ class Network:
     `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
     has datum defects). `residuals` names the domain in which v = computed − observed is formed.
     `further`: observations of further kinds (`network/further`), which name images and points by
-    id. `warnings` for the report, which also list what was left out; `left_out`: the same with all
-    names.
+    id. `warnings` and `notes` for the report: what may spoil a result, and what is only good to
+    know, such as what was left out; `left_out`: the latter with all names.
     """
 
     cameras: tuple[Camera, ...]
@@ -232,6 +237,7 @@ class Network:
     angle_unit: str = "rad"
     further: tuple[Any, ...] = ()
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
 
     def replace(self, **changes) -> "Network":
@@ -241,6 +247,10 @@ class Network:
     def warn(self, *messages: str) -> "Network":
         """A copy with further warnings."""
         return self.replace(warnings=(*self.warnings, *messages))
+
+    def note(self, *messages: str) -> "Network":
+        """A copy with further notes."""
+        return self.replace(notes=(*self.notes, *messages))
 
     def __str__(self) -> str:
         return (

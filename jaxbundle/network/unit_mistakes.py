@@ -12,7 +12,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.tables import Camera, Network, Points
+from jaxbundle.network.tables import STATED, Camera, Network, Points
 
 LARGEST_RADIUS = 10.0
 """Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
@@ -38,6 +38,8 @@ AGREEING = 4.0
 """Largest ratio of σ0 to the ratio of two units: a guessed σ is right to about this factor."""
 FINEST_PIXELS = 0.005
 """No image point is measured more precisely, in pixels."""
+SMALL_PITCH = 1e-3
+"""Pixels of 1 µm are the smallest of cameras, mm."""
 MILLIMETRE_RATIOS = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
@@ -55,8 +57,13 @@ def check_units(network: Network) -> Network:
         xy = network.observations.xy[of_camera == c]
         if len(xy):
             said.append(_check_field(camera, xy))
-    said += [_control_against_ties(network), _distances_against_control(network)]
-    return network.warn(*filter(None, said))
+    return network.warn(*filter(None, [*said, *name_lengths(network)]))
+
+
+def name_lengths(network: Network) -> list[str]:
+    """Lengths that seem to be in mm and in m in one network, in words."""
+    said = _control_against_ties(network), _distances_against_control(network)
+    return [line for line in said if line]
 
 
 def _check_field(camera: Camera, xy) -> str:
@@ -112,17 +119,19 @@ def name_degrees(points: Points) -> str:
 
 def name_sigma_unit(network: Network, sigma0: float) -> str:
     """The unit in which the a priori σ of image coordinates would agree with σ0, in words; empty if
-    σ0 is not far from 1, or no unit does."""
+    nobody stated them, σ0 is not far from 1, or no unit does."""
+    if network.observations.sigma_origin != STATED:
+        return ""
     if SIGMA0_RANGE[0] < sigma0 < SIGMA0_RANGE[1] or not sigma0 > 0:
         return ""
     camera, sigma = network.cameras[0], float(np.median(network.observations.sigma))
     unit, pitch = get_model(camera.model).unit, camera.pixel_size and abs(camera.pixel_size[0])
     if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
         unit, sigma = "px", sigma / pitch
-    if sigma == 1.0:  # Unit weights: nothing was meant.
-        return ""
     if unit == "mm":
         meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
+        if sigma < FINEST_PIXELS * (pitch or SMALL_PITCH):
+            meant["m"] = 1e3
     else:
         meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < FINEST_PIXELS else {}
     near = {u: f for u, f in meant.items() if 1 / AGREEING < sigma0 / f < AGREEING}

@@ -33,6 +33,7 @@ from jaxbundle.network_design.feasible import (
     try_stations,
 )
 from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs, make_pairs
+from jaxbundle.network_design.priors import use_prior_tables
 from jaxbundle.network_design.realise import problem_of, realise
 from jaxbundle.network_design.result import Design, State
 from jaxbundle.network_design.search import Step, configuration, make_program, satisfies, search
@@ -89,7 +90,7 @@ def design(
     if conditions is not None and not isinstance(conditions, Conditions):
         raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
-    network = split_check_points(require_network(network))[0]
+    network = use_prior_tables(split_check_points(require_network(network))[0])
     sigma = _sigma(network, sigma_image)
     integer("starts", starts)
     if order == "zero":

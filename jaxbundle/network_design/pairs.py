@@ -19,6 +19,7 @@ from jaxbundle.leastsquares.indexing.rows import Data as EngineData
 from jaxbundle.leastsquares.problem import fill_data
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_tables
+from jaxbundle.network.further import CameraParameters
 from jaxbundle.network.tables import Network, Observations, Source, require_network
 from jaxbundle.network_design.aims import (
     Aim,
@@ -194,9 +195,10 @@ def _refuse(network: Network) -> None:
             row = int(np.argmax(bad))
             raise InputError(f"{table.source(row)}: {table.id[row]!r} has no start values; a "
                              f"design starts from {words}")  # fmt: skip
-    if network.further:
+    others = [one for one in network.further if not isinstance(one, CameraParameters)]
+    if others:
         raise InputError(
-            f"{network.further[0].source.name}: a design uses image points, distances, control "
+            f"{others[0].source.name}: a design uses image points, distances, control "
             "points and priors; omit the other observations"
         )
     if len(network.points) < 3 or len(network.images) < 1:

@@ -12,7 +12,7 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matr
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
-from jaxbundle.network.tables import Network, Observations, Source
+from jaxbundle.network.tables import Network, Source
 from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs
 
 _angles = jax.jit(
@@ -41,9 +41,8 @@ def realise(
         noise = np.random.default_rng(seed).standard_normal(xy.shape)
         xy = np.where(pairs.soft[:, None], xy + rays.sigma * noise, rays.xy)
     rows = np.flatnonzero(measured)
-    observations = Observations(
-        rays.image[rows], rays.point[rows], xy[rows], rays.sigma[rows],
-        Source("simulated image points"),
+    observations = dataclasses.replace(
+        rays.take(rows), xy=xy[rows], source=Source("simulated image points")
     )
     moved = network.replace(
         images=images, points=points, observations=observations, residuals=residuals,

@@ -60,7 +60,7 @@ def name_image_convention(network: Network) -> str:
         return ""
     rows = rows[many.spread(len(rows), MOST_RAYS)]
     some = network.replace(observations=rays.take(rows))
-    centres, halves = (np.array(v) for v in zip(*(_frame(c) for c in network.cameras)))
+    centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]
     missed: dict[tuple[tuple[int, int, int, int], bool], float]
     missed = {(SAME, False): _misclosure(some, placed, known)}
@@ -92,7 +92,7 @@ def name_image_convention(network: Network) -> str:
     )
 
 
-def _frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+def image_frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The image centre, and half the size of the image, in the unit of the model; NaN: unknown."""
     size, pitch = camera.image_size, camera.pixel_size
     if get_model(camera.model).unit == "px":
@@ -120,7 +120,7 @@ def name_image_extent(network: Network) -> str:
     camera = network.images.camera[network.observations.image]
     for c, given in enumerate(network.cameras):
         xy = network.observations.xy[camera == c]
-        centre, half = _frame(given)
+        centre, half = image_frame(given)
         if not len(xy) or not np.isfinite(half).all():
             continue
         unit = get_model(given.model).unit

@@ -372,7 +372,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
         observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
     )
     network = keep_points(keep_images(network, keep), known)
-    network = network.warn(f"start values found, {frame}")
+    network = network.note(f"start values found, {frame}")
     for thing, found in zip(("image", "point"), reasons):
         network = note_missing(network, thing, found, "for which no start values were found")
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
@@ -390,7 +390,7 @@ def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what:
     names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
     groups = {why: tuple(id for id, one in reasons.items() if one == why)
               for why in dict.fromkeys(reasons.values())}  # fmt: skip
-    network = network.warn(f"left out {count(len(reasons), thing)} {what}: {names}")
+    network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
     notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
     return network.replace(left_out=(*network.left_out, *notes))
 

@@ -31,6 +31,8 @@ from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice
 from jaxbundle.network.tables import (
+    STATED,
+    UNIT,
     Camera,
     Distances,
     Images,
@@ -177,7 +179,8 @@ def simulate_with_truth(
     points = _points(targets, role, used, control_sigma)
     ends = _ends(distances, len(targets), used, row)
     observations = Observations(
-        image, row[point], xy, _sigma_of_images(sigma_xy, xy), Source("image points")
+        image, row[point], xy, _sigma_of_images(sigma_xy, xy), Source("image points"),
+        STATED if np.all(sigma_xy) else UNIT,
     )
     truth = Network(
         cameras=cameras, images=_images(stations, of_station), points=points,

@@ -18,7 +18,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.further import Ties
 from jaxbundle.network.sightings import keep_images, keep_points
-from jaxbundle.network.tables import Images, Network, Observations, Points
+from jaxbundle.network.tables import Images, Network, Points
 from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
 
 CRITICAL = 3.29
@@ -125,7 +125,7 @@ def _at_solution(result: Adjustment) -> Network:
     images = Images(images.id, images.camera, start[:, :3], start[:, 3:], images.sigma,
                     images.source)  # fmt: skip
     points = Points(points.id, points.role, position, points.sigma, points.source)
-    rays = Observations(rays.image, rays.point, rays.xy, rays.sigma, rays.source).take(used)
+    rays = rays.take(used)
     found = network.replace(cameras=cameras, images=images, points=points, observations=rays)
     return keep_points(found, np.all(np.isfinite(position), axis=1))
 

@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.further import Antennas, ExteriorPriors
 from jaxbundle.network.sightings import keep_points
-from jaxbundle.network.tables import Distances, Network, Observations, Points
+from jaxbundle.network.tables import Distances, Network, Points, Source
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import similarity_of_most
@@ -568,10 +568,11 @@ class _Block:
                 np.concatenate([self.X[moved], added.position]),
                 np.concatenate([network.points.sigma, added.sigma]),
             ),
-            observations=Observations(
-                np.concatenate([rays.image, added.image]),
-                np.concatenate([at[rays.point], added.point]),
-                np.concatenate([rays.xy, xy]), np.concatenate([rays.sigma, sigma]),
+            observations=dataclasses.replace(
+                rays, image=np.concatenate([rays.image, added.image]),
+                point=np.concatenate([at[rays.point], added.point]),
+                xy=np.concatenate([rays.xy, xy]), sigma=np.concatenate([rays.sigma, sigma]),
+                source=Source("observations"),
             ),
             further=(*(one for one in network.further if not isinstance(one, ExteriorPriors)),
                      *self._positions(choice)),
@@ -581,6 +582,7 @@ class _Block:
                 distances.value[here], distances.sigma[here], distances.source.take(here),
             ),
             datum="control", datum_points=(), object_unit="m", warnings=whole.warnings,
+            notes=whole.notes,
         )  # fmt: skip
 
     def _measured_points(self, control: Points, choice: Choice, first: int) -> _Added:

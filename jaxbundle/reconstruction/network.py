@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle.network.build import make_further, make_network
 from jaxbundle.network.further import CameraParameters
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import ESTIMATED, Network
 from jaxbundle.photographs.exif import StatedDistance
 from jaxbundle.reconstruction.attitudes import Attitudes
 from jaxbundle.reconstruction.named import Named
@@ -76,7 +76,7 @@ def tie_network(
         {"image": names[np.concatenate([measured.image, named.image])],
          "point": [*map(track_name, measured.track.tolist()), *named.name],
          "x": xy[:, 0], "y": xy[:, 1], "sx": sigma[:, 0], "sy": sigma[:, 1]},
-        distances or None, image_unit="px", name=name,
+        distances or None, image_unit="px", name=name, sigma_origin=ESTIMATED,
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )  # fmt: skip

@@ -22,7 +22,7 @@ from jaxbundle.report.page import (
 )
 from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
-from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Verdict, conclude
 
 WITHOUT = ("χ² test",)
 """Findings of an adjustment that do not apply: σ are estimated from the residuals."""
@@ -33,6 +33,21 @@ CONTROL = ("Control", "Check points")
 def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
     """The page of a part of a `Reconstruction`: HTML, in pieces."""
     return compose(part.adjustment, origin, also=_describe(found, part))
+
+
+def conclude_part(found, part) -> Verdict:
+    """The verdict on a part, with the use of the photographs."""
+    return conclude(part.adjustment, *_findings(found, part), len(found.warnings))
+
+
+def _findings(found, part) -> tuple[list[Finding], tuple[str, ...]]:
+    """The findings of a part, and those of its adjustment that they replace."""
+    fit = [_fit(part)] if part.factors else []
+    controlled = part.control is not None or part.no_control
+    return (
+        [*fit, _photographs(found, part), *_judge_control(part)],
+        (*WITHOUT, *CONTROL) if controlled else WITHOUT,
+    )
 
 
 def describe_part(found, part) -> str:
@@ -62,12 +77,11 @@ def _describe(found, part) -> Addition:
     overview += f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
     if found.notes:
         overview += items(found.notes)
-    findings = (*([_fit(part)] if part.factors else []), _photographs(found, part))
+    findings, without = _findings(found, part)
     return Addition(
-        "reconstruction", (*findings, *_judge_control(part)), overview=overview,
-        warnings=found.warnings, sections=tuple(sections), tables={"pairs": _pairs(found)},
-        name=_name(found, part),
-        without=(*WITHOUT, *CONTROL) if part.control is not None or part.no_control else WITHOUT,
+        "reconstruction", tuple(findings), overview=overview, warnings=found.warnings,
+        sections=tuple(sections), tables={"pairs": _pairs(found)}, name=_name(found, part),
+        without=without,
     )  # fmt: skip
 
 
@@ -84,7 +98,8 @@ def _fit(part) -> Finding:
     worst = part.misfit
     state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
     return Finding("Fit", state, f"residuals relative to their σ from matching: {words}; these "
-                   "factors are in all σ of the result")  # fmt: skip
+                   "factors are in all σ of the result",
+                   f"residuals {significant(worst)} times their σ from matching")  # fmt: skip
 
 
 def _photographs(found, part) -> Finding:
@@ -95,7 +110,8 @@ def _photographs(found, part) -> Finding:
     if found.left_out:
         words += f", {len(found.left_out)} left out"
     whole = len(found.parts) == 1 and not found.left_out
-    return Finding("Photographs", GOOD if whole else DOUBTFUL, words)
+    brief = f"{total - used} of {count(total, 'photograph')} not in this result"
+    return Finding("Photographs", GOOD if whole else DOUBTFUL, words, brief)
 
 
 def _judge_control(part) -> list[Finding]:
@@ -117,7 +133,11 @@ def _judge_control(part) -> list[Finding]:
     if wrong:
         words += f"; {count(wrong, 'point')} with a wrong measurement"
     held = any(p.verdict.startswith("held exactly") for p in used)
-    found = [Finding("Control", DOUBTFUL if left or wrong or held else GOOD, words)]
+    said = [f"{len(left)} of {count(len(given), 'control point')} left out"] if left else []
+    said += [f"{count(wrong, 'control point')} with a wrong measurement"] if wrong else []
+    said += ["control held exactly"] if held else []
+    state = DOUBTFUL if said else GOOD
+    found = [Finding("Control", state, words, ", ".join(said))]
     if checks:
         known = [p for p in checks if np.isfinite(p.residual).any()]
         words = (f"{len(known)} of {count(len(checks), 'check point')} compared, RMS "

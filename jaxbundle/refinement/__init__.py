@@ -5,6 +5,7 @@ from jaxbundle.refinement.adjusted_tables import point_rows as point_rows
 from jaxbundle.refinement.freedom import FREE as FREE
 from jaxbundle.refinement.freedom import HELD as HELD
 from jaxbundle.refinement.freedom import Freedom as Freedom
+from jaxbundle.refinement.refining import UNIT_OF_WEIGHT as UNIT_OF_WEIGHT
 from jaxbundle.refinement.refining import Refinement as Refinement
 from jaxbundle.refinement.refining import refine as refine
 from jaxbundle.refinement.report import report as report

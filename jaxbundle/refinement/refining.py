@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
-from jaxbundle.network.tables import Network, Observations
+from jaxbundle.network.tables import STATED, Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import CheckPoints, intersect
@@ -25,8 +25,11 @@ from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
 from jaxbundle.statistics.correlation import correlation_matrix
+from jaxbundle.statistics.global_test import chi_squared_test
 
 TESTS = ("none", "baarda", "pope")
+UNIT_OF_WEIGHT = "1 line or pixel"
+"""The σ of an image point where none is stated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +84,14 @@ class Refinement:
     def redundancy(self) -> int:
         """Observations and priors minus unknowns."""
         return self.inspection.redundancy
+
+    def global_test(self) -> dict:
+        """χ² test of vᵀPv (`statistics.global_test`); `passed` is None where nobody stated σ of
+        line and pixel, or of the image coordinates of photographs."""
+        given, r = self.inspection.declared.given, self.redundancy
+        sets = [given.observations, *([] if given.frames is None else [given.frames.observations])]
+        origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
+        return chi_squared_test(r * self.sigma0**2, r, origin)
 
     @property
     def estimate(self) -> Float[np.ndarray, " m"]:

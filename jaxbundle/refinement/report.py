@@ -3,7 +3,8 @@
 import numpy as np
 
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
-from jaxbundle.refinement.refining import Refinement
+from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement
+from jaxbundle.statistics.global_test import describe_test
 
 LISTED_CORRELATION = 0.9
 """Correlations above this are listed."""
@@ -19,6 +20,7 @@ def to_json(result: Refinement) -> dict:
     sigma = found.sigma
     document = {
         "sigma0": result.sigma0, "redundancy": result.redundancy, "steps": found.steps,
+        "global_test": result.global_test(),
         "warnings": list(result.warnings),
         "unknowns": [
             {"of": n.owner, "name": n.parameter, "unit": n.unit, "change": value,
@@ -73,6 +75,7 @@ def report(result: Refinement) -> str:
         f"points           {counts}; {len(used)} image points",
         f"sigma0           {result.sigma0:.4f}   redundancy {result.redundancy}, "
         f"{found.steps} steps",
+        f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
     ]
     for one in [*(image.id for image in result.images), *_photographs(result)]:
         v = np.array([row["v"] for row in used if row["image"] == one])

@@ -10,10 +10,12 @@ report with reason and remedy, without numbers of a solution.
 
 from jaxbundle.report import head, observations, unknowns
 from jaxbundle.report.budget import budget_lines
-from jaxbundle.report.head import unit_weights as unit_weights
+from jaxbundle.report.head import unit_of_weight as unit_of_weight
 from jaxbundle.report.summary import html as html
 from jaxbundle.report.summary import one_line as one_line
 from jaxbundle.report.summary import short as short
+from jaxbundle.report.verdict import Verdict as Verdict
+from jaxbundle.report.verdict import conclude as conclude
 
 
 def text(
@@ -25,6 +27,7 @@ def text(
     max_rows: int = 200,
     accuracy_unit: float | None = None,
     budget=None,
+    verdict: Verdict | None = None,
 ) -> str:
     """The full report of an adjustment.
 
@@ -38,18 +41,20 @@ def text(
     - `accuracy_unit`: points are counted by σ in classes of 0.1, 0.5, 1, 2 and 4 times this length
       (object unit); None: times the median of all σ of the points.
     - `budget`: the error budget of the adjustment (`jaxbundle.sensitivity`), a section at the end.
+    - `verdict`: that of a command which has further tests, instead of the adjustment's.
 
     **Returns:** text that ends with a line feed.
     """
     if test not in observations.TESTS:
         raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
-    lines = [*head.title(adjustment, date), *head.settings(adjustment), *head.counts(adjustment)]
+    lines = head.title(adjustment, date)
+    lines += [*head.settings(adjustment, verdict), *head.counts(adjustment)]
     if not adjustment.converged:
-        lines += [*head.why_not_solved(adjustment), *head.warnings(adjustment)]
+        lines += [*head.why_not_solved(adjustment), *head.messages(adjustment)]
         return _join(lines)
     lines += head.convergence(adjustment)
     lines += head.variance_factor(adjustment)
-    lines += head.warnings(adjustment)
+    lines += head.messages(adjustment)
     lines += unknowns.cameras(adjustment)
     lines += unknowns.images(adjustment, max_rows)
     lines += unknowns.points(adjustment, max_rows, accuracy_unit)

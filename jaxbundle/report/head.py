@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
-from jaxbundle.network.tables import ROLES
+from jaxbundle.network.tables import ESTIMATED, ROLES, STATED, UNIT
 from jaxbundle.report.layout import (
     WIDTH,
     clean,
@@ -21,6 +21,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.statistics.global_test import describe_test
 from jaxbundle.statistics.weakness import ADVICE_FOR
 
 METHODS = {
@@ -32,6 +33,10 @@ REDUCTIONS = {
     "banded": "Cholesky factor of blocks along a band",
     "iterative": "conjugate gradients",
 }
+KINDS = {
+    STATED: "σ a priori", UNIT: "unit of weight", ESTIMATED: "σ estimated",
+}  # fmt: skip
+"""How the σ of image coordinates are called by their origin."""
 DOMAINS = {
     "corrected": "corrected: the measurement freed of distortion against the ideal image",
     "measured": "measured: the distorted image of the point against the raw measurement",
@@ -56,16 +61,20 @@ def title(adjustment, date: str | None) -> list[str]:
     return [first, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
 
 
-def settings(adjustment) -> list[str]:
+def settings(adjustment, verdict=None) -> list[str]:
     """What to know first; method, datum, domain of the residuals, units."""
-    return ["", *facts([*first_facts(adjustment), *setting_facts(adjustment)])]
+    return ["", *facts([*first_facts(adjustment, verdict), *setting_facts(adjustment)])]
 
 
-def first_facts(adjustment) -> list[tuple[str, str]]:
-    """Likely causes of a bad fit, and how much was left out."""
-    rows = [("Attention", clean(text)) for text in adjustment.findings]
+def first_facts(adjustment, verdict=None) -> list[tuple[str, str]]:
+    """The verdict with its reasons, likely causes of a bad fit, and how much was left out."""
+    rows = []
+    if adjustment.converged:
+        _, words, findings = verdict or adjustment.verdict
+        rows = [("Verdict", words), *((f.about, f.words) for f in findings if f.lowers)]
+    rows += [("Attention", clean(text)) for text in adjustment.findings]
     if words := left_out_in_words(adjustment):
-        rows.append(("Left out", f"{words}: see Warnings, and left_out in the JSON"))
+        rows.append(("Left out", f"{words}: see Notes, and left_out in the JSON"))
     return rows
 
 
@@ -117,15 +126,7 @@ def datum(adjustment) -> str:
         ]
         parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
-    open_ones = "defect 7: the observations leave open position, orientation and scale"
-    if defect < 7:
-        known = network.points.has_role("control", "fixed")
-        about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-        gauge = np.asarray(system.plan.datum.gauge)
-        words = open_directions_in_words(gauge, about / max(known.sum(), 1))
-        if defect == 6 and "scale" not in words:
-            words = "position and orientation"
-        open_ones = f"defect {defect}: the observations leave open {words}"
+    open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
     weight = np.asarray(system.plan.datum.weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
@@ -140,6 +141,18 @@ def datum(adjustment) -> str:
         f"{network.datum}; {open_ones}; {how}. Coordinates, exterior orientation and their σ "
         "refer to this datum; residuals, σ0 and cameras do not depend on it."
     )
+
+
+def open_datum(adjustment) -> str:
+    """What the observations leave open of position, orientation and scale; empty: nothing."""
+    network, defect = adjustment.problem.network, adjustment.counts.datum
+    if defect in (0, 7):
+        return "position, orientation and scale" if defect else ""
+    known = network.points.has_role("control", "fixed")
+    about = (network.points.position[known] - adjustment.problem.origin).sum(0)
+    gauge = np.asarray(adjustment.problem.system.plan.datum.gauge)
+    words = open_directions_in_words(gauge, about / max(known.sum(), 1))
+    return "position and orientation" if defect == 6 and "scale" not in words else words
 
 
 def counts(adjustment) -> list[str]:
@@ -235,12 +248,6 @@ def image_sigmas(adjustment) -> np.ndarray:
     return np.unique(np.round(1 / weight[weight > 0], 12))
 
 
-def unit_weights(adjustment) -> bool:
-    """Whether every image coordinate has σ 1 mm, which says nothing about its precision."""
-    sigma = image_sigmas(adjustment)
-    return len(sigma) == 1 and sigma[0] == 1.0 and adjustment.image_unit == "mm"
-
-
 def image_precision(adjustment) -> str:
     """σ0 times the a priori σ of image coordinates, in their unit, in µm and in pixels."""
     sigma, unit = image_sigmas(adjustment), adjustment.image_unit
@@ -254,8 +261,13 @@ def image_precision(adjustment) -> str:
         if len(pitch) == 1 and None not in pitch:
             size = abs(next(iter(pitch))[0])
             parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
-    kind = "estimated" if adjustment.sigma_factors else "a priori"
-    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends, 4)} {unit})"
+    return f"{' = '.join(parts)}  (σ0 × {KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit})"
+
+
+def unit_of_weight(adjustment) -> str:
+    """The σ of image coordinates with their unit, as a unit of weight."""
+    ends = dict.fromkeys(f"{sigma:.4g}" for sigma in image_sigmas(adjustment)[[0, -1]])
+    return f"{' to '.join(ends)} {adjustment.image_unit}"
 
 
 def span(values, digits: int = 5) -> str:
@@ -265,33 +277,10 @@ def span(values, digits: int = 5) -> str:
 
 def chi_squared(adjustment, level: float = 0.05) -> str:
     """The global test in words."""
-    if adjustment.redundancy < 1:
-        return "no redundancy: σ0 and standard deviations cannot be estimated"
-    if adjustment.sigma_factors:
-        return "not done: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
-    if unit_weights(adjustment):
-        return f"not meaningful: unit weights (a priori σ 1 mm);  {_interval(found, level)}"
-    return test_in_words(found, level) + (
-        ", see Warnings" if adjustment.doubts and found["vtpv"] > found["high"] else ""
-    )
-
-
-def test_in_words(found, level: float = 0.05) -> str:
-    """The conclusion of a χ² test of vᵀPv (`statistics.global_test`)."""
-    said = f"{'' if found['passed'] else 'not '}passed: {_interval(found, level)}; "
-    if found["passed"]:
-        return f"{said}the a priori σ are confirmed"
-    if found["vtpv"] < found["low"]:
-        return f"{said}the observations are better than their a priori σ"
-    return f"{said}the a priori σ are too small, blunders are left, or the cameras lack parameters"
-
-
-def _interval(found, level: float) -> str:
-    return (
-        f"vᵀPv {significant(found['vtpv'], 5)}, {100 * (1 - level):g} % interval "
-        f"{significant(found['low'], 5)} to {significant(found['high'], 5)}"
-    )
+    failed = found["passed"] is False and found["vtpv"] > found["high"]
+    words = describe_test(found, unit_of_weight(adjustment), level)
+    return f"{words}, see Warnings" if failed and adjustment.doubts else words
 
 
 def variance_factor(adjustment) -> list[str]:
@@ -319,10 +308,13 @@ def variance_facts(adjustment) -> list[tuple[str, str]]:
     ]
 
 
-def warnings(adjustment) -> list[str]:
-    """Excluded or suspicious data."""
-    lines = [line for text in adjustment.warnings for line in paragraph(f"- {clean(text)}", 0, 2)]
-    return [*heading("Warnings"), *cut_lines(lines, 60, "…")] if lines else []
+def messages(adjustment) -> list[str]:
+    """Warnings: suspicious data; and notes, such as of what was left out."""
+    found = []
+    for title, texts in (("Warnings", adjustment.warnings), ("Notes", adjustment.notes)):
+        lines = [line for text in texts for line in paragraph(f"- {clean(text)}", 0, 2)]
+        found += [*heading(title), *cut_lines(lines, 60, "…")] if lines else []
+    return found
 
 
 def why_not_solved(adjustment) -> list[str]:

@@ -56,6 +56,8 @@ def summary(adjustment) -> list[tuple[str, str]]:
     ]
     if words := left_out_in_words(adjustment):
         rows.insert(1, ("Left out", words))
+    if adjustment.converged:
+        rows.insert(1, ("Verdict", adjustment.verdict.words))
     if not adjustment.converged:
         if adjustment.undetermined:
             rows.append(("Not determined", list_some(adjustment.undetermined, 8, clean)))

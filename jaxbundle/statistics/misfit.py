@@ -95,6 +95,18 @@ def doubt_of_fit(
     return f"{told}; likely causes, the likeliest first: {', '.join(causes)}"
 
 
+def doubt_of_unit(sigma0: float, redundancy: int, unit: str) -> str | None:
+    """A message that a `unit` of weight, which nobody stated, does not suit the σ of observations
+    of other kinds, and the remedy."""
+    if not (redundancy > 0 and contradicts(sigma0, redundancy)):
+        return None
+    return (
+        f"no a priori σ of image coordinates was given: {unit} was assumed beside the σ of other "
+        f"observations, but σ0 is {sigma0:.3g}, so that these have a wrong weight: give "
+        "sigma_image, or estimate it (--components)"
+    )
+
+
 def _remedy(scale: float) -> str:
     return (
         f"Multiply the a priori σ (sigma_image, or those of the observations) by {scale:.3g}, or "

@@ -8,10 +8,14 @@ coefficient only means that it is not needed.
 
 import dataclasses
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.datum.by_table import directions_of_motions
 from jaxbundle.leastsquares.quality.weakness import (
     NONLINEAR_RATIO,
     VAGUE_RATIO,
@@ -37,45 +41,135 @@ FURTHER = (
 )
 
 
+ROTATION, SCALE = slice(3, 6), 6
+"""Parameters of a similarity after the three of its shift."""
+FEW_POINTS = 0.05
+"""Share of weak points that is a note: the summary of a network has the σ that 95 % of the points
+do not exceed."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Weakness:
     """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE_RATIO` of their
     reference, the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above
-    1/`NONLINEAR_RATIO` of their distance; `of`: the number of points."""
+    1/`NONLINEAR_RATIO` of their distance; `of`: the number of points. `georeference`: how uncertain
+    the common position of all is, in words, if that alone makes image unknowns look weak."""
 
     unknowns: tuple[str, ...] = ()
     worst: float = 0.0
     points: tuple[str, ...] = ()
     of: int = 0
+    georeference: str = ""
+
+    @property
+    def few_points(self) -> bool:
+        """Whether so few points are weak that the others are what the network is about."""
+        return len(self.points) <= FEW_POINTS * self.of
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What does not spoil the network: its georeference, a few weak points."""
+        few = self._of_points() if self.few_points else ()
+        return (*filter(None, (self.georeference,)), *few)
 
     @property
     def lines(self) -> tuple[str, ...]:
         """One line for the unknowns of images and cameras, one for points; each with a remedy."""
-        found = []
+        return (*self._of_unknowns(), *(() if self.few_points else self._of_points()))
+
+    def _of_unknowns(self) -> tuple[str, ...]:
         if self.unknowns:
             kinds = [kind for kind in ADVICE_FOR if any(f" of {kind} " in n for n in self.unknowns)]
             worst = f"is up to {self.worst:.2g} of" if self.worst < 1 else "is larger than"
-            found.append(
+            return (
                 f"poorly determined: {list_some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
                 f"{1 / VAGUE_RATIO:g} of it the unknown is practically undetermined. "
-                f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}"
+                f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}",
             )
+        return ()
+
+    def _of_points(self) -> tuple[str, ...]:
         if self.points:
             most = 2 * len(self.points) > self.of
             where = "images taken from one place, or nearly" if most else "rays almost parallel"
-            found.append(
+            return (
                 f"poorly determined: X, Y, Z of {len(self.points)} of {count(self.of, 'point')} "
                 f"({list_some(self.points)}), with a σ above {1 / NONLINEAR_RATIO:g} of their "
-                f"distance: {where}. Depth needs images from places farther apart."
+                f"distance: {where}. Depth needs images from places farther apart.",
             )
-        return tuple(found)
+        return ()
 
 
 def weakness(inspection: Inspection, sigma0: float) -> Weakness:
-    """The weak directions of a solution; none without a factor."""
-    found = find_weak(inspection.solution, _extents(inspection), sigma0)
-    return _in_words(inspection.problem, found)
+    """The weak directions of a solution; none without a factor.
+
+    The uncertainty of the common position, rotation and scale of all points, which loose control
+    leaves, is none of the images': they are judged without it, and it is stated for itself."""
+    problem, extents = inspection.problem, _extents(inspection)
+    found = find_weak(inspection.solution, extents, sigma0)
+    if not any(" of image " in name for name in found.names) or problem.counts.datum:
+        return _in_words(problem, found)
+    georeference = find_georeference(inspection)
+    if georeference is None or sigma0 * georeference.rotation > 1 / NONLINEAR_RATIO:
+        return _in_words(problem, found)
+    own = find_weak(inspection.solution, extents, sigma0, {"image": georeference.of_images})
+    said = "" if own.names == found.names else georeference.in_words(
+        sigma0, problem.network.object_unit
+    )
+    return dataclasses.replace(_in_words(problem, own), georeference=said)
+
+
+@dataclasses.dataclass(frozen=True)
+class Georeference:
+    """Cofactors of the similarity of all points, estimated as that of the points: σ/σ0 of the
+    `position` of their centroid in its least certain direction (object unit), of the `rotation`
+    about its least certain axis (radians), of the `scale`; `of_images` [images, 6]: the cofactors
+    of the unknowns of images that follow from it."""
+
+    position: float
+    rotation: float
+    scale: float
+    of_images: Float[np.ndarray, "images 6"]
+
+    def in_words(self, sigma0: float, unit: str) -> str:
+        """σ a posteriori of the common position."""
+        return (
+            f"georeference uncertain to {sigma0 * self.position:.2g} {unit}, "
+            f"{np.degrees(sigma0 * self.rotation):.2g}° and {100 * sigma0 * self.scale:.2g} % of "
+            "scale (σ of the whole block, from its control or camera positions); relative to each "
+            "other images and points are determined"
+        )
+
+
+def find_georeference(inspection: Inspection) -> Georeference | None:
+    """The uncertainty of the similarity of all points: τ = (GᵀG)⁻¹Gᵀ·δX of the Helmert matrix G, so
+    that Q_ττ is propagated. None for points at any distance, and for fewer than three."""
+    problem, values = inspection.problem, inspection.adjusted
+    tables = inspection.solution.values
+    moves = directions_of_motions(problem.system.declared, {
+        name: tables[name] for name in ("image", "point")
+    })  # fmt: skip
+    X, n = np.asarray(values.point), len(problem.network.points)
+    rows = np.flatnonzero(np.isfinite(X[:n]).all(1) & ~problem.at_any_distance)
+    of_points = np.asarray(moves["point"])[rows]
+    if of_points.shape[1:2] != (3,) or len(rows) < 3:
+        return None
+    inverse = np.linalg.pinv(of_points.reshape(-1, of_points.shape[2]))
+    estimate = eqx.Partial(_similarity_of, jnp.asarray(inverse), jnp.asarray(rows))
+    Q = inspection.propagate(estimate)
+    whole = of_points.mean(0)
+    largest = lambda C: float(np.sqrt(max(np.linalg.eigvalsh(C)[-1], 0.0)))
+    G = np.asarray(moves["image"])[: len(problem.network.images)]
+    return Georeference(
+        largest(whole @ Q @ whole.T), largest(Q[ROTATION, ROTATION]), largest(Q[SCALE:, SCALE:]),
+        np.einsum("iaj,jk,iak->ia", G, Q, G),
+    )  # fmt: skip
+
+
+def _similarity_of(inverse, rows, values):
+    """τ of the coordinates of points, to first order."""
+    return inverse @ values.point[rows].ravel()
 
 
 def weakness_of_unsolved(problem: Problem, values: Values) -> Weakness:

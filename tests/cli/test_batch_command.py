@@ -114,6 +114,20 @@ def test_networks_and_one_that_is_bad(run, tmp_path):
     assert "bad.toml" in first["error"] and "1 bad input, 1 converged" in done.out
     assert second["status"] == "converged" and second["redundancy"] == 23
     assert "points" not in second and second["cameras"]["cam"]["parameters"]["c"]["sigma"] > 0
+    again = run(bad, EXAMPLE, "--json-lines", file, "--quiet")  # resumed: nothing to compute
+    assert (again.status, again.out) == (0, "")
+    assert "1 of 2 inputs without a result: 1 bad input, 1 converged" in again.err
+
+
+def test_a_batch_without_any_result_is_not_a_success(run, tmp_path):
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[project]\nname = 3\n")
+    file = tmp_path / "results.jsonl"
+    for options in ((), ("--quiet",)):  # computed, then resumed
+        done = run(bad, "--json-lines", file, *options)
+        assert done.status == 3
+        assert "none of 1 input has a result: 1 bad input" in done.err
+    assert rows(file)[0]["status"] == "bad input"
 
 
 def test_bad_input_ends_with_one_line_and_writes_nothing(run, cameras, tmp_path):

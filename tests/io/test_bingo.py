@@ -50,7 +50,7 @@ def test_both_files(folder):
     }  # fmt: skip
     assert_allclose(net.points.position[0], (1, 2, 3))
     assert_allclose(net.observations.xy, [[-20.5, 10.25], [30, -5.125], [-21.5, 11.25], [30, 4]])
-    text = " ".join(net.warnings)
+    text = " ".join((*net.warnings, *net.notes))
     assert "'300'" in text and "RADI, ADPA" in text and "itera.dat" in text
     assert net.datum == "control" and net.image_unit == "mm"
 

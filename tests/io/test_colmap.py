@@ -312,4 +312,4 @@ def test_missing_files(tmp_path, folder):
 
 def test_rigs_are_told(folder):
     (folder / "rigs.txt").write_text("1 1 CAMERA 1\n")
-    assert "rigs and frames are not read" in read_colmap(folder).warnings[-1]
+    assert "rigs and frames are not read" in read_colmap(folder).notes[-1]

@@ -62,10 +62,18 @@ def test_control_replaces_that_of_any_input(tmp_path, form, frame):
     turn = TURN if frame == "another" else np.eye(3)
     for mine, given in zip(net.images.angles, ANGLES):
         assert_allclose(matrix(mine), matrix(given) @ turn.T, atol=1e-12)
-    said = " ".join(net.warnings)
+    said = " ".join((*net.warnings, *net.notes))
     assert ("in another frame" in said) == (frame == "another") and "a posteriori" not in said
     assert ("became tie points: '11'" in said) == (form is photomodeler)
     assert "held as fixed" not in said
+
+
+@pytest.mark.parametrize("scale, said", [(1000.0, "a thousand times"), (1e-3, "a thousandth")])
+def test_control_in_mm_for_start_values_in_m_is_said(tmp_path, scale, said):
+    input, first = project(tmp_path)
+    net = read_network(input, control=table(tmp_path, scale * POINTS, first))
+    (told,) = [line for line in net.warnings if "is one of them in mm, the other in m?" in line]
+    assert said in told and "control.csv" in told
 
 
 def test_points_without_coordinates_are_intersected_to_find_the_frame(tmp_path):

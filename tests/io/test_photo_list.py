@@ -8,6 +8,7 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_photo_list, read_project
 from jaxbundle.network.check import check_network
+from jaxbundle.network.tables import STATED, UNIT
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
 
@@ -38,7 +39,7 @@ def write(tmp_path):
 
 def test_the_example_is_the_example_project():
     """The same measurements as the project beside it, once the σ of the file are set aside."""
-    overrides = ["sigma_image=1", "free=c,x0,y0,K1,K2,K3,P1,P2,b1,b2"]
+    overrides = ["sigma_image=0.0007", "free=c,x0,y0,K1,K2,K3,P1,P2,b1,b2"]
     network = read_network(EXAMPLE / "convergent4.txt", overrides=overrides)
     project = read_project(EXAMPLE)
     assert network.cameras == project.cameras
@@ -52,15 +53,22 @@ def test_the_example_is_the_example_project():
                 getattr(getattr(network, table), name), getattr(getattr(project, table), name)
             )
     assert (network.datum, network.residuals) == ("inner", "corrected")
-    assert "σ = 1 mm (sigma_image)" in network.warnings[0]
+    assert network.observations.sigma_origin == STATED
+    assert network.notes[0].startswith("the σ of the file are ignored")
     check_network(network)
+
+
+def test_unit_weights_can_be_asked_for():
+    network = read_network(EXAMPLE / "convergent4.txt", overrides=["sigma_origin=unit"])
+    assert network.observations.sigma_origin == UNIT
+    assert (network.observations.sigma == 1).all() and network.warnings == ()
 
 
 def test_the_sigma_of_the_example_are_refused():
     with pytest.raises(InputError) as error:
         read_photo_list(EXAMPLE / "convergent4.txt")
     for words in ("convergent4.txt, line 6", "σ of x", "'3'", "'DSC_037'", "-0.5",
-                  "--set sigma_image=VALUE (mm)", "sigma_image=1 for unit weights"):  # fmt: skip
+                  "--set sigma_image=VALUE (mm)", "sigma_origin=unit for unit"):  # fmt: skip
         assert words in str(error.value)
 
 
@@ -74,7 +82,7 @@ def test_good_sigma_are_used(write):
     assert network.cameras[0].parameters == {"c": 20.0}
     assert network.cameras[0].free == ()
     assert network.observations.source(1).endswith("list.txt, line 6")
-    assert "start values only" in network.warnings[0]
+    assert "start values only" in network.notes[0]
 
 
 def test_overrides(write):

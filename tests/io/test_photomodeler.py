@@ -79,7 +79,7 @@ def test_control_points_weighted_and_held(tmp_path):
     roles = dict(zip(net.points.id, net.points.role))
     assert (roles["3"], roles["5"], roles["1"]) == ("control", "fixed", "tie")
     assert_allclose(net.points.sigma[net.points.id.index("3")], 0.02)
-    assert "held as fixed: '5'" in " ".join(net.warnings)
+    assert "held as fixed: '5'" in " ".join(net.notes)
 
 
 def test_size_of_the_image_from_the_command_line(tmp_path):
@@ -148,7 +148,8 @@ def test_smart_points_whose_ids_are_taken_are_renumbered(tmp_path):
     ids = ["1", "2", "3", "4", "5", "6", "7", "8", "102", "103", "14", "15"]
     assert list(net.points.id) == ids
     assert_same(plain, net.replace(points=dataclasses.replace(net.points, id=plain.points.id)))
-    assert "2 smart points" in net.warnings[0] and "2 is 102, 3 is 103" in net.warnings[0]
+    told = " ".join(net.warnings)
+    assert "2 smart points" in told and "2 is 102, 3 is 103" in told
 
 
 def test_a_repeated_id_that_is_no_smart_point_is_refused(tmp_path):

@@ -332,8 +332,10 @@ def test_the_default_sigma_is_told(folder):
     edit(folder, "project.toml", "sigma_image = 0.01\n", "")
     network = read_project(folder)
     assert network.warnings == (
-        "sigma_image is not given: image coordinates without σ have σ = 1 mm",
+        "18 image coordinates of 20 without σ: theirs is 1 mm, beside those given; give "
+        "sigma_image",
     )
+    assert network.observations.sigma_origin == "unit"
     assert network.observations.sigma[0, 0] == 1.0
 
 

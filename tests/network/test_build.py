@@ -104,8 +104,10 @@ def test_fixed_and_prior_of_an_image():
 
 
 def test_the_missing_sigma_is_told_when_none_is_given():
-    assert "σ = 1 px" in build(sigma_image=None, image_unit="px", cameras=PIXELS).warnings[0]
-    assert build().warnings == ()
+    rays = build(image_unit="px", cameras=PIXELS).observations
+    assert (rays.sigma_origin, float(rays.sigma[0, 0])) == ("unit", 0.001)  # a pixel, in mm
+    assert build(sigma_image=1.0).observations.sigma_origin == "stated"
+    assert build(sigma_image=1.0).warnings == ()
 
 
 @pytest.mark.parametrize("table, change, said", [

@@ -20,6 +20,7 @@ from jaxbundle.network_design import design as design_module
 from jaxbundle.network_design.aims import Aim, measure, smallest_redundancy, task_of
 from jaxbundle.network_design.feasible import start_at
 from jaxbundle.network_design.pairs import make_pairs
+from jaxbundle.network_design.priors import use_prior_tables
 from jaxbundle.network_design.search import configuration, make_program
 from jaxbundle.network_design.variables import choose_variables, turn_axis
 
@@ -241,6 +242,32 @@ def test_what_cannot_be_designed_is_refused(network, site):
         conditions(room=((0, 0, 0), (1, 0, 1)))
     blind = network.replace(cameras=(dataclasses.replace(camera, image_size=None),))
     refused(blind, "its field of view is not known")
+
+
+def test_priors_in_tables_are_information_as_in_columns(network):
+    """As in the folder of an adjusted network, whose priors have values of their own."""
+    ids, camera = network.images.id[:3], network.cameras[0]
+    rows = {"image": ids, **{f"{axis}0": np.zeros(3) for axis in "XYZ"},
+            **{f"s{axis}0": np.full(3, 0.01) for axis in "XYZ"}}  # fmt: skip
+    rows |= {name: [None] * 3 for a in ("omega", "phi", "kappa") for name in (a, f"s{a}")}
+    observed = {"camera": [camera.id], "parameter": ["c"], "value": [21.0], "sigma": [0.005]}
+    tables = jaxbundle.add_further(network, exterior_priors=rows, camera_parameters=observed)
+    sigma = network.images.sigma.copy()
+    sigma[:3, :3] = 0.01
+    columns = network.replace(
+        images=dataclasses.replace(network.images, sigma=sigma),
+        cameras=(dataclasses.replace(camera, sigma={"c": 0.005}),),
+    )
+    aims = []
+    for given in (use_prior_tables(tables), columns, network):
+        pairs = make_pairs(given, Aim(), jaxbundle.Conditions(), SIGMA)
+        values = pairs.problem.data.start
+        aims.append(pairs.aim_at(pairs.measured(values), values))
+    assert aims[0] == pytest.approx(aims[1], rel=1e-9) and aims[0] != pytest.approx(aims[2])
+    with pytest.raises(InputError, match="omit the other observations"):
+        jaxbundle.design(jaxbundle.add_further(
+            tables, velocities={"image": ids}, rolling_shutter={"line_time": 1e-5, "free": ["vX"]}
+        ))  # fmt: skip
 
 
 def test_an_aim_that_the_datum_decides_is_refused(network, site):

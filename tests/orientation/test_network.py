@@ -194,7 +194,7 @@ def test_what_cannot_be_placed_is_named_with_the_reason(solid):
     assert "2 known points of 2" in found.images[network.images.id[4]]
     assert network.images.id[4] in str(found)
     assert len(found.network.images) == 9
-    warning = next(w for w in found.network.warnings if w.startswith("left out 1 image"))
+    warning = next(w for w in found.network.notes if w.startswith("left out 1 image"))
     assert network.images.id[4] in warning
 
 
@@ -338,7 +338,7 @@ def test_blunders_that_leave_least_squares_no_solution(with_control):
     off = result.image_values[:, :3] - with_control.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
-    assert any("that contradict the adjusted" in warning for warning in result.warnings)
+    assert any("that contradict the adjusted" in warning for warning in result.notes)
 
 
 def test_a_plane_without_control():

@@ -36,7 +36,7 @@ RIG, MOMENT = "rig", "0"
 def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
     """The project document of a network of another program: measured in pixels, free."""
     settings = {"name": name, "datum": "inner", "image_unit": "px", "residuals": "measured",
-                "object_unit": "model", "sigma_image": 1.0}  # fmt: skip
+                "object_unit": "model"}  # fmt: skip
     return {"project": settings | project, "camera": [dict(camera) for camera in cameras]}
 
 
@@ -75,7 +75,8 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     index = {camera.id: c for c, camera in enumerate(cameras)}
     exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
     none = np.zeros(0, np.int64)
-    settings = {k: v for k, v in project.items() if k not in ("sigma_image", "datum_points")}
+    of_points = ("sigma_image", "sigma_origin", "datum_points")
+    settings = {k: v for k, v in project.items() if k not in of_points}
     return Network(
         cameras=tuple(cameras),
         images=Images(

@@ -83,7 +83,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             )
     document = {
         "project": {"name": path.name.split(".")[0], "datum": "inner", "image_unit": "px",
-                    "residuals": "measured", "object_unit": "model", "sigma_image": 1.0},
+                    "residuals": "measured", "object_unit": "model"},
         "camera": [
             {"id": str(c), "model": MODEL.name, "free": list(MODEL.parameters),
              **dict(zip(MODEL.parameters, map(float, row)))}

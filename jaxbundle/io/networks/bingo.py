@@ -102,13 +102,13 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )  # fmt: skip
     unseen = [row["id"] for row in points if row["id"] not in ids]
     if unseen:
-        network = network.warn(f"no photograph shows the points {list_some(unseen)}: left out")
+        network = network.note(f"no photograph shows the points {list_some(unseen)}: left out")
     if skipped:
         network = network.warn(
             f"{', '.join(skipped)} of {files[GEO].name} are not read: the distortion starts at 0; "
             "give its parameters with --set camera.ID.p25=… and free=…"
         )
-    return network.warn(
+    return network.note(
         "photographs and new points have no start values: the file with them (itera.dat) is not "
         "read"
     )

@@ -46,7 +46,7 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             raise InputError(f"{path / part}{suffix}: no such file")
     network = to_network(path, read(path), overrides)
     if (path / f"rigs{suffix}").is_file():
-        return network.warn("rigs and frames are not read: every image has its own pose")
+        return network.note("rigs and frames are not read: every image has its own pose")
     return network
 
 

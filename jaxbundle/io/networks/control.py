@@ -40,6 +40,9 @@ which it is none: of points in random order it is about 1."""
 LARGEST_OFFSET = 0.01
 """Control farther than this from its position in the input, relative to its extent, is in another
 frame."""
+MILLIMETRES = 1.01
+"""Scale of a similarity to a thousand, or a thousandth, from which start values and control are in
+mm and in m: a scale in an arbitrary unit is within 1 % of them by chance once in hundreds."""
 EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
 """A selection of check points, such as `every 3rd`."""
 
@@ -212,14 +215,14 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
         points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **given
     )
     lost = [id for id in control.id if id not in index]
-    warnings = []
+    warnings, notes = [], []
     if dropped:
         points = count(len(dropped), "control point")
         warnings.append(f"{points} of the input not in {control.source.name} became tie points: "
                         f"{list_some(dropped)}")  # fmt: skip
     if lost:
-        warnings.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
-    return network.warn(*warnings)
+        notes.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
+    return network.warn(*warnings).note(*notes)
 
 
 def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> Network:
@@ -253,14 +256,21 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
             f"{list_some(worst, 3, str)}; check names and units of the table, or leave out the "
             "start values of the input"
         )
-    scale = np.cbrt(np.linalg.det(A))
+    scale = float(np.cbrt(np.linalg.det(A)))
+    if abs(abs(np.log(scale)) - np.log(1000)) < np.log(MILLIMETRES):
+        times = "a thousand times" if scale > 1 else "a thousandth"
+        network = network.warn(
+            f"the control of {source_name} is {times} "
+            "as large as the start values: is one of them in mm, the other in m? The result is in "
+            "the unit of the control"
+        )
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     return network.replace(
         images=Images(images.id, images.camera, images.position @ A.T + t, angles_of(M),
                       images.sigma, images.source),
         points=dataclasses.replace(points, position=position),
-    ).warn(
+    ).note(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
     )  # fmt: skip

@@ -22,7 +22,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.settings import apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import Columns, count, show
-from jaxbundle.network.tables import Network, Source
+from jaxbundle.network.tables import UNIT, Network, Source
 
 PHOTO = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
 IMAGE_POINT = ("x", "y")
@@ -34,7 +34,7 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
     `overrides` are settings `KEY=VALUE` (`networks.settings`), such as `free=c,x0,y0,K1`.
     With `sigma_image=VALUE` (mm) all image coordinates have this σ instead of that of the
-    file.
+    file, with `sigma_origin=unit` unit weights.
 
     **Raises:** `InputError` naming file and line, among others for a σ that is not finite and
     positive.
@@ -49,7 +49,8 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         "camera": [{"id": "cam", "model": "brown", "c": focal}],
     }  # fmt: skip
     document = apply_overrides(document, overrides)
-    given = "sigma_image" in document["project"]
+    project = document["project"]
+    given = "sigma_image" in project or project.get("sigma_origin") == UNIT
     if not given:
         _check_sigmas(path, (*photos, *image_points, *object_points))
     tables = {
@@ -62,11 +63,8 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     }  # fmt: skip
     network = network_of(document, tables, str(path))
     if given:
-        return network.warn(
-            f"all image coordinates have σ = {document['project']['sigma_image']:g} mm "
-            "(sigma_image); the σ of the file are ignored, also those of photographs and points"
-        )
-    return network.warn(
+        return network.note("the σ of the file are ignored, also those of photographs and points")
+    return network.note(
         "σ of photographs and object points are ignored: their values are start values only"
     )
 
@@ -101,7 +99,7 @@ def _check_sigmas(path: Path, rows: Sequence[_Row]) -> None:
                 raise InputError(
                     f"{path}, line {row.line}: σ of {axis} of {row} is {sigma:g}; it must be "
                     "finite and positive; to ignore the σ of the file give --set "
-                    "sigma_image=VALUE (mm), or sigma_image=1 for unit weights"
+                    f"sigma_image=VALUE (mm), or sigma_origin={UNIT} for unit weights"
                 )
 
 

@@ -7,6 +7,7 @@ object_unit = "m"
 image_unit = "mm"                   # or "px": (0, 0) the centre of the upper-left pixel
 angle_unit = "deg"                  # rad | deg | gon
 sigma_image = 0.015                 # σ of image coordinates without their own, in image_unit
+sigma_origin = "stated"             # stated | unit (of weight) | estimated (from the residuals)
 datum = "control"                   # control | inner | minimal
 datum_points = ["1", "2", "3"]      # which points carry inner constraints; all tie points if absent
 residuals = "corrected"             # corrected | measured
@@ -65,7 +66,7 @@ from jaxbundle.network.columns import Columns, as_columns, did_you_mean
 from jaxbundle.network.further import KINDS, SECTIONS, Further
 from jaxbundle.network.further.base import among
 from jaxbundle.network.rules import AXES
-from jaxbundle.network.tables import Camera, Network, Source, require_network
+from jaxbundle.network.tables import STATED, UNIT, Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 from jaxbundle.system.file_content import check_plain
 
@@ -80,6 +81,8 @@ INLINE = {
 }  # fmt: skip
 """The tables and the name of one of their rows in the TOML file."""
 
+UNIT_DIGITS = 1e-12
+"""Relative rounding of a unit of weight converted between pixels and millimetres."""
 WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "x", "y")}
 """Tables not required for oriented images, and their columns."""
 
@@ -176,7 +179,7 @@ def write_project(
 ) -> Path:
     """Write `project.toml` and its tables into a folder; returns the path of the former.
 
-    Reading it again gives the same network (its warnings are comments in the file).
+    Reading it again gives the same network (its warnings and notes are comments in the file).
 
     **Arguments:** `force`: also replace files not written by `by`, the command or function.
 
@@ -208,6 +211,10 @@ def fill_project(network: Network, folder: Path) -> None:
         folder / "points.csv", POINT_COLUMNS, (points.id, points.role), points.position,
         POINT_SIGMAS, points.sigma, {np.inf: "free"},
     )  # fmt: skip
+    origin = rays.sigma_origin
+    if origin == UNIT and np.allclose(sigma, 1.0, rtol=UNIT_DIGITS, atol=0):
+        # Nobody gave them: where none are written, they are units of weight again.
+        sigma, origin = np.full_like(sigma, np.nan), STATED
     _write_table(
         folder / "observations.csv", OBSERVATION_COLUMNS,
         ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]), xy,
@@ -220,7 +227,7 @@ def fill_project(network: Network, folder: Path) -> None:
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
     for further in among(network):
         _write_further(folder, further, radians)
-    write_text(folder / FILE_NAME, _document_text(network))
+    write_text(folder / FILE_NAME, _document_text(network, origin))
 
 
 def _write_table(path, header, ids, values, sigma_header, sigma, words):
@@ -247,9 +254,13 @@ def _cells(numbers, words=MappingProxyType({})):
     return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
 
 
-def _document_text(network: Network) -> str:
-    lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
-    settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
+def _document_text(network: Network, origin: str) -> str:
+    said = (*network.warnings, *network.notes)
+    lines = [f"# {' '.join(line.split())}" for line in said]
+    of_sigma = "sigma_image", "sigma_origin"
+    settings = {key: getattr(network, key) for key in SETTINGS if key not in of_sigma}
+    if origin != STATED:
+        settings["sigma_origin"] = origin
     further = among(network)
     distances = ["distances"] * (len(network.distances) > 0)
     tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in further)]

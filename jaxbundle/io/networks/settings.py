@@ -14,12 +14,12 @@ from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, did_you_mean, list_some, show
 from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import SIGMA_ORIGINS, STATED, Network
 
 REQUIRED_TABLES = ("images", "points", "observations")
 TABLES = (*REQUIRED_TABLES, "distances", *KINDS)
 TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
-SETTINGS = (*TEXT, "sigma_image", "datum_points")
+SETTINGS = (*TEXT, "sigma_image", "sigma_origin", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
 )
@@ -140,7 +140,6 @@ def network_of(
     project = document["project"]
     check_settings(project, f"{where}, [project]: ")
     settings = {key: project[key] for key in SETTINGS if key in project}
-    settings.setdefault("sigma_image", None)
     cameras = make_cameras(document["camera"], f"{where}, ", models)
     sections = {name: document[name] for name in SECTIONS if name in document}
     return make_network(cameras, **tables, **sections, **settings)
@@ -158,5 +157,6 @@ def check_settings(project: Mapping[str, Any], where: str) -> None:
         if key in CHOICES:
             check_choice(key, value, CHOICES[key], where)
     check_sigma_image(project.get("sigma_image", 1.0), where)
+    check_choice("sigma_origin", project.get("sigma_origin", STATED), SIGMA_ORIGINS, where)
     if not isinstance(project.get("datum_points", []), list):
         raise InputError(f'{where}datum_points must be a list of ids, such as ["1", "2"]')

@@ -41,6 +41,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
             },
         },
         "warnings": list(adjustment.warnings),
+        "notes": list(adjustment.notes),
         "left_out": [
             {"kind": note.thing, "names": list(note.names), "reason": note.why}
             for note in adjustment.problem.network.left_out
@@ -50,7 +51,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
     head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
-    head |= {"robust_scale": adjustment.robust_scale}
+    head |= {"robust_scale": adjustment.robust_scale, "global_test": adjustment.global_test()}
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
@@ -71,6 +72,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     if brief:
         return head
     return head | {
+        "verdict": verdict_dict(adjustment.verdict),
         "variance_components": _components(adjustment),
         "points": dict(_points(adjustment.points)),
         "residuals": list(_residuals(adjustment.residuals)),
@@ -92,7 +94,9 @@ def result_text(
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return
-    yield _text(head | {"variance_components": _components(adjustment)})[:-1]
+    more = {"verdict": verdict_dict(adjustment.verdict)}
+    more |= {"variance_components": _components(adjustment)}
+    yield _text({**more, **head})[:-1]
     yield ', "points": {'
     yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
     yield '}, "residuals": ['
@@ -118,6 +122,14 @@ def without_nan(value):
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def verdict_dict(verdict) -> dict:
+    """A verdict (`report.verdict`) as plain dicts."""
+    state, words, findings = verdict
+    return {"state": state, "words": words, "findings": [
+        {"about": f.about, "state": f.state, "words": f.words} for f in findings
+    ]}  # fmt: skip
 
 
 def _camera(table: dict) -> dict:

@@ -8,7 +8,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.network.further import CameraParameters, ExteriorPriors, Further, RollingShutter
 from jaxbundle.network.further.base import among
 from jaxbundle.network.sightings import keep_points, without_distances
-from jaxbundle.network.tables import Images, Network, Observations, Points
+from jaxbundle.network.tables import ESTIMATED, Images, Network, Points
 
 
 def adjusted_network(adjustment) -> Network:
@@ -43,9 +43,8 @@ def adjusted_network(adjustment) -> Network:
                       np.full_like(images.sigma, np.nan), images.source),
         points=Points(points.id, roles, adjustment.point_values,
                       np.full_like(points.sigma, np.nan), points.source),
-        observations=Observations(rays.image, rays.point, rays.xy, rays.sigma,
-                                  rays.source).take(used),
-        datum="inner", datum_points=(), further=(), warnings=("the adjusted network",),
+        observations=rays.take(used),
+        datum="inner", datum_points=(), further=(), warnings=(), notes=("the adjusted network",),
     )  # fmt: skip
     return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
 
@@ -57,7 +56,8 @@ def readjustable_network(adjustment) -> Network:
     Priors of orientations and cameras become rows of `exterior_priors` and `camera_parameters`,
     because what was observed differs from the start values; control points have their given
     coordinates.
-    σ are the final ones, after variance components and robust weights. Observations removed by data
+    σ are the final ones, after variance components (then their origin is "estimated") and robust
+    weights. Observations removed by data
     snooping, points without coordinates and check points are left out.
     """
     problem = adjustment.problem
@@ -78,13 +78,15 @@ def readjustable_network(adjustment) -> Network:
         images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
                       np.where(images.sigma == 0, 0.0, np.nan), images.source),
         points=_given_points(adjustment),
-        observations=Observations(rays.image, rays.point, rays.xy, _sigma(weight, np.nan),
-                                  rays.source).take(used),
+        observations=dataclasses.replace(
+            rays, sigma=_sigma(weight, np.nan),
+            sigma_origin=ESTIMATED if adjustment.sigma_factors else rays.sigma_origin,
+        ).take(used),
         distances=dataclasses.replace(
             network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
         ),
         further=_joined(*_further(adjustment), *_priors(adjustment)),
-        warnings=("the adjusted network",),
+        warnings=(), notes=("the adjusted network",),
     )  # fmt: skip
     adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
     return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))

@@ -6,7 +6,7 @@ points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
                                     # id,role,longitude,latitude,height[,sE,sN,sh]
 observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]
 frames = "photographs"              # a project of photographs that share points
-sigma = 0.5                         # of line and pixel, where the table has none
+sigma = 0.5                         # of line and pixel, where the table has none; default 1, a unit
 angle_unit = "deg"                  # rad | deg | gon, of this file and of longitude, latitude
 snooping = "pope"                   # none | baarda | pope
 significance = 0.001
@@ -50,7 +50,7 @@ from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.sections import Section, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, show
-from jaxbundle.network.tables import Network, Observations
+from jaxbundle.network.tables import STATED, UNIT, Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.refinement.freedom import Freedom
 from jaxbundle.refinement.refining import TESTS, east_north_up
@@ -214,7 +214,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
 
 def _observations(table, ids, images, section, where) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
-    sigma = section.number("sigma", 1.0)
+    sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
     given = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
@@ -223,4 +223,5 @@ def _observations(table, ids, images, section, where) -> Observations:
         table.indices("point", "point", ids, section.text("points")),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
         np.where(np.isnan(given), sigma, given), table.source,
+        STATED if stated or not np.isnan(given).any() else UNIT,
     )  # fmt: skip

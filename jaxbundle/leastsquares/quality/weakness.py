@@ -57,12 +57,15 @@ class Weak:
     of: int = 0
 
 
-def find_weak(found: Solution, extents: Extents, sigma0: float) -> Weak:
-    """The weak directions of a solution; none without a factor."""
+def find_weak(
+    found: Solution, extents: Extents, sigma0: float, explained: Extents | None = None
+) -> Weak:
+    """The weak directions of a solution; none without a factor. `explained`: cofactors of its
+    unknowns, by table, that are not counted, such as those of a common motion."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
     at_hand = "cofactors" in vars(found) or len(kept_unknowns(found.problem)) < SMALL_SYSTEM
-    return _weak(found, found.factor, extents, sigma0, at_hand)
+    return _weak(found, found.factor, extents, sigma0, at_hand, explained)
 
 
 def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
@@ -80,7 +83,9 @@ def _lifted_factor(declared, plan, values, data) -> Factor:
     return without_plan(factorise(lift(Normal(plan, blocks))))
 
 
-def _weak(found: Solution, factor: Factor, extents: Extents, sigma0: float, at_hand=False) -> Weak:
+def _weak(
+    found: Solution, factor: Factor, extents: Extents, sigma0: float, at_hand=False, explained=None
+) -> Weak:
     problem, plan = found.problem, found.problem.plan
     sigma0 = sigma0 if np.isfinite(sigma0) else 1.0
     if not np.isfinite(np.asarray(factor.reduced.pivots)).all():
@@ -88,13 +93,16 @@ def _weak(found: Solution, factor: Factor, extents: Extents, sigma0: float, at_h
     far, judged = _far_rows(problem, factor, extents, sigma0)
     if far is None:
         return Weak()
-    per_extent = _per_extent(problem, extents)
+    per_extent = _of_columns(problem, extents)
     if at_hand:
         own = found.cofactors.own
         variance = {g: np.diagonal(np.asarray(own[g]), axis1=1, axis2=2) for g in plan.kept}
         sigma = np.sqrt(np.asarray(flat(plan.kept, variance))) * per_extent
     else:
         sigma = _sigma_of_weakest(found, factor, per_extent)
+    if explained is not None:
+        less = per_extent**2 * _of_columns(problem, explained)
+        sigma = np.sqrt(np.maximum(sigma**2 - less, 0.0))
     sigma = sigma0 * sigma
     order = np.argsort(-sigma, kind="stable")[: (VAGUE_RATIO * sigma > 1).sum()]
     names = kept_unknowns(problem) if len(order) else []
@@ -125,16 +133,17 @@ def _far_rows(problem: Problem, factor: Factor, extents: Extents, sigma0: float)
     return tuple(rows[far].tolist()), int(judged.sum())
 
 
-def _per_extent(problem: Problem, extents: Extents) -> Float[np.ndarray, " reduced"]:
-    """1/e of the columns of the reduced system; 0 for what is held or has no extent."""
+def _of_columns(problem: Problem, by_table: Extents) -> Float[np.ndarray, " reduced"]:
+    """Quantities by table, such as 1/e, as those of the columns of the reduced system; 0 for what
+    is held or has none."""
     plan, found = problem.plan, {}
     for g in plan.kept:
         group = plan.groups[g]
         found[g] = np.zeros(group.free.shape)
         for m in group.members:
-            if m.table not in extents:
+            if m.table not in by_table:
                 continue
-            of = extents[m.table]
+            of = by_table[m.table]
             if of.ndim == 1:  # Kept rows of the eliminated table.
                 of = np.where(of > 0, 1 / np.where(of > 0, of, 1.0), 0.0)[:, None]
             rows = np.arange(group.rows) if m.rows is None else np.asarray(m.rows)

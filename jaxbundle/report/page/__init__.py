@@ -22,4 +22,4 @@ from jaxbundle.report.page.origin import fingerprint_files as fingerprint_files
 from jaxbundle.report.page.origin import head_line as head_line
 from jaxbundle.report.page.origin import stamp as stamp
 from jaxbundle.report.page.overview import give_verdict as give_verdict
-from jaxbundle.report.page.verdict import Finding as Finding
+from jaxbundle.report.verdict import Finding as Finding

@@ -10,11 +10,11 @@ from jaxbundle.report.page import sections
 from jaxbundle.report.page.document import NOTHING, Listing, Page, Section, write
 from jaxbundle.report.page.markup import facts, grid, paragraph
 from jaxbundle.report.page.origin import UNKNOWN, Origin
-from jaxbundle.report.page.overview import explain_failure, give_verdict
+from jaxbundle.report.page.overview import explain_failure, give_verdict, list_messages
 from jaxbundle.report.page.scene import describe_frames, describe_network
 from jaxbundle.report.page.tables import collect_tables
-from jaxbundle.report.page.verdict import Finding, judge
 from jaxbundle.report.summary import summary
+from jaxbundle.report.verdict import Finding, Verdict, conclude
 
 A_POSTERIORI = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
@@ -40,9 +40,13 @@ class Addition(NamedTuple):
     tables: Mapping[str, Listing] = NOTHING
     name: str = ""
 
+    def conclude(self, adjustment) -> Verdict:
+        """The verdict of the command on its adjustment."""
+        return conclude(adjustment, self.findings, self.without, len(self.warnings))
+
 
 ALONE = Addition()
-REPEATED_LINES = ("Note", "Redundancy", "σ0", "Image precision", "χ² test")
+REPEATED_LINES = ("Note", "Verdict", "Redundancy", "σ0", "Image precision", "χ² test")
 """Lines of the summary that are repeated below it."""
 
 
@@ -79,7 +83,10 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
     if not adjustment.converged:
         first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
         return Page(title, [first, *also.sections], origin, settings, also.tables)
-    first = give_verdict(find(adjustment, also), warnings, also.overview, *_whole(adjustment))
+    noted = list_messages("Notes", adjustment.notes)
+    first = give_verdict(
+        find(adjustment, also), warnings, also.overview, noted, *_whole(adjustment)
+    )
     drawings: dict[str, Any] = {
         "network-data": describe_network(adjustment), "frames": describe_frames(adjustment)
     }  # fmt: skip
@@ -90,7 +97,7 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
 
 def find(adjustment, also: Addition = ALONE) -> list[Finding]:
     """The findings of a solved adjustment, those of an addition first."""
-    return [*also.findings, *(f for f in judge(adjustment) if f.about not in also.without)]
+    return list(also.conclude(adjustment).findings)
 
 
 def _whole(adjustment) -> list[str]:

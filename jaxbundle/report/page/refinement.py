@@ -5,11 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.network.columns import count
-from jaxbundle.refinement import point_rows
-from jaxbundle.report.head import test_in_words
+from jaxbundle.refinement import UNIT_OF_WEIGHT, point_rows
 from jaxbundle.report.layout import estimate, significant
-from jaxbundle.report.observations import count_weak
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
 from jaxbundle.report.page.markup import facts, grid
@@ -17,12 +16,17 @@ from jaxbundle.report.page.origin import UNKNOWN, Origin
 from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
-from jaxbundle.report.page.verdict import DOUBTFUL, GOOD, Finding, judge_fit
-from jaxbundle.statistics.global_test import chi_squared_test
+from jaxbundle.report.verdict import (
+    DOUBTFUL,
+    GOOD,
+    LEVEL,
+    Finding,
+    describe_reliability,
+    judge_fit,
+)
+from jaxbundle.statistics.global_test import describe_test
 
 KIND = "refinement of scanner images"
-CRITICAL_W = 3.29
-"""Critical value of |w| at 0.1 %."""
 MOST_CORRELATED = 40
 """With more unknowns the matrix is only in result.json."""
 SCANNER_AXES = ("line", "pixel")
@@ -73,37 +77,33 @@ def _image_points(result) -> list[dict]:
 
 
 def _judge(result, used, w) -> list[Finding]:
-    r = np.concatenate([row["r"] for row in used])
-    weak, loose = count_weak(r)
-    large, expected = int((np.abs(w) > CRITICAL_W).sum()), 0.001 * len(w)
-    over = large > expected + 3 * np.sqrt(expected) + 1
+    found = result.global_test()
+    # As many tests as coordinates; σ a priori only where they were stated.
+    size = np.abs(w) if found["passed"] else np.abs(w) / result.sigma0
+    largest = float(np.fmax.reduce(size, initial=np.nan))
+    limit = normal_quantile(1 - level_of_one(LEVEL, len(w)) / 2)
+    blunders = (
+        f"largest |{'w' if found['passed'] else 'w/σ0'}| {significant(largest)}, critical value of "
+        f"{count(len(w), 'coordinate')} at {100 * LEVEL:g} % {significant(limit)}; "
+        f"{len(result.removed)} removed by data snooping"
+    )
+    likely = f"{count(int((size > limit).sum()), 'blunder')} likely"
     findings = [
-        _fit(result),
-        Finding("Reliability", DOUBTFUL if weak > 0.05 * len(r) else GOOD,
-                f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), 'coordinate')} "
-                f"weakly controlled (r < 0.1), {loose} uncontrolled"),
-        Finding("Blunders", DOUBTFUL if over else GOOD,
-                f"{large} of {count(len(w), 'coordinate')} with |w| over {CRITICAL_W} (by chance "
-                f"about {significant(expected, 2)}); {len(result.removed)} removed by data "
-                "snooping"),
-    ]  # fmt: skip
+        judge_fit(found, describe_test(found, UNIT_OF_WEIGHT), result.sigma0,
+                  bool(np.isfinite(result.prior_sigma).any()), result.redundancy),
+        describe_reliability(np.concatenate([row["r"] for row in used]), "coordinate"),
+        Finding("Blunders", DOUBTFUL if largest > limit else GOOD, blunders, likely),
+    ]
     check = result.check
     if check is not None:
         ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
         largest = np.fmax.reduce(ratio, initial=np.nan)
+        limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)
         rms = ", ".join(significant(value) for value in check.rms)
         words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
                  f"difference {significant(largest)} times its σ")  # fmt: skip
-        findings.append(Finding("Check points", DOUBTFUL if largest > CRITICAL_W else GOOD, words))
+        findings.append(Finding("Check points", DOUBTFUL if largest > limit else GOOD, words))
     return findings
-
-
-def _fit(result) -> Finding:
-    if result.redundancy < 1:
-        words = "no redundancy: σ0 and standard deviations cannot be estimated"
-        return Finding("χ² test", DOUBTFUL, words)
-    found = chi_squared_test(result.redundancy * result.sigma0**2, result.redundancy)
-    return judge_fit(found, test_in_words(found))
 
 
 def _whole(result, used) -> str:

@@ -1,0 +1,52 @@
+"""The verdict on a calibration: that of its adjustment, with coverage and cross-validation."""
+
+from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
+from jaxbundle.report.verdict import DOUBTFUL, GOOD, Finding, Verdict, conclude
+
+WITHOUT = ("Control",)
+"""Findings of the adjustment that do not apply to a board."""
+
+
+def conclude_calibration(calibration) -> Verdict:
+    """The verdict on a solved `Calibration`."""
+    return conclude(
+        calibration.adjustment, find(calibration), WITHOUT, len(calibration.shortcomings)
+    )
+
+
+def find(calibration) -> list[Finding]:
+    """Its own findings."""
+    covered, checked = calibration.coverage, calibration.cross_validation
+    good = covered.part >= PART and covered.reach >= REACH
+    words = coverage_in_words(covered)
+    found = [Finding("Coverage", GOOD if good else DOUBTFUL, words, words)]
+    if checked is not None:
+        state = DOUBTFUL if checked.test > LARGEST_TEST else GOOD
+        words = " ".join(cross_validation_in_words(calibration))
+        found.append(Finding("Cross-validation", state, words, "halves that contradict each other"))
+    return found
+
+
+def coverage_in_words(covered) -> str:
+    """The part of the image with measured points."""
+    return (
+        f"points in {100 * covered.part:.0f} % of the image's cells, out to "
+        f"{100 * covered.reach:.0f} % of the half diagonal"
+    )
+
+
+def cross_validation_in_words(calibration) -> list[str]:
+    """The cross-validation of the halves, in sentences."""
+    checked = calibration.cross_validation
+    if checked is None:
+        return ["too few photographs for two halves" if calibration.validated else "not made"]
+    largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
+    sentences = [
+        f"the camera of either half leaves an RMS of {checked.rms_other:.4f} px in the other half, "
+        f"where its own leaves {checked.rms_own:.4f} px. The two differ by "
+        f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
+        f"together {checked.test:.2f} (1 expected)."
+    ]
+    if checked.comparison is not None:
+        sentences.append(f"Their images, over the whole image: {checked.comparison}.")
+    return sentences

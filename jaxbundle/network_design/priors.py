@@ -1,0 +1,56 @@
+"""Prior tables of a network as a design uses them: information, whatever the values observed.
+
+A network written by an adjustment has its priors in tables, because what was observed differs from
+the adjusted values. σ of a design follow from the Jacobian at the stations of the design, so that
+only the σ of priors count: those of orientations go to the images, where they follow a station that
+moves, and those of camera parameters observe the values that the cameras have.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.network.further import CameraParameters, ExteriorPriors
+from jaxbundle.network.further.base import rows_of
+from jaxbundle.network.further.camera_parameters import RATIO
+from jaxbundle.network.tables import Network
+
+
+def use_prior_tables(network: Network) -> Network:
+    """The network with the priors of its tables `exterior_priors` and `camera_parameters` at its
+    own values."""
+    kept = []
+    for one in network.further:
+        if isinstance(one, ExteriorPriors):
+            network = _of_images(network, one)
+        elif isinstance(one, CameraParameters):
+            kept.append(_at_own_values(network, one))
+        else:
+            kept.append(one)
+    return network.replace(further=tuple(kept))
+
+
+def _of_images(network: Network, given: ExteriorPriors) -> Network:
+    """σ of orientations in the table of images; two of the same element are combined."""
+    sigma = network.images.sigma.copy()
+    weight = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
+    np.add.at(weight, rows_of(given.image, network.images), 1 / given.sigma**2)
+    new = (weight > 0) & (sigma != 0)
+    sigma[new] = 1 / np.sqrt(weight[new])
+    return network.replace(images=dataclasses.replace(network.images, sigma=sigma))
+
+
+def _at_own_values(network: Network, given: CameraParameters) -> CameraParameters:
+    values = {
+        camera.id: {**default_parameters(get_model(camera.model)), **camera.parameters}
+        for camera in network.cameras
+    }  # fmt: skip
+
+    def value(camera: str, parameter: str) -> float:
+        name, _, divisor = parameter.partition(RATIO)
+        of = values[camera]
+        return float(of[name] / of[divisor] if divisor else of[name])
+
+    found = [value(*row) for row in zip(given.camera, given.parameter, strict=True)]
+    return dataclasses.replace(given, value=np.array(found))

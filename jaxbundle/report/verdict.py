@@ -1,0 +1,258 @@
+"""The verdict on a result: the conclusion of its tests, in words.
+
+`met` and `noted` are what a good result has: nothing to test for want of a priori σ, a free
+network, a few things left out. `doubtful` is a test that a good result fails only by chance at
+0.1 %, or that could not be made although the result depends on it; `not met`: σ or control that
+were stated are contradicted.
+"""
+
+from collections.abc import Container, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbundle.leastsquares.quality.distributions import level_of_one
+from jaxbundle.network.columns import count
+from jaxbundle.network.tables import ESTIMATED
+from jaxbundle.report.head import chi_squared, open_datum
+from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.observations import count_weak, critical_value
+from jaxbundle.statistics.misfit import LARGEST_REMOVED, contradicts
+
+GOOD, NOTED, DOUBTFUL, BAD = "met", "noted", "doubtful", "not met"
+LEVEL = 0.001
+"""Probability that a good result fails a test of the verdict."""
+WEAK_SHARE = 0.05
+"""Share of weakly controlled observations that is noted."""
+
+
+class Finding(NamedTuple):
+    """The subject of one test, whether it is met, its numbers in words; `brief`: for the sentence
+    of the verdict, otherwise the subject."""
+
+    about: str
+    state: str
+    words: str
+    brief: str = ""
+
+    @property
+    def lowers(self) -> bool:
+        """Whether it lowers the verdict."""
+        return self.state in (DOUBTFUL, BAD)
+
+
+class Verdict(NamedTuple):
+    """The overall state, a sentence, and the findings it follows from."""
+
+    state: str
+    words: str
+    findings: tuple[Finding, ...]
+
+
+def judge(adjustment) -> list[Finding]:
+    """The findings of a solved adjustment."""
+    return [
+        _fit(adjustment), _control(adjustment), *_checks(adjustment),
+        describe_reliability(adjustment.residuals["r"]), _blunders(adjustment),
+        *_left_out(adjustment),
+    ]  # fmt: skip
+
+
+def in_words(findings: list[Finding], warnings: int) -> tuple[str, str]:
+    """The overall state, and a sentence for it."""
+    brief = {state: [f.brief or f.about for f in findings if f.state == state]
+             for state in (NOTED, DOUBTFUL, BAD)}  # fmt: skip
+    doubtful = [*brief[DOUBTFUL], *([count(warnings, "warning")] if warnings else [])]
+    if brief[BAD]:
+        return BAD, f"The result does not meet its tests: {', '.join(brief[BAD])}."
+    if doubtful:
+        return DOUBTFUL, f"Use the result with care: {', '.join(doubtful)}."
+    noted = f" (noted: {', '.join(brief[NOTED])})" if brief[NOTED] else ""
+    return GOOD, f"The result meets its tests{noted}."
+
+
+def conclude(
+    adjustment, findings: Iterable[Finding] = (), without: Container[str] = (), warnings: int = 0
+) -> Verdict:
+    """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
+    those of the adjustment, and with further `warnings`."""
+    found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
+    return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
+
+
+def _fit(adjustment) -> Finding:
+    return judge_fit(
+        adjustment.global_test(), chi_squared(adjustment), adjustment.sigma0,
+        adjustment.weights_matter, adjustment.redundancy,
+    )
+
+
+def judge_fit(
+    found: dict, words: str, sigma0: float, weights_matter: bool, redundancy: float
+) -> Finding:
+    """The finding of a χ² test (`statistics.global_test`). Observations better than their a priori
+    σ, or than a unit of weight, only concern these σ, since those of the result are a posteriori;
+    but where there are observations of other kinds, `weights_matter`."""
+    fit = _judge_fit(found, words, sigma0)
+    unsuited = weights_matter and fit.state == NOTED and contradicts(sigma0, int(redundancy))
+    unsuited &= found["sigma_origin"] != ESTIMATED
+    return fit._replace(state=DOUBTFUL) if unsuited else fit
+
+
+def _judge_fit(found: dict, words: str, sigma0: float) -> Finding:
+    about, passed = "χ² test", found["passed"]
+    if found["low"] is None:
+        return Finding(about, DOUBTFUL, words, "no redundancy, so that nothing is tested")
+    if passed is None:
+        none = "σ estimated" if found["sigma_origin"] == ESTIMATED else "no a priori σ"
+        return Finding(about, NOTED, words, none)
+    if passed:
+        return Finding(about, GOOD, words)
+    times = f"{significant(sigma0)} times their a priori σ"
+    if found["vtpv"] < found["low"]:
+        return Finding(about, NOTED, words, f"residuals only {times}")
+    return Finding(about, BAD, words, f"residuals {times} (χ² test)")
+
+
+def _tested(adjustment, rows) -> tuple[float, float, str]:
+    """The largest |τ| of some observations, NaN if none of them is controlled; its critical value
+    among so many; both in words."""
+    tau = np.abs(adjustment.residuals["tau"][rows])
+    tau = tau[np.isfinite(tau)]
+    largest = float(np.fmax.reduce(tau, initial=np.nan))
+    limit = critical_value(adjustment, level=level_of_one(LEVEL, len(tau)))
+    words = (f"{significant(largest)}, critical value of the largest of {len(tau)} at "
+             f"{100 * LEVEL:g} % {significant(limit)}")  # fmt: skip
+    return largest, limit, words
+
+
+def _control(adjustment) -> Finding:
+    points = adjustment.problem.network.points
+    number = {role: int(points.has_role(role).sum()) for role in ("control", "fixed")}
+    if not any(number.values()):
+        return _free_network(adjustment)
+    parts = ", ".join(count(n, f"{role} point") for role, n in number.items() if n)
+    largest, limit, words = _tested(adjustment, adjustment.residuals["kind"] == "control")
+    if np.isnan(largest):
+        return _held_control(adjustment, parts)
+    words = f"{parts}; largest |τ| {words}"
+    if largest > limit:
+        return Finding("Control", BAD, words, "control contradicted")
+    if vague := adjustment.weakness.georeference:
+        brief = vague.partition(",")[0]
+        return Finding("Control", NOTED, f"{words}; {vague}", brief)
+    return Finding("Control", GOOD, words)
+
+
+def _free_network(adjustment) -> Finding:
+    """Without control a network is complete: in its datum, which is named."""
+    open_part = open_datum(adjustment)
+    if not open_part:
+        vague = adjustment.weakness.georeference
+        words = "no control points; the datum is given by other observations (Datum)"
+        brief = vague.partition(",")[0] or "no control points"
+        return Finding("Control", NOTED, f"{words}; {vague}" if vague else words, brief)
+    words = (f"no control points: a free network, {open_part} are those of the start values (datum "
+             f"{adjustment.network.datum})")  # fmt: skip
+    return Finding("Control", NOTED, words, "free network")
+
+
+def _held_control(adjustment, parts: str) -> Finding:
+    """Points without σ are exact: their errors are in the image residuals, and three of them fit
+    any network."""
+    rows, points = adjustment.residuals, adjustment.problem.network.points
+    ids = [id for id, fixed in zip(points.id, points.has_role("fixed")) if fixed]
+    own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
+    largest, limit, said = _tested(adjustment, own)
+    words, brief = f"{parts} held exactly, because no σ is stated; ", "control held exactly"
+    if len(ids) <= 3 or np.isnan(largest):
+        return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ", brief)
+    state = GOOD if largest <= limit else DOUBTFUL
+    return Finding("Control", state, f"{words}largest |τ| of their image points {said}", brief)
+
+
+def _checks(adjustment) -> list[Finding]:
+    found = adjustment.check_points
+    if found is None:
+        return []
+    unit = clean(adjustment.network.object_unit)
+    rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
+    table = adjustment.table("checks")
+    d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
+    known = (s > 0) & np.isfinite(d)
+    largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)
+    limit = critical_value(adjustment, level=level_of_one(LEVEL, int(known.sum())))
+    words = (
+        f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
+        f"difference {significant(largest)} times the σ of its intersection, critical value "
+        f"{significant(limit)}"
+    )
+    state = DOUBTFUL if largest > limit else GOOD
+    brief = f"a check point {significant(largest)} σ off"
+    return [Finding("Check points", state, words, brief)]
+
+
+def describe_reliability(r: np.ndarray, thing: str = "observation") -> Finding:
+    """The finding about redundancy numbers: blunders in weakly controlled observations hardly show,
+    which a design can change and an adjustment cannot."""
+    weak, loose = count_weak(r)
+    words = (f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), thing)} weakly "
+             f"controlled (r < 0.1), {loose} uncontrolled")  # fmt: skip
+    brief = f"{weak} of {count(len(r), thing)} weakly controlled"
+    return Finding("Reliability", NOTED if weak > WEAK_SHARE * len(r) else GOOD, words, brief)
+
+
+def _blunders(adjustment) -> Finding:
+    tau = np.abs(adjustment.residuals["tau"])
+    of_one, expected = critical_value(adjustment, level=LEVEL), LEVEL * len(tau)
+    over = int((tau > of_one).sum())
+    largest, limit, said = _tested(adjustment, slice(None))
+    words = (
+        f"{over} of {count(len(tau), 'observation')} over the critical value {significant(of_one)} "
+        f"of |τ| at {100 * LEVEL:g} % (by chance about {significant(expected, 2)}); largest {said}"
+    )
+    removed, suspects = len(adjustment.removed), len(adjustment.suspects)
+    if removed or suspects:
+        words += f"; {removed} removed by data snooping, {suspects} suspected"
+    rays = adjustment.counts.observations / 2 + removed
+    if largest > limit:
+        left = int((tau > limit).sum())
+        return Finding("Blunders", DOUBTFUL, words, f"{count(left, 'blunder')} likely")
+    if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
+        brief = f"{removed} of {rays:.0f} image points removed as blunders"
+        return Finding("Blunders", DOUBTFUL, words, brief)
+    many = over > explained_by_chance(len(tau))
+    return Finding("Blunders", NOTED if many else GOOD, words, f"{over} large residuals")
+
+
+def explained_by_chance(number: float, level: float = LEVEL) -> float:
+    """The largest number of rejections among good observations that chance explains: their mean,
+    three standard deviations, and one always."""
+    expected = level * number
+    return expected + 3 * np.sqrt(expected) + 1
+
+
+def _left_out(adjustment) -> list[Finding]:
+    """What was left out although it was measured often enough: a note if a test rejects as many by
+    chance, or if rays do not determine so few points; photographs never are."""
+    network = adjustment.problem.network
+    notes = [note for note in network.left_out if note.names]
+    if not notes:
+        return []
+    number: dict[str, int] = {}
+    for note in notes:
+        if note.measured:
+            thing = note.thing.removeprefix("tie ")
+            number[thing] = number.get(thing, 0) + len(note.names)
+    kept = {"image": len(network.images), "point": len(network.points),
+            "image point": len(network.observations)}  # fmt: skip
+    share = {thing: f"{n} of {count(n + kept.get(thing, 0), thing)} left out"
+             for thing, n in number.items()}  # fmt: skip
+    doubtful = [
+        thing for thing, n in number.items()
+        if thing == "image" or n > explained_by_chance(n + kept.get(thing, 0))
+    ]  # fmt: skip
+    few = sum(len(note.names) for note in notes if not note.measured)
+    words = [*share.values(), *([f"{few} without enough rays"] if few else [])]
+    brief = ", ".join(share[thing] for thing in doubtful or number) or "points without enough rays"
+    return [Finding("Left out", DOUBTFUL if doubtful else NOTED, "; ".join(words), brief)]
