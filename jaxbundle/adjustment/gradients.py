@@ -66,10 +66,11 @@ def check_gradients(
       arguments (parameters, ray) of `jaxbundle.cameras.project`; or a `Problem`, whose adjusted
       unknowns are differentiated with respect to `Data` (its own if no argument is given;
       `options` go to `jaxbundle.solve`).
-    - `step`: the longest of the differences, relative to the size of each leaf of the arguments.
-      Parameters of a camera model, of many units in one array, have the size that would move the
-      image point by its distance from the origin. It is halved until the differences, extrapolated to step 0, are ten times more exact than
-      `tolerance`, ten times at most (Ridders 1982).
+    - `step`: the longest of the differences, relative to the size of each leaf of the arguments;
+      for the arguments of a camera model, which have many units, relative to the change that
+      would move the image point by its distance from the origin. It is halved until the
+      differences, extrapolated to step 0, are ten times more exact than `tolerance`, ten times
+      at most (Ridders 1982).
     """
     if not callable(function) and not isinstance(function, CameraModel | Problem):
         raise InputError(
@@ -77,8 +78,9 @@ def check_gradients(
         )
     directions = integer("directions", directions)
     step, tolerance = positive("step", step), positive("tolerance", tolerance)
-    model = function if isinstance(function, CameraModel) else None
-    if model is not None:
+    by_effect = isinstance(function, CameraModel)
+    if isinstance(function, CameraModel):
+        model = function
         function = lambda p, ray: jnp.stack(project(model, tuple(p), *ray))
         arguments = tuple(jnp.asarray(leaf, float) for leaf in arguments)
     elif isinstance(function, Problem):
@@ -95,7 +97,7 @@ def check_gradients(
         jax.tree.map(lambda a: jnp.full(jnp.shape(a), _size(a)), tuple(arguments))
     )[0]
     f = lambda x: ravel_pytree(function(*unravel(x)))[0]
-    if model is not None:
+    if by_effect:
         sizes = _sizes_by_effect(f, x, sizes)
 
     @jax.jit
@@ -153,6 +155,6 @@ def _size(leaf) -> float:
 
 
 def _sizes_by_effect(f: Callable, x: jax.Array, otherwise: jax.Array) -> jax.Array:
-    """The change of every argument that would change f by |f|; `otherwise` where it has no effect."""
+    """The change of every argument that changes f by |f|; `otherwise` where it has no effect."""
     effects = jnp.linalg.norm(jax.jacfwd(f)(x), axis=0)
     return jnp.where(effects > 0, jnp.linalg.norm(f(x)) / effects, otherwise)
