@@ -84,6 +84,14 @@ def write_opencv_camera(path: Path) -> None:
         "--model", "opencv")  # fmt: skip
 
 
+def write_camera(path: Path) -> None:
+    """Near the camera of examples/board."""
+    path.write_text(
+        '[[camera]]\nid = "cam"\nmodel = "opencv"\nimage_size = [480, 360]\nfx = 620.0\n'
+        "fy = 620.0\ncx = 242.0\ncy = 178.0\nk1 = -0.12\nk2 = 0.05\n", encoding="utf-8",
+    )  # fmt: skip
+
+
 def write_calibration(photographs: slice) -> Callable[[Path], None]:
     return lambda path: run("calibrate", *PHOTOGRAPHS[photographs], "--board", "9x6", "--square",
                             SQUARE, "--free", "fx,fy,cx,cy,k1", "--json", path)  # fmt: skip
@@ -252,6 +260,8 @@ OWN: dict[str, Callable[[Path], None]] = {
     "rigs.npz": write_rig_arrays,
     "cameras.npz": write_camera_arrays,
     "made.csv": write_made,
+    "views": lambda path: copy_photographs(path, PHOTOGRAPHS[:6]),
+    "base.toml": write_camera,
     "photos": write_photos,
     "gcp_list.txt": write_control_of_photos,
     "scanner.toml": write_scanner,

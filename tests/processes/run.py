@@ -1,6 +1,7 @@
-"""The commands and Python blocks of README and docs, as a reader runs them: `make test-commands`.
+"""The commands and Python blocks of README and docs, and the commands on cameras of every model, as
+a reader runs them: `make test-commands`.
 
-    python tests/processes/run.py [--pages README.md …] [--seconds S] [--json FILE] [--models]
+    python tests/processes/run.py [--pages README.md brown …] [--seconds S] [--json FILE]
 
 A fresh clone of the repository, with what is changed and known to git, in a temporary folder, with
 an environment that has the clone and the packages of this Python, in which nothing but PATH, HOME
@@ -14,6 +15,7 @@ in an order that differs from commit to commit, so that runs of limited time rea
 
 import argparse
 import json
+import math
 import os
 import random
 import re
@@ -26,9 +28,11 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from camera_models import MODELS, processes_of_model
 from documents import ROOT, Process, pages, processes_of
 
 NOT_RUN = {
@@ -68,7 +72,8 @@ class Told:
 class Checkout:
     """A clone and an environment in which it is installed as by `pip install -e`."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, until: float = math.inf):
+        self.until = until  # of time.monotonic(): what runs longer is ended
         self.path, self.homes = folder / "jaxbundle", folder / "homes"
         git = lambda *words: subprocess.run(
             ["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True
@@ -112,7 +117,10 @@ class Checkout:
             stderr=err, start_new_session=True,
         )  # fmt: skip
         ended = threading.Event()
-        watching = threading.Thread(target=_watch, args=(process.pid, out.name, serves, ended))
+        limit = min(time.monotonic() + LONGEST, self.until)
+        watching = threading.Thread(
+            target=_watch, args=(process.pid, out.name, serves, ended, limit)
+        )
         watching.start()
         _, status, usage = os.wait4(process.pid, 0)
         ended.set()
@@ -129,9 +137,8 @@ class Checkout:
                 usage.ru_utime + usage.ru_stime, *texts)  # fmt: skip
 
 
-def _watch(group: int, output: str, serves: bool, ended: threading.Event) -> None:
+def _watch(group: int, output: str, serves: bool, ended: threading.Event, limit: float) -> None:
     """Read the page of a command that serves one, and end it by Ctrl-C; end what takes too long."""
-    limit = time.monotonic() + LONGEST
     while serves and not ended.wait(0.2) and time.monotonic() < limit:
         if found := re.search(r"http://\S+", Path(output).read_text("utf-8", "replace")):
             with urllib.request.urlopen(found[0], timeout=60) as answer:
@@ -139,7 +146,8 @@ def _watch(group: int, output: str, serves: bool, ended: threading.Event) -> Non
             os.killpg(group, signal.SIGINT)
             break
     if not ended.wait(max(limit - time.monotonic(), 0)):
-        os.killpg(group, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has just ended
+            os.killpg(group, signal.SIGKILL)
 
 
 def why_not(process: Process) -> str | None:
@@ -156,11 +164,11 @@ def expected_status(process: Process) -> int:
 
 
 def run_page(
-    checkout: Checkout, page: str, chosen: list[Process] | None = None, once: bool = False
+    checkout: Checkout, page: str, chosen: list[Process], home: Path | None = None
 ) -> Iterator[Told]:
-    """Every process of a page, cold and then warm; `chosen`: which of them; `once`: with the home
-    of all others."""
-    processes = [one for one in (chosen or processes_of(page)) if not why_not(one)]
+    """The chosen processes of a page, cold and then warm; `home`: once, and all of them with this
+    one."""
+    processes = [one for one in chosen if not why_not(one)]
     own = checkout.homes.parent / "own" / page.replace("/", "-")
     own.mkdir(parents=True)
     names = {}
@@ -169,7 +177,7 @@ def run_page(
 
         write_own_files(own, page, [one.text for one in processes])
         names = OWN_NAMES
-    for warm in (True,) if once else (False, True):
+    for warm in (True,) if home else (False, True):
         checkout.clean()
         shutil.copytree(own, checkout.path, dirs_exist_ok=True)
         for one in processes:
@@ -185,21 +193,20 @@ def run_page(
                     encoding="utf-8",
                 )
                 words = ["python", "-c", script.read_text(encoding="utf-8")]
-            home = checkout.homes / page.replace("/", "-") / str(processes.index(one))
-            home = checkout.homes / "all" if once else home
-            told = checkout.run(words, home, one.text.startswith("jaxbundle explore"))
+            own_home = checkout.homes / page.replace("/", "-") / str(processes.index(one))
+            told = checkout.run(words, home or own_home, one.text.startswith("jaxbundle explore"))
             status, clock, processor, out, err = told
             yield Told(one.name, warm, status, expected_status(one), clock, processor, out, err)
-    if not once:
+    if not home:
         shutil.rmtree(checkout.homes)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pages", nargs="+", help="these pages alone")
+    parser.add_argument("--pages", nargs="+", help="these pages or camera models")
     parser.add_argument("--only", help="commands with these words alone")
-    parser.add_argument("--seconds", type=float, help="begin no page after this time")
-    parser.add_argument("--once", action="store_true", help="once, with one home for all")
+    parser.add_argument("--seconds", type=float, help="end after this time")
+    parser.add_argument("--home", type=Path, help="run them once, with this home: quicker")
     parser.add_argument("--json", type=Path, help="write what every process said")
     given = parser.parse_args()
     import jaxbundle
@@ -209,16 +216,23 @@ def main() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     begin, results, missed = time.monotonic(), [], []
     with tempfile.TemporaryDirectory() as folder:
-        checkout = Checkout(Path(folder))
-        first, *others = given.pages or pages()
+        until = begin + (given.seconds or math.inf)
+        checkout = Checkout(Path(folder), until)
+        first, *others = given.pages or [*pages(), *MODELS]
         if not given.pages:
             random.Random(checkout.commit).shuffle(others)
         for page in (first, *others):
-            chosen = [one for one in processes_of(page) if (given.only or "") in one.text]
-            if given.seconds and time.monotonic() - begin > given.seconds:
-                missed += [page] * bool(chosen)
+            found = processes_of_model(page) if page in MODELS else processes_of(page)
+            chosen = [one for one in found if (given.only or "") in one.text]
+            if not chosen:
                 continue
-            for told in run_page(checkout, page, chosen, given.once) if chosen else ():
+            if time.monotonic() > until:
+                missed.append(page)
+                continue
+            for told in run_page(checkout, page, chosen, given.home and given.home.resolve()):
+                if time.monotonic() > until:
+                    missed.append(page)
+                    break
                 results.append(told)
                 print(line_of(told), flush=True)
                 if given.json:
@@ -226,10 +240,10 @@ def main() -> None:
                     given.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
     failed = [told for told in results if told.failed]
     ran = len({told.name for told in results})
-    times = "once" if given.once else "cold and warm"
+    times = "once" if given.home else "cold and warm"
     print(f"{ran} commands and blocks, each {times}: {len(failed)} failures")
     for page in missed:
-        print(f"not reached: {page}")
+        print(f"not reached, or not to its end: {page}")
     for told in failed:
         print(f"\n{line_of(told)}\n{told.stdout[-500:]}\n{told.stderr[-2000:]}")
     sys.exit(bool(failed))
