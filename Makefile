@@ -1,5 +1,5 @@
-# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-oldest`,
-# `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
+# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-commands`,
+# `make test-oldest`, `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
 # installed, else venv and pip) and install the package: `demo` with plots, the others with what the tests
 # need; `docs` also Sphinx, `bench` also what it compares with; `test-oldest` and `test-newest` have
 # environments of their own.
@@ -19,7 +19,8 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all random-problems mutants bench docs install install-demo install-docs clean \
+.PHONY: demo test test-all test-commands random-problems mutants bench docs install install-demo \
+  install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
@@ -57,6 +58,11 @@ test test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
+
+# Commands and Python blocks of README and docs, and commands on every camera model, as processes from a
+# clone with an empty home, cold and warm: an hour on two cores, or as much as fits: make test-commands SECONDS=500
+test-commands: install
+	$(BIN)/python tests/processes/run.py $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PAGES),--pages $(PAGES))
 
 # 500 random problems by the engine and by dense algebra, in WORKERS processes; 40 of them are in `make test`.
 random-problems: install

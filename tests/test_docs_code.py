@@ -117,35 +117,3 @@ def test_result(tmp_path, monkeypatch):
 @pytest.mark.further
 def test_measure():
     assert len(run_page("measure")["points"]) == 54
-
-
-@pytest.mark.further
-@pytest.mark.slow
-def test_readme(convergent4, views):
-    """Its blocks in their order, with a reader's own tables and arrays."""
-    first, second, third, fourth = blocks_of(ROOT / "README.md")
-    given = convergent4.problem.network
-    rays = zip(given.observations.image, given.observations.point, given.observations.xy)
-    names = {
-        "cameras": given.cameras, "images": [{"id": i, "camera": "cam"} for i in given.images.id],
-        "points": [{"id": p} for p in given.points.id],
-        "observations": [
-            {"image": given.images.id[i], "point": given.points.id[p], "x": x, "y": y}
-            for i, p, (x, y) in rays
-        ],
-        "stations": jaxbundle.ring_of_stations(4, radius=3.0, height=2.0, roll_every=2),
-        "targets": jaxbundle.grid_of_targets(4, 3, 0.5, relief=0.3),
-        "camera": jaxbundle.Camera("cam", "brown", {"c": 24.0}, free=("c", "x0", "y0")),
-    }  # fmt: skip
-    exec(first, names)
-    assert names["result"].redundancy == convergent4.redundancy
-    exec(second.replace('datum="inner")', 'datum="inner"); made = network', 1), names)
-    assert len(names["made"].observations) == len(given.observations)
-    held = jaxbundle.simulate(
-        names["stations"], names["targets"], names["camera"], noise=0.0005, control=range(4)
-    )
-    names["problem"] = jaxbundle.make_problem(jaxbundle.check_network(held))
-    exec(third, names)
-    assert np.isfinite(names["values"].position).all()
-    board, images, *_ = views
-    exec(fourth, names | {"board": board, "images": np.reshape(images, (1, 5, -1, 2))})

@@ -16,28 +16,36 @@ from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
 
+MOST_HALVINGS = 10
+"""The shortest step is 2¹⁰ = 1000 times shorter than the given one: from 1e-4 to 1e-7, whose
+differences rounding (1e-16/step) makes less exact again than longer ones."""
+
 
 @dataclasses.dataclass(frozen=True)
 class GradientCheck:
     """Largest relative differences over the tested directions.
 
-    `forward`: jvp against central differences; `reverse`: vjp against jvp. Both are relative to
-    the size of the derivative in that direction.
+    `forward`: jvp against central differences; `reverse`: vjp against jvp; `differences`: the
+    error of the central differences, as they estimate it themselves. All are relative to the size
+    of the derivative in that direction.
     """
 
     forward: float
     reverse: float
     tolerance: float
+    differences: float
 
     @property
     def passed(self) -> bool:
         return self.forward < self.tolerance and self.reverse < 1e-9
 
     def __str__(self) -> str:
-        verdict = "agree" if self.passed else "DISAGREE"
+        verdict, advice = "agree" if self.passed else "DISAGREE", ""
+        if not self.passed and self.differences > self.tolerance:
+            advice = f"; the differences are good to {self.differences:.1e} only: try another step"
         return (
             f"derivatives {verdict}: autodiff against central differences {self.forward:.1e}, "
-            f"reverse against forward {self.reverse:.1e} (relative)"
+            f"reverse against forward {self.reverse:.1e} (relative){advice}"
         )
 
 
@@ -58,8 +66,11 @@ def check_gradients(
       arguments (parameters, ray) of `jaxbundle.cameras.project`; or a `Problem`, whose adjusted
       unknowns are differentiated with respect to `Data` (its own if no argument is given;
       `options` go to `jaxbundle.solve`).
-    - `step`: of the differences, relative to the size of each leaf of the arguments; extrapolated
-      from h and h/2 (Richardson), so the error is O(h⁴).
+    - `step`: the longest of the differences, relative to the size of each leaf of the arguments;
+      for the arguments of a camera model, which have many units, relative to the change that
+      would move the image point by its distance from the origin. It is halved until the
+      differences, extrapolated to step 0, are ten times more exact than `tolerance`, ten times
+      at most (Ridders 1982).
     """
     if not callable(function) and not isinstance(function, CameraModel | Problem):
         raise InputError(
@@ -67,9 +78,11 @@ def check_gradients(
         )
     directions = integer("directions", directions)
     step, tolerance = positive("step", step), positive("tolerance", tolerance)
+    by_effect = isinstance(function, CameraModel)
     if isinstance(function, CameraModel):
         model = function
         function = lambda p, ray: jnp.stack(project(model, tuple(p), *ray))
+        arguments = tuple(jnp.asarray(leaf, float) for leaf in arguments)
     elif isinstance(function, Problem):
         problem = function
         arguments = arguments or (problem.data.image_xy,)
@@ -84,6 +97,8 @@ def check_gradients(
         jax.tree.map(lambda a: jnp.full(jnp.shape(a), _size(a)), tuple(arguments))
     )[0]
     f = lambda x: ravel_pytree(function(*unravel(x)))[0]
+    if by_effect:
+        sizes = _sizes_by_effect(f, x, sizes)
 
     @jax.jit
     def derivatives(x, d, c):
@@ -93,23 +108,53 @@ def check_gradients(
 
     outputs = jax.eval_shape(f, x).shape
     random = np.random.default_rng(integer("seed", seed, 0))
-    worst, transposed = 0.0, 0.0
+    forward, reverse, differences = [], [], []
     for _ in range(directions):
         d = jnp.asarray(random.normal(size=x.shape)) * sizes
         c = jnp.asarray(random.normal(size=outputs))
         _, along, pulled = derivatives(x, d, c)
+        scale = max(float(jnp.linalg.norm(along)), 1e-300)
         y = lambda h, d=d, c=c: derivatives(x + h * d, d, c)[0]
-        difference = lambda h, y=y: (y(h) - y(-h)) / (2 * h)
-        extrapolated = (4 * difference(step / 2) - difference(step)) / 3
-        scale = float(jnp.linalg.norm(along))
-        worst = max(worst, float(jnp.linalg.norm(along - extrapolated)) / max(scale, 1e-300))
+        extrapolated, error = _differentiate(y, step, tolerance / 10 * scale)
+        forward.append(float(jnp.linalg.norm(along - extrapolated)) / scale)
+        differences.append(error / scale)
         apart = abs(float(jnp.vdot(c, along)) - float(jnp.vdot(pulled, d)))
-        bound = float(jnp.linalg.norm(c)) * scale
-        transposed = max(transposed, apart / max(bound, 1e-300))
-    return GradientCheck(worst, transposed, tolerance)
+        reverse.append(apart / (float(jnp.linalg.norm(c)) * scale))
+    largest = lambda found: float(np.max(found))  # NaN where one of them is
+    return GradientCheck(largest(forward), largest(reverse), tolerance, largest(differences))
+
+
+def _differentiate(y: Callable, step: float, sufficient: float) -> tuple[jax.Array, float]:
+    """dy/dh at h = 0 and the norm of its error, from central differences at the steps h, h/2, …
+
+    D₀(h) = (y(h) − y(−h))/2h has an error series in h²; Dⱼ(h) = Dⱼ₋₁(h) + (Dⱼ₋₁(h) −
+    Dⱼ₋₁(2h))/(4ʲ − 1) is free of its first j terms. The error of Dⱼ(h) is estimated by its larger
+    distance from Dⱼ₋₁(h) and Dⱼ₋₁(2h), and the value with the smallest is kept (Ridders, Advances
+    in Engineering Software 4, 1982).
+    """
+    distance = lambda a, b: float(jnp.linalg.norm(a - b))
+    row = [(y(step) - y(-step)) / (2 * step)]
+    best, error = row[0], np.inf
+    for _ in range(MOST_HALVINGS):
+        step, before = step / 2, row
+        row = [(y(step) - y(-step)) / (2 * step)]
+        for j, longer in enumerate(before, 1):
+            row.append(row[-1] + (row[-1] - longer) / (4**j - 1))
+            estimate = max(distance(row[j], row[j - 1]), distance(row[j], longer))
+            if estimate < error:
+                best, error = row[j], estimate
+        if error <= sufficient:
+            break
+    return best, error
 
 
 def _size(leaf) -> float:
     array = np.asarray(leaf)
     size = float(np.sqrt(np.mean(array**2))) if array.size else 0.0
     return size if size > 0 else 1.0
+
+
+def _sizes_by_effect(f: Callable, x: jax.Array, otherwise: jax.Array) -> jax.Array:
+    """The change of every argument that changes f by |f|; `otherwise` where it has no effect."""
+    effects = jnp.linalg.norm(jax.jacfwd(f)(x), axis=0)
+    return jnp.where(effects > 0, jnp.linalg.norm(f(x)) / effects, otherwise)

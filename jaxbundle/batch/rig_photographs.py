@@ -67,9 +67,8 @@ def _rig(views: Mapping[str, BoardViews | str]) -> tuple[Rig, dict] | str:
         rig = rig_of_views(given)
     except InputError as error:
         return str(error)
-    told: dict = {"image_size": {name: list(size) for name, size in zip(rig.cameras, rig.sizes)}}
     failed = {f"{name}/{photo}": why for name, one in given.items() for photo, why in one.failed}
-    return rig, told | ({"photographs_not_used": failed} if failed else {})
+    return rig, {"photographs_not_used": failed} if failed else {}
 
 
 def rig_of_views(views: Mapping[str, BoardViews]) -> Rig:

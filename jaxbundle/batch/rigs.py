@@ -124,6 +124,8 @@ def _solve(
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}, None
     row: dict[str, Any] = {"status": STATUS[CONVERGED] if result.converged else result.termination}
     row |= {"model": str(settings.model.name), "views": len(result.network.images)}
+    if len(rig.cameras) > 1:
+        row["image_size"] = {name: list(size) for name, size in zip(rig.cameras, rig.sizes)}
     if excluded:
         row["epochs_not_used"] = excluded
     row |= result_dict(result, brief=True)

@@ -9,6 +9,8 @@ Range: all rays, −180° < λ ≤ 180° and |φ| ≤ 90°; pixels beyond have n
 straight behind: a point measured on one side of it and computed on the other has a residual of the
 width of the image, which data snooping removes. At the poles the longitude is undetermined.
 
+A change of cx is a rotation about the vertical axis: it is not estimated by default.
+
 Units: pixels, (0, 0) the centre of the upper-left pixel, u right, v down.
 
 Source: Snyder (1987), Map Projections: A Working Manual, USGS Professional Paper 1395, section 12
@@ -40,5 +42,5 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 EQUIRECTANGULAR = CameraModel(
     "equirectangular", ("fx", "fy", "cx", "cy"), project=project, unproject=unproject, unit="px",
-    image="equidistant",
+    image="equidistant", free=("fx", "fy", "cy"),
 )  # fmt: skip

@@ -46,7 +46,13 @@ from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
-from jaxbundle.io.networks.rig_result import is_rig_result, read_rig_result
+from jaxbundle.io.networks.rig_result import (
+    file_of_line,
+    is_rig_line,
+    is_rig_result,
+    read_rig_line,
+    read_rig_result,
+)
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
     fill_ros_stereo,
@@ -168,6 +174,7 @@ FORMATS: dict[str, Format] = {
         is_ros_stereo, read_ros_stereo, "a folder with two camera_info files of ROS"
     ),
     "rig": Format(is_rig_result, read_rig_result, "result.json of jaxbundle calibrate --rig"),
+    "rig-line": Format(is_rig_line, read_rig_line, "a line of jaxbundle batch: FILE.jsonl#KEY"),
 }
 
 
@@ -345,8 +352,8 @@ def read_network(
                 f"--format {format}: {what}; a network is read as {', '.join(FORMATS)}"
             )
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
-    if not os.path.exists(path):
-        raise InputError(f"{path}: no such file or folder")
+    if not os.path.exists(file_of_line(path)):
+        raise InputError(f"{file_of_line(path)}: no such file or folder")
     format = format or recognise_format(path)
     if format is None and is_camera_file(path):
         raise InputError(

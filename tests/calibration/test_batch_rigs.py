@@ -46,7 +46,7 @@ def mounting(row):
     return row["further_unknowns"]["mounting"]["right of rig"]
 
 
-def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs):
+def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs, tmp_path):
     found = calibrate(rigs, snooping="pope")
     assert found.status.tolist() == ["converged"] * 4 + ["not solved"]
     first, second, third, fourth, fifth = found.rows
@@ -74,6 +74,13 @@ def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs):
             assert of[parameter]["sigma"] == pytest.approx(sigma, rel=1e-3)
     assert first["rms"] == pytest.approx(np.sqrt(np.mean([r**2 for r in single.rms.values()])),
                                          rel=1e-6)  # fmt: skip
+    # as a line of `jaxbundle batch`, it is a rig for other programs
+    (tmp_path / "rigs.jsonl").write_text(json.dumps({"key": "car", "settings": {}} | first))
+    rig = jaxbundle.io.read_network(tmp_path / "rigs.jsonl#car")
+    assert [camera.image_size for camera in rig.cameras] == [render.LENS.size] * 2
+    assert rig.cameras[1].parameters["fx"] == first["cameras"]["right"]["parameters"]["fx"]["value"]
+    length = np.linalg.norm(rig.images.position[1] - rig.images.position[0])
+    assert length == pytest.approx(np.linalg.norm([x["value"] for x in one[:3]]))
     table = found.population(list("abcde")).table()
     assert "right fx" in table and "mounting right of rig X0" in table
     assert not any("left of rig" in name for name in table)  # the reference is held

@@ -1,5 +1,6 @@
 """What every camera model must satisfy: round trips, conventions and derivatives."""
 
+import dataclasses
 from functools import cache, partial
 
 import jax
@@ -164,3 +165,23 @@ def test_models_are_static_arguments(case):
 def test_unknown_models_are_named_with_the_closest():
     with pytest.raises(ValueError, match="'Brwon': did you mean 'brown'.*snavely"):
         cameras.get_model("Brwon")
+
+
+@each_case
+def test_what_is_free_by_default_is_no_rotation_of_the_camera(case):
+    """Otherwise no photographs could determine it: the Jacobian by the default parameters and a
+    rotation of the rays has full rank, at the noise of differences in its smallest singular value.
+    """
+    rays = image_rays(case, case.grid())
+    free = jnp.array([case.model.parameters.index(name) for name in case.model.free])
+
+    def image(changes, turn):
+        p = jnp.array(case.p).at[free].add(changes)
+        return project(dataclasses.replace(case, values=dict(zip(case.model.parameters, p))),
+                       rays + jnp.cross(turn, rays))  # fmt: skip
+
+    J = jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(len(free)), jnp.zeros(3)), -1)
+    J = np.asarray(J).reshape(-1, len(free) + 3)
+    J = J[np.isfinite(J).all(1)]
+    s = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
+    assert s[-1] > 1e-9 * s[0]

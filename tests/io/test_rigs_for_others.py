@@ -21,6 +21,7 @@ from jaxbundle.io.exchange import convert
 from jaxbundle.io.formats import read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.kalibr import write_kalibr
+from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.io.networks.stereo import fill_ros_stereo, write_opencv_stereo
 from jaxbundle.network.tables import Camera
@@ -253,8 +254,53 @@ def result_json(folder, **changes):
 @pytest.mark.parametrize("name", ["camchain.yaml", "mrcal", "stereo.yaml", "camera_info"])
 def test_the_json_of_a_calibration_is_converted(tmp_path, name):
     done = convert(result_json(tmp_path), tmp_path / name)
-    assert any("unit of the board" in line for line in done.warnings)
+    assert [line for line in done.warnings if "unit of the board" not in line] == []
     check_back(tmp_path / name, rig()[0])
+
+
+def rig_line(key="cars/7", **changes):
+    """The part of a line of `batch --rig` that is read."""
+    mountings, cameras, sizes = {}, {}, {}
+    for k, base in enumerate(([0.0, 0, 0], BASES["right"])):
+        one, angles = camera(k), angles_of(TURNS[k : k + 1])[0]
+        names = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+        mountings[f"{one.id} of rig"] = {
+            name: {"value": float(x)} for name, x in zip(names, (*base, *angles))
+        }
+        values = {name: {"value": value} for name, value in one.parameters.items()}
+        cameras[one.id], sizes[one.id] = {"model": "opencv", "parameters": values}, [752, 480]
+    row = {"key": key, "status": "converged", "settings": {}, "converged": True,
+           "cameras": cameras, "image_size": sizes,
+           "further_unknowns": {"mounting": mountings}}  # fmt: skip
+    return json.dumps(row | changes)
+
+
+@pytest.mark.parametrize("name", ["camchain.yaml", "mrcal", "stereo.yaml", "camera_info"])
+def test_a_rig_of_a_batch_is_converted(tmp_path, name):
+    file = tmp_path / "rigs.jsonl"
+    camera_alone = json.dumps({"key": "A17", "status": "converged", "parameters": {}})
+    file.write_text(rig_line(settings={"pixel_size": 0.004}))  # the only one needs no key
+    assert read_network(file).cameras[1].pixel_size == (0.004, 0.004)
+    file.write_text("\n".join([camera_alone, rig_line("cars/6"), rig_line("rigs.npz#7")]) + "\n")
+    done = convert(f"{file}#rigs.npz#7", tmp_path / name)
+    assert [line for line in done.warnings if "image points" in line] == []
+    check_back(tmp_path / name, rig()[0])
+    for text, words in (
+        (f"{file}", "2 rigs; name one.*'cars/6', 'rigs.npz#7'"),
+        (f"{file}#cars/5", "no rig 'cars/5'; did you mean 'cars/6'"),
+        (f"{tmp_path / 'no.jsonl'}#cars/5", "no.jsonl: no such file"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            read_network(text)
+    for line, words in (
+        (camera_alone, "no rig is in it"),
+        ("text", "line 1: not a line of jaxbundle batch"),
+        (rig_line(converged=False, status="iteration limit"), r"not solved \(iteration limit\)"),
+        (rig_line(cameras={}), "cars/7: not a line of jaxbundle batch --rig: has no 'c0'"),
+    ):  # fmt: skip
+        file.write_text(line + "\n")
+        with pytest.raises(InputError, match=words):
+            read_network(file)
 
 
 def test_results_that_are_no_rig(tmp_path):

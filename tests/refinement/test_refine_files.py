@@ -54,19 +54,23 @@ ROWS = {"points": ("id", "role", "longitude", "latitude", "height"),
 
 @pytest.fixture
 def folder(tmp_path):
+    write_refinement(tmp_path)
+    return tmp_path
+
+
+def write_refinement(folder):
     """A refinement as files: an image with bias and jitter, 40 control points."""
     rng = np.random.default_rng(5)
     places, heights = spread(rng)
     bias, amplitude = np.array([1e-4, -1.5e-4, 4e-4]), np.array([4e-5, 2e-5, 0.0])
     X = ground_with_sine(satellite(), bias, np.zeros(3), amplitude, heights, places)
-    write_scanner_image(tmp_path, "A", satellite(), WGS84)
+    write_scanner_image(folder, "A", satellite(), WGS84)
     longitude, latitude, h = (np.asarray(v) for v in geodetic(WGS84, tuple(np.asarray(X).T)))
     table = zip(np.degrees(longitude).tolist(), np.degrees(latitude).tolist(), h.tolist())
-    write(tmp_path, "points", [(f"P{k}", "control", *row) for k, row in enumerate(table)])
+    write(folder, "points", [(f"P{k}", "control", *row) for k, row in enumerate(table)])
     seen = measured(places, rng).xy.tolist()
-    write(tmp_path, "observations", [("A", f"P{k}", *row) for k, row in enumerate(seen)])
-    (tmp_path / "refine.toml").write_text(TEXT)
-    return tmp_path
+    write(folder, "observations", [("A", f"P{k}", *row) for k, row in enumerate(seen)])
+    (folder / "refine.toml").write_text(TEXT)
 
 
 def write(folder, name, rows):

@@ -128,10 +128,8 @@ def ground(X, Y):
     return 200 + 12 * np.sin(X / 60) * np.cos(Y / 70)
 
 
-@pytest.fixture(scope="module")
-def satellite(tmp_path_factory):
-    """Two RPC images; the second is moved by 3 lines against its coefficients."""
-    folder = tmp_path_factory.mktemp("satellite")
+def write_satellite(folder):
+    """a.tif and b.tif with RPC; the second is moved by 3 lines against its coefficients."""
     around = neighbourhood(np.radians(10.0), np.radians(45.0))
     scene = Scene((HeightField(ground, (-600, -600, 600, 600)),), (Texture(1.0, 2, 512),))
     blank = np.zeros((LINES, SAMPLES), np.float32)
@@ -145,7 +143,13 @@ def satellite(tmp_path_factory):
         shot = render_rays(scene, o, d, Sensor(noise=1.5, seed=len(name)))
         cv2.imwrite(str(folder / f"{name}.tif"), shot.grey.astype(np.uint16) * 9 + 100)
         write_rpc(folder / f"{name}_RPC.TXT", coefficients(by_height))
-    return folder, around
+    return around
+
+
+@pytest.fixture(scope="module")
+def satellite(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("satellite")
+    return folder, write_satellite(folder)
 
 
 @pytest.mark.parametrize("dense", [(), ("--dense",)])

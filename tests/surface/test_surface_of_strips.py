@@ -80,14 +80,20 @@ def seen_by(image, scene, seed):
     return render_rays(scene, top.reshape(shape), d.reshape(shape), Sensor(noise=2, seed=seed)).grey
 
 
-@pytest.mark.further
-def test_scanner_files_become_a_cloud_a_dsm_and_an_orthophoto(tmp_path, command):
+def write_strips(folder, names):
+    """A strip looking ahead and one looking back, with their scanner files; returns the texture."""
     texture = Texture(0.25, seed=2, side=512)
     scene = Scene((HeightField(ground, (-120, -120, 120, 220)),), (texture,))
-    for name, sign in (("ahead", 1), ("back", -1)):
+    for name, sign in zip(names, (1, -1)):
         image = strip(0.2 * sign, sign * 1000 * np.tan(0.2))
-        write_scanner_image(tmp_path, name, image, None)
-        cv2.imwrite(str(tmp_path / f"{name}.tif"), seen_by(image, scene, sign + 1))
+        write_scanner_image(folder, name, image, None)
+        cv2.imwrite(str(folder / f"{name}.tif"), seen_by(image, scene, sign + 1))
+    return texture
+
+
+@pytest.mark.further
+def test_scanner_files_become_a_cloud_a_dsm_and_an_orthophoto(tmp_path, command):
+    texture = write_strips(tmp_path, ("ahead", "back"))
     out = tmp_path / "out"
     told = command(
         "surface", tmp_path / "ahead.toml", tmp_path / "back.toml", "--out", out, "--zmin", -9,

@@ -86,7 +86,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
         points=Points((), (), np.zeros((0, 3)), np.zeros((0, 3))),
         observations=Observations(none, none, np.zeros((0, 2)), np.zeros((0, 2))),
         **settings,
-    ).warn("there are no image points: nothing can be adjusted")  # fmt: skip
+    )  # fmt: skip
 
 
 def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
@@ -96,7 +96,7 @@ def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
         Source(where, None, "camera"), names, names, none + np.eye(3), none[:, 0]
     )
     project = {"datum": "inner", "residuals": "measured", "object_unit": "model"}
-    return _without_points(cameras, images, project).replace(warnings=())
+    return _without_points(cameras, images, project)
 
 
 def rig_network(

@@ -1,4 +1,5 @@
-"""The rig in the JSON of `jaxbundle calibrate --rig`: cameras, and their mountings.
+"""The rig in the JSON of `jaxbundle calibrate --rig`, or a line of `jaxbundle batch`: cameras, and
+their mountings. In the JSON
 
     rig.reference                           the camera without a mounting
     rig.mountings.CAMERA.base, rotation     projection centre in the frame of the reference camera,
@@ -6,26 +7,38 @@
     rig.cameras.CAMERA.PARAMETER.value      of the joint adjustment
     calibrations.CAMERA                     model and image size
 
+and in a line
+
+    cameras.CAMERA                          model and parameters
+    image_size.CAMERA                       columns and rows
+    further_unknowns.mounting               "CAMERA of RIG": X0, Y0, Z0, omega, phi, kappa, the base
+                                            and the angles of R; zeros for the reference
+
 Frames here have y up and look along −z. The network is that of a chain of Kalibr: one image a
 camera, the reference at the origin, looking along Z with Y down.
 """
 
+import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.geometry.pose_conventions import D
 from jaxbundle.io.networks.assemble import rig_network
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.build import make_cameras
+from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning, parse_json
 
+LINE = re.compile(r"(.+\.jsonl)(?:#(.+))?", re.S)
+"""A file of lines, and the key of one of them, which may have a # itself."""
 UNIT = "model"
 REFERENCE = {"base": [0, 0, 0], "rotation": np.eye(3).tolist()}
 IN_BOARD_UNITS = (
@@ -39,6 +52,67 @@ def is_rig_result(path: Path) -> bool:
         return False
     return re.match(rb'\s*\{\s*"converged"\s*:\s*\w+\s*,\s*"calibrations"\s*:',
                     beginning(path, 1000)) is not None  # fmt: skip
+
+
+def file_of_line(path: Path) -> Path:
+    """The file of a line, `FILE.jsonl#KEY`; any other path as it is."""
+    found = LINE.fullmatch(str(path))
+    return Path(found[1]) if found else path
+
+
+def is_rig_line(path: Path) -> bool:
+    """Whether a path names lines of `jaxbundle batch`, or one of them."""
+    return LINE.fullmatch(str(path)) is not None and file_of_line(path).is_file()
+
+
+def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The rig of a line `FILE.jsonl#KEY`; without KEY of the only rig of the file.
+
+    **Raises:** `InputError` naming file, line and entry.
+    """
+    path = Path(path)
+    file, key = LINE.fullmatch(str(path)).groups()
+    rigs = {row["key"]: row for row in _rows(Path(file))
+            if "mounting" in row.get("further_unknowns", {})}  # fmt: skip
+    if not rigs:
+        raise InputError(f"{file}: no rig is in it; expected lines of jaxbundle batch --rig")
+    if key is None and len(rigs) > 1:
+        raise InputError(f"{file}: {len(rigs)} rigs; name one: {file}#KEY, with KEY one of "
+                         f"{list_some(rigs)}")  # fmt: skip
+    row = rigs.get(next(iter(rigs)) if key is None else key)
+    if row is None:
+        raise InputError(f"{file}: no rig {key!r}{did_you_mean(str(key), rigs)}")
+    where = f"{file}, {row['key']}"
+    try:
+        if row["converged"] is not True:
+            raise InputError(f"{where}: was not solved ({row['status']})")
+        mountings = {label.rpartition(" of ")[0]: {name: x["value"] for name, x in found.items()}
+                     for label, found in row["further_unknowns"]["mounting"].items()}  # fmt: skip
+        cameras, pixel = [], row.get("settings", {}).get("pixel_size")
+        for id in mountings:
+            entry = row["cameras"][id]
+            values, about = entry["parameters"], {"image_size": row["image_size"][id]}
+            about["pixel_size"] = pixel and [pixel, pixel]
+            cameras.append(_camera(where, id, values, entry["model"], about))
+        bases = [np.array([m[x] for x in ("X0", "Y0", "Z0")]) for m in mountings.values()]
+        angles = np.array([[m[x] for x in ("omega", "phi", "kappa")] for m in mountings.values()])
+        turns = [np.asarray(matrix_from_omega_phi_kappa(row)) for row in angles]
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{where}: not a line of jaxbundle batch --rig: {what}") from None
+    return network_of_rig(Path(file), cameras, turns, bases, overrides)
+
+
+def _rows(file: Path) -> Iterator[dict]:
+    for number, line in enumerate(read_text(file).splitlines(), 1):
+        try:
+            row = json.loads(line)
+            row["key"], row["status"]
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise InputError(f"{file}, line {number}: not a line of jaxbundle batch") from None
+        yield row
 
 
 def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -56,7 +130,11 @@ def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
                 "calibrate --rig"
             )
         mountings = {rig["reference"]: REFERENCE, **rig["mountings"]}
-        cameras = [_camera(path, id, rig["cameras"][id], parts[id]) for id in mountings]
+        cameras = []
+        for id in mountings:
+            (entry,) = parts[id]["cameras"].values()
+            about = parts[id].get("calibration", {})
+            cameras.append(_camera(str(path), id, rig["cameras"][id], entry["model"], about))
         bases = [np.array(m["base"], float).reshape(3) for m in mountings.values()]
         turns = [np.array(m["rotation"], float).reshape(3, 3) for m in mountings.values()]
     except InputError:
@@ -86,14 +164,12 @@ def network_of_rig(
     return rig_network(path, cameras, R, t, overrides, warnings=[IN_BOARD_UNITS], unit=UNIT)
 
 
-def _camera(path: Path, id: str, values: Mapping, calibration: Mapping) -> Camera:
-    (entry,) = calibration["cameras"].values()
-    about = calibration.get("calibration", {})
-    row = {"id": id, "model": entry["model"]}
+def _camera(where: str, id: str, values: Mapping, model: str, about: Mapping) -> Camera:
+    row = {"id": id, "model": model}
     row |= {name: value["value"] for name, value in values.items()}
     if about.get("image_size"):
         row["image_size"] = about["image_size"]
     if about.get("pixel_size"):
         row["pixel_size"] = about["pixel_size"]
-    (camera,) = make_cameras([row], str(path))
+    (camera,) = make_cameras([row], where)
     return camera

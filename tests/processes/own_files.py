@@ -1,0 +1,290 @@
+"""What a reader of README and docs has: the files that their commands name, small, made here.
+
+`OWN` lists them by their names; `write_own_files` makes those that a text names. `OWN_NAMES` are
+the variables that a page takes from its reader.
+"""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+ROOMS = ("", "measure", "reconstruction", "surface", "io", "refinement", "cli")
+sys.path[:0] = [str(ROOT / "tests" / room) for room in ROOMS]
+
+import jaxbundle  # noqa: E402
+
+BOARD, SQUARE = (9, 6), 0.03
+PHOTOGRAPHS = sorted((EXAMPLES / "board").glob("photo_*.jpg"))[:12]
+
+OWN_NAMES = {
+    "docs/howto/coming_from.md": """
+import cv2, glob, numpy
+image_size, pattern = (480, 360), (9, 6)
+board = numpy.zeros((54, 3), numpy.float32)
+board[:, :2] = 0.03 * numpy.mgrid[:9, :6].T.reshape(-1, 2)
+imgpoints = [cv2.findChessboardCorners(cv2.imread(path, 0), pattern)[1]
+             for path in sorted(glob.glob("examples/board/photo_0*.jpg"))]
+objpoints = [board] * len(imgpoints)
+"""
+}
+"""As they stand before the page's code in a program that calls `cv2.calibrateCamera`."""
+
+
+def write_project(path: Path) -> None:
+    """The network of four photographs."""
+    shutil.copytree(EXAMPLES / "convergent4", path)
+
+
+def write_project_here(path: Path) -> None:
+    for file in (EXAMPLES / "convergent4").iterdir():
+        shutil.copy(file, path.parent)
+
+
+def write_surveyed(path: Path) -> None:
+    for name in ("north", "south"):
+        write_project(path / name)
+
+
+def write_photomodeler(path: Path) -> None:
+    from test_photomodeler import export
+
+    path.write_text(export(), encoding="utf-8")
+
+
+def write_control(path: Path) -> None:
+    from exchange_cases import POINTS
+
+    rows = [f"{k + 1},control,{','.join(map(repr, map(float, POINTS[k])))},0.01,0.01,0.01"
+            for k in range(4)]  # fmt: skip
+    path.write_text("\n".join(["id,role,X,Y,Z,sX,sY,sZ", *rows]) + "\n", encoding="utf-8")
+
+
+def run(*words: object) -> None:
+    subprocess.run([sys.executable, "-m", "jaxbundle", *map(str, words)], check=True, cwd=ROOT,
+                   stdout=subprocess.DEVNULL)  # fmt: skip
+
+
+def write_bal(path: Path) -> None:
+    run("convert", EXAMPLES / "convergent4", path, "--to", "bal", "--model", "snavely",
+        "--image-size", "3000,2000", "--pixel-size", "0.008,0.008")  # fmt: skip
+
+
+def write_opencv_camera(path: Path) -> None:
+    run("convert", f"{EXAMPLES / 'video_cameras' / 'cameras.toml'}", path, "--camera", "1-indoor",
+        "--model", "opencv")  # fmt: skip
+
+
+def write_camera(path: Path) -> None:
+    """Near the camera of examples/board."""
+    path.write_text(
+        '[[camera]]\nid = "cam"\nmodel = "opencv"\nimage_size = [480, 360]\nfx = 620.0\n'
+        "fy = 620.0\ncx = 242.0\ncy = 178.0\nk1 = -0.12\nk2 = 0.05\n", encoding="utf-8",
+    )  # fmt: skip
+
+
+def write_calibration(photographs: slice) -> Callable[[Path], None]:
+    return lambda path: run("calibrate", *PHOTOGRAPHS[photographs], "--board", "9x6", "--square",
+                            SQUARE, "--free", "fx,fy,cx,cy,k1", "--json", path)  # fmt: skip
+
+
+def copy_photographs(folder: Path, photographs: Iterable[Path]) -> None:
+    folder.mkdir(parents=True)
+    for path in photographs:
+        shutil.copy(path, folder)
+
+
+def write_cameras(path: Path) -> None:
+    """Folders of photographs of one board: as if by two cameras."""
+    copy_photographs(path / "A17", PHOTOGRAPHS[::2])
+    copy_photographs(path / "A18", PHOTOGRAPHS[1::2])
+
+
+def write_charuco(path: Path) -> None:
+    import render
+    from board_photographs import poses
+
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard(BOARD, 30, 22, words)
+    picture = board.generateImage((1080, 720), marginSize=0)
+    pattern = render.print_of(picture, BOARD[0] * SQUARE, 0.02)
+    (path / "A19").mkdir(parents=True)
+    for k, (M, X0) in enumerate(poses(6)):
+        grey = render.photograph(render.LENS, M, X0, pattern, seed=k)
+        cv2.imwrite(str(path / "A19" / f"photo_{k}.png"), grey)
+
+
+def rig_poses(seed: int) -> tuple[list, list]:
+    """Poses of two cameras of one rig, at 8 epochs: 40 mm apart, turned by 3°."""
+    from board_photographs import poses
+    from scipy.spatial.transform import Rotation
+
+    left = poses(8, seed, turned=False)
+    turn = Rotation.from_euler("y", 3, degrees=True).as_matrix()
+    return left, [(turn @ M, X0 + M.T @ [0.04, 0.0, 0.0]) for M, X0 in left]
+
+
+def write_view_of_rig(path: Path, side: int, seed: int = 0) -> None:
+    import render
+    from board_photographs import PATTERN
+
+    path.mkdir(parents=True)
+    for k, (M, X0) in enumerate(rig_poses(seed)[side]):
+        grey = render.photograph(render.LENS, M, X0, PATTERN, seed=100 * side + k)
+        cv2.imwrite(str(path / f"{'lr'[side]}_{k:03}.png"), grey)
+
+
+def write_rigs(path: Path) -> None:
+    for seed, name in enumerate(("car_1", "car_2")):
+        for side, camera in enumerate(("left", "right")):
+            write_view_of_rig(path / name / camera, side, seed)
+
+
+def write_rig_arrays(path: Path) -> None:
+    import render
+    from board_photographs import BOARD as board
+    from board_photographs import corners
+
+    rng = np.random.default_rng(1)
+    exact = np.array([
+        [corners(render.LENS, rig_poses(seed)[side]) for side in (0, 1)] for seed in (0, 1)
+    ])  # fmt: skip
+    np.savez(path, object_points=board.points, image_size=(480, 360), ids=["car_1", "car_2"],
+             image_points=exact + rng.normal(0, 0.05, exact.shape))  # fmt: skip
+
+
+def write_camera_arrays(path: Path) -> None:
+    from batch_cameras import images_of
+    from batch_cameras import write_cameras as write_arrays
+
+    write_arrays(path, images_of(4))
+
+
+def write_made(path: Path) -> None:
+    path.write_text("id,made\nA17,2026-05-01\nA18,2026-06-01\n", encoding="utf-8")
+
+
+def write_photos(path: Path) -> None:
+    """Eight rendered photographs, and points in them as a list of control."""
+    from rendered_photographs import write_photographs
+
+    write_photographs(path, "photo_", 8, 1)
+
+
+def write_control_of_photos(path: Path) -> None:
+    """Corners of the roof and three points on the ground, as they are seen in the photographs."""
+    from rendered_photographs import CAMERA, SIZE, hills, stations
+
+    from jaxbundle.cameras import get_model, project
+
+    ground = [(x, y, hills(x, y)) for x, y in ((-2.0, 1.5), (2.0, 2.0), (1.5, -2.0), (-2.2, -1.8))]
+    points = [*ground, (-1.2, -1.0, 1.4), (0.8, -1.0, 1.8), (0.8, 1.0, 1.8), (-1.2, 1.0, 1.4)]
+    model, rng = get_model("opencv"), np.random.default_rng(2)
+    p = tuple(CAMERA.parameters.get(name, 0.0) for name in model.parameters)
+    lines = ["EPSG:32633"]
+    for number, X in enumerate(points):
+        for k, (X0, M) in enumerate(zip(*stations(8, 1))):
+            u, v = np.array(project(model, p, *(M @ (X - X0)))) + rng.normal(0, 0.2, 2)
+            if 5 < u < SIZE[0] - 5 and 5 < v < SIZE[1] - 5:
+                at = " ".join(f"{value:.3f}" for value in (X[0] + 5e5, X[1] + 5e6, X[2]))
+                lines.append(f"{at} {u:.2f} {v:.2f} photo_{k}.png gcp{number}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@cache
+def flight() -> Path:
+    """A line scanner of 64 lines and 50 pixels."""
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp())
+    text = (EXAMPLES / "line_scanner" / "flight.toml").read_text(encoding="utf-8")
+    text = text.replace("lines = 2000", "lines = 128").replace("pixels = 1000", "pixels = 50")
+    (folder / "flight.toml").write_text(text, encoding="utf-8")
+    run("pushbroom", "simulate", folder / "flight.toml", "--out", folder / "out")
+    return folder / "out"
+
+
+def write_scanner(path: Path) -> None:
+    for file in flight().iterdir():
+        if file.is_file() and not file.name.startswith("."):
+            shutil.copy(file, path.parent)
+
+
+def write_refinement(path: Path) -> None:
+    """A satellite image with bias and jitter, and 40 control points."""
+    from test_refine_files import write_refinement
+
+    write_refinement(path.parent)
+
+
+def write_rpc_images(path: Path) -> None:
+    from test_surface_commands import write_satellite
+
+    write_satellite(path.parent)
+
+
+def write_strips(path: Path) -> None:
+    from test_surface_of_strips import write_strips
+
+    write_strips(path.parent, ("ahead", "back"))
+
+
+OWN: dict[str, Callable[[Path], None]] = {
+    "PROJECT": write_project,
+    "my": write_project,
+    "project.toml": write_project_here,
+    "surveyed": write_surveyed,
+    "export.txt": write_photomodeler,
+    "EXPORT.txt": write_photomodeler,
+    "control.csv": write_control,
+    "problem-16-22106-pre.txt.bz2": write_bal,
+    "calibration.yaml": write_opencv_camera,
+    "spring.json": write_calibration(slice(0, 4)),
+    "summer.json": write_calibration(slice(4, 8)),
+    "autumn.json": write_calibration(slice(8, 12)),
+    "cameras": write_cameras,
+    "phones": write_cameras,
+    "charuco": write_charuco,
+    "left": lambda path: write_view_of_rig(path, 0),
+    "right": lambda path: write_view_of_rig(path, 1),
+    "rigs": write_rigs,
+    "rigs.npz": write_rig_arrays,
+    "cameras.npz": write_camera_arrays,
+    "made.csv": write_made,
+    "views": lambda path: copy_photographs(path, PHOTOGRAPHS[:6]),
+    "base.toml": write_camera,
+    "photos": write_photos,
+    "gcp_list.txt": write_control_of_photos,
+    "scanner.toml": write_scanner,
+    "refine.toml": write_refinement,
+    "a.tif": write_rpc_images,
+    "ahead.toml": write_strips,
+}  # fmt: skip
+MADE_BY = {
+    "docs/calibrate.md": ["cameras.npz"], "docs/reconstruct.md": ["surveyed"],
+}
+"""Files that the page itself makes."""
+
+
+def write_own_files(folder: Path, page: str, texts: Iterable[str]) -> list[str]:
+    """The files named by commands and code, as words or as the first part of a path."""
+    words = {word for text in texts for word in re.split(r"[\s\"'=#]+", text)}
+    first = {word.split("/")[0] for word in words} | words
+    named = [name for name in OWN if name in first and name not in MADE_BY.get(page, ())]
+    for name in named:
+        OWN[name](folder / name)
+    return named
+
+
+if __name__ == "__main__":
+    jaxbundle.enable_x64()
+    print(json.dumps(write_own_files(Path(sys.argv[1]), sys.argv[2], sys.argv[3:])))
