@@ -43,7 +43,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx):
         if self.computes:
-            require_address_space()
+            require_address_space(self.name or "")
             if ctx.obj is not None:
                 ctx.obj()
             small = self.once and is_small(ctx.params["input"])

@@ -35,9 +35,10 @@ from jaxbundle.reconstruction.block import Block, describe_block
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
-from jaxbundle.reconstruction.georeferencing import ENOUGH_CONTROL, Given, georeference
+from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import Extra, tie_network, track_name
+from jaxbundle.reconstruction.oriented_block import ENOUGH_CONTROL, Given
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,

@@ -13,9 +13,10 @@ SHORTAGES = (
     "can't start new thread", "failed to map segment",
 )  # fmt: skip
 """What OpenCV, XLA, C++, the system, Python and the dynamic linker say without memory."""
-SMALLEST_ADDRESS_SPACE = 1.8e9
-"""Bytes of address space, most of it never used, with which JAX compiles the programs of a small
-network; with 0.2 GB less it aborts the process (measured, JAX 0.10, two cores)."""
+SMALLEST_ADDRESS_SPACE = {"": 1.65e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
+"""Bytes of address space, most of it never used, with which a command, or any other, compiles its
+programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX 0.10,
+two cores)."""
 NO_LIMIT = 2**60
 """Bytes: larger limits of version 1 of control groups mean none."""
 
@@ -27,17 +28,17 @@ def free_memory() -> float:
     return max(0.0, min(_of_the_machine(), _of_the_address_space(), left_in_control_groups()))
 
 
-def require_address_space() -> None:
+def require_address_space(command: str = "") -> None:
     """Refuse a limit of the address space below which XLA and LLVM abort the process without an
     error that can be caught.
 
     **Raises:** `MemoryError`."""
     left = _of_the_address_space()
-    if left < SMALLEST_ADDRESS_SPACE:
+    needed = SMALLEST_ADDRESS_SPACE.get(command, SMALLEST_ADDRESS_SPACE[""])
+    if left < needed:
         raise MemoryError(
             f"not enough memory: the limit of the address space (ulimit -v) leaves "
-            f"{left / 1e9:.1f} GB; at least {SMALLEST_ADDRESS_SPACE / 1e9} GB are needed, 3 GB for "
-            "photographs: raise it"
+            f"{left / 1e9:.2f} GB; at least {needed / 1e9:.2f} GB are needed: raise it"
         )
 
 

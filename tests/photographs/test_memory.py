@@ -39,12 +39,16 @@ def test_a_photograph_beyond_the_limit_is_named_with_its_size_and_the_remedy(tmp
 
 
 @needs_proc
-def test_a_command_says_what_address_space_it_needs():
-    limited = f"ulimit -v 1500000; {sys.executable} -m jaxbundle adjust nothing.toml"
+@pytest.mark.parametrize("command, limit, needed", [
+    ("adjust nothing.toml", 1_500_000, "1.65 GB"),
+    ("reconstruct nothing --out nowhere", 2_500_000, "2.80 GB"),
+])  # fmt: skip
+def test_a_command_says_what_address_space_it_needs(command, limit, needed):
+    limited = f"ulimit -v {limit}; {sys.executable} -m jaxbundle {command}"
     done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "ulimit -v" in line and "1.8 GB are needed" in line
+    assert "ulimit -v" in line and f"{needed} are needed" in line
 
 
 @pytest.mark.parametrize("error", [
