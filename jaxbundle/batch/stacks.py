@@ -16,7 +16,6 @@ Of rigs, as of `calibrate_rigs`, with an axis more: `image_points` [rigs, camera
 import dataclasses
 import os
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,14 +28,8 @@ from jaxbundle.batch.input import check_shapes, single_list
 from jaxbundle.batch.rigs import Rig
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
-from jaxbundle.io.text.unpacking import largest_unpacked_size
+from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE, largest_unpacked_size
 from jaxbundle.io.writing.fingerprints import of_arrays
-
-UNREADABLE = (
-    OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, MemoryError,
-    zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""Errors of numpy and zipfile for truncated, damaged or oversized archives."""
 
 REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
 KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
@@ -110,7 +103,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
                 arrays = {name: _rows(path, name, file) for name in KNOWN_ARRAYS if name in file}
-    except UNREADABLE as error:
+    except UNREADABLE_ARCHIVE as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
     missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
@@ -168,7 +161,9 @@ def _rows(path: str | Path, name: str, file) -> Any:
     cameras = found is not None and found.ndim in BY_CAMERA[name]
     truths = name == "visible"
     if found is None or not cameras or (found.dtype.kind == "b") != truths:
-        return file[name]
+        found = file[name]
+        if not isinstance(found, np.ndarray):  # NumPy gives the bytes of other members
+            raise ValueError(f"{name} is no array")
     return found
 
 

@@ -6,6 +6,8 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 from jaxbundle.arguments import integer, one_of
@@ -32,12 +34,14 @@ from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board
-from jaxbundle.measure.views import search_alone
+from jaxbundle.measure.views import search_alone, searches_at_once
+from jaxbundle.photographs.formats import is_photograph
 from jaxbundle.photographs.opencv import need_opencv
-from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.workers import Workers
 
 RIGS_A_WRITE = 32
+OF_A_PROCESS = 280e6
+"""Bytes of a process that searches boards, before its first photograph (measured)."""
 SIGMA_IMAGE = "sigma_image"
 WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
 """Settings present only in lines computed with them."""
@@ -148,7 +152,11 @@ def plan_works(
     if settings.board is not None and folders:
         regular = os.path.isfile(file) or not os.path.exists(file)
         kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
-        workers = held.enter_context(Workers(search_alone, available_cores()))
+        # the photographs of a folder are of one size
+        of_folders = (filter(is_photograph, Path(one).rglob("*")) for one in folders.values())
+        some = [path for found in of_folders for path in islice(found, 1)]
+        at_once = searches_at_once(some, settings.board, OF_A_PROCESS)
+        workers = held.enter_context(Workers(search_alone, at_once))
         if settings.rig:
             rigs = RigFolders(tuple(folders.values()), settings.board, kept, workers)
             works["photographs"] = _photographed_rigs(rigs, tuple(folders), settings)

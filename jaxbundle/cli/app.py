@@ -19,6 +19,7 @@ from jaxbundle.cli.habits import add_habits
 from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave
+from jaxbundle.system.memory import free_memory, is_memory_shortage, require_address_space
 from jaxbundle.system.terminals import for_output
 
 BAD_INPUT, NOT_SOLVED = 2, 3
@@ -42,6 +43,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx):
         if self.computes:
+            require_address_space(self.name or "")
             if ctx.obj is not None:
                 ctx.obj()
             small = self.once and is_small(ctx.params["input"])
@@ -190,8 +192,6 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         sys.stdout.flush()
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
-    except MemoryError:
-        _end("not enough memory", NOT_SOLVED)
     except (BrokenPipeError, SystemExit):  # typer ends a command that meets a broken pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         leave(NO_READER)
@@ -208,6 +208,8 @@ def run(prepare: Callable[[], object] | None = None) -> None:
             f"{error.object[error.start]!r}; set PYTHONUTF8=1", BAD_INPUT,
         )  # fmt: skip
     except Exception as error:
+        if is_memory_shortage(error):
+            _end(_describe_shortage(error), BAD_INPUT)
         # Usage errors of the command line itself (unknown option, missing argument).
         if message := getattr(error, "format_message", None):
             context = getattr(error, "ctx", None)
@@ -216,6 +218,16 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         traceback.print_exc()
         leave(1)
     sys.exit(status)
+
+
+def _describe_shortage(error: BaseException) -> str:
+    said = " ".join(str(error).split()).partition(" in function")[0]
+    if "not enough memory" in said:
+        return said
+    return "not enough memory" + (f" ({said})" if said else "") + (
+        f", {free_memory() / 1e9:.1f} GB are free: raise the limit (ulimit -v, that of the "
+        "container), end other programs, or make the input smaller"
+    )
 
 
 def _end(message: object, status: int) -> NoReturn:

@@ -103,10 +103,10 @@ def _write_tables(part: Part, folder: Path) -> None:
 
 
 def _thumbnail(path: Path):
-    """The reduced grey values of a photograph; a blank image if the file is gone."""
+    """The reduced grey values of a photograph; a blank image without the file, or the memory."""
     try:
         grey = read_photograph(path)
-    except InputError:
+    except (InputError, MemoryError):
         return np.full((2, 2), 255, np.uint8)
     step = max(1, max(grey.shape) // FIGURE_PIXELS)
     return grey[::step, ::step]

@@ -18,6 +18,7 @@ from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
 from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.photographs.reading import image_errors
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
@@ -27,6 +28,10 @@ MARKERS = 3
 """More markers than this prove another dictionary: false ones are rare."""
 QUICK_SIDE = 800
 """The same for boards of other sizes."""
+OF_A_COPY, OF_MARKERS = 230, 6
+"""Bytes a pixel of the largest copy in which OpenCV searches a chessboard that is not there (most:
+measured in a photograph of 3072 × 2048 pixels), and of a photograph in which it searches
+markers."""
 
 
 def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
@@ -48,7 +53,7 @@ def find_board_points(grey: Grey, board: Board) -> BoardPoints:
         raise InputError(f"the image of {grey.shape[1]} × {grey.shape[0]} pixels is too small")
     finders = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": find_tags}
     find = finders.get(board.kind, _circles)
-    try:
+    with image_errors():
         try:
             return find(cv2, grey, board)
         except InputError as error:
@@ -59,8 +64,14 @@ def find_board_points(grey: Grey, board: Board) -> BoardPoints:
                 return dataclasses.replace(find(cv2, 255 - grey, board), negative=True)
             except InputError:
                 raise error from None
-    except cv2.error as error:
-        raise InputError(f"OpenCV cannot search this image: {error.err}") from None
+
+
+def memory_of_search(rows: int, columns: int, kind: str) -> float:
+    """Bytes that the search of a board of a kind takes in a photograph, beside its grey values."""
+    if kind in ("charuco", "aprilgrid"):
+        return OF_MARKERS * rows * columns
+    factor = min(1.0, SIDES[-1] / max(rows, columns))
+    return OF_A_COPY * factor**2 * rows * columns
 
 
 def _is_in_small(cv2, grey, board) -> bool:

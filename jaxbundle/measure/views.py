@@ -5,7 +5,8 @@ import glob
 import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,19 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
-from jaxbundle.measure.corners import find_board_points, largest_chessboard, other_sizes
+from jaxbundle.measure.corners import (
+    find_board_points,
+    largest_chessboard,
+    memory_of_search,
+    other_sizes,
+)
+from jaxbundle.photographs.at_once import photographs_at_once
 from jaxbundle.photographs.folders import list_photographs
 from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.photographs.opencv import need_opencv
-from jaxbundle.photographs.reading import read_photograph
-from jaxbundle.system.configuration import available_cores
+from jaxbundle.photographs.reading import image_errors, photograph_size, read_photograph
 from jaxbundle.system.file_content import read_content
+from jaxbundle.system.threads import map_in_threads
 from jaxbundle.types import Progress
 
 SEARCHING = "searching the board"
@@ -145,11 +152,10 @@ def measure_boards(
         return (repeated[name], False) if name in repeated else _search(file_of[name], board)
 
     looks, negatives = {}, {}
-    with ThreadPoolExecutor(available_cores()) as pool:
-        for done, (name, found) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
-            looks[name], negatives[name] = found
-            if progress is not None:
-                progress(SEARCHING, done, len(file_of))
+    tell = lambda done: progress and progress(SEARCHING, done, len(file_of))
+    found = map_in_threads(search, file_of, searches_at_once(files, board), tell)
+    for name, (look, negative) in zip(file_of, found):
+        looks[name], negatives[name] = look, negative
     views = collect_views(file_of, looks, board)
     of_negatives = sum(negatives[name] for name in views.names)
     notes = (
@@ -203,11 +209,24 @@ def search_board(path: str | Path, board: Board) -> Look:
 def _search(path, board) -> tuple[Look, bool]:
     """The search result, and whether the board is a negative."""
     try:
-        grey = read_photograph(path)
-        found = find_board_points(grey, board)
+        with image_errors(path):
+            grey = read_photograph(path)
+            found = find_board_points(grey, board)
         return ((grey.shape[1], grey.shape[0]), found.xy), found.negative
     except InputError as error:
         return str(error).removeprefix(f"{path}: "), False
+
+
+def searches_at_once(files: Sequence[str | Path], board: Board, base: float = 0.0) -> int:
+    """In how many photographs a board can be searched at once; `base`: bytes that each search takes
+    besides, in a process of its own."""
+    sizes = []
+    for path in files:
+        with suppress(InputError):
+            sizes.append(photograph_size(path))
+    columns, rows = max(sizes, key=prod, default=(0, 0))
+    need = memory_of_search(rows, columns, board.kind)
+    return photographs_at_once(rows * columns, base + need)
 
 
 def search_alone(task: tuple[str | Path, Board]) -> Look:

@@ -58,9 +58,20 @@ class Columns:
         if len(self) == 0 and not self.may_be_empty:
             raise InputError(f"{self.source.name}: the table is empty; give at least one row")
 
+    def column(self, name: str) -> Column:
+        """The values of a column.
+
+        **Raises:** `InputError` if the table has none of this name."""
+        if name not in self.values:
+            raise InputError(
+                f"{self.source.name}: the column {name!r} is missing; found columns: "
+                f"{', '.join(self.values)}"
+            )
+        return self.values[name]
+
     def ids(self, name: str) -> tuple[str, ...]:
         """A column of ids or words; integers become text, surrounding blanks are removed."""
-        values = self.values[name]
+        values = self.column(name)
         if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
             return tuple(map(str, values.tolist()))
         ids = tuple(map(_id, values))
@@ -77,7 +88,7 @@ class Columns:
         """
         if name not in self.values and not required:
             return np.full(len(self), np.nan)
-        values = self.values[name]
+        values = self.column(name)
         numbers = _plain_numbers(values)
         if numbers is None:
             numbers = np.array([

@@ -7,6 +7,8 @@ would rotate the camera axes. Images with more than 8 bits are stretched to 8 bi
 import os
 import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.photographs.formats import OF_RAW, RAW, register_heic, remedy
 from jaxbundle.photographs.opencv import need_opencv, need_pillow
 from jaxbundle.system.file_content import check_plain, read_content
+from jaxbundle.system.memory import free_memory, is_memory_shortage
 
 MOST_PIXELS = 2**30
 """Limit of OpenCV."""
@@ -26,15 +29,47 @@ START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 """Marks of JPEG: start of the file, of a scan, end of the image."""
 
 
+class PhotographMemoryError(MemoryError):
+    """There is too little memory for a photograph; the message says which, and what to do."""
+
+
+@contextmanager
+def image_errors(path: str | Path | None = None) -> Iterator[None]:
+    """Turn the errors of image libraries, in work on a photograph, into those of this package.
+
+    **Arguments:** `path`: of the photograph; None: unknown here, a guard around this one adds it.
+
+    **Raises:** `MemoryError` without memory, which is no fault of the photograph, with what to do
+    (`PhotographMemoryError`); `InputError` for any other error of OpenCV.
+    """
+    try:
+        yield
+    except (InputError, PhotographMemoryError):
+        raise
+    except Exception as error:
+        if is_memory_shortage(error):
+            if path is None:
+                raise MemoryError("not enough memory for this image") from None
+            raise PhotographMemoryError(_describe_shortage(path)) from None
+        if isinstance(error, need_opencv().error):
+            where = "" if path is None else f"{path}: "
+            raise InputError(f"{where}OpenCV cannot process this image: {error.err}") from None
+        raise
+
+
 def read_photograph(
     path: str | Path, colour: bool = False
 ) -> UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]:
     """The grey values of a photograph in any format OpenCV reads, or its red, green and blue.
 
     **Raises:** `InputError` if the file is missing, empty, not an image, truncated, or too
-    large.
+    large; `MemoryError`, which names it, if there is no memory for it.
     """
-    cv2 = need_opencv()
+    with image_errors(path):
+        return _read(need_opencv(), path, colour)
+
+
+def _read(cv2, path, colour):
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file")
     if os.path.isdir(path):
@@ -47,10 +82,7 @@ def read_photograph(
         _refuse_cut(path)
     way = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
     flags = way | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error as error:
-        raise InputError(f"{path}: the image cannot be decoded ({error.err})") from None
+    found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if found is None:
         found = _by_pillow(path, colour)
     elif colour:
@@ -94,6 +126,18 @@ def open_image(path: str | Path):
             f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
         )
     return image
+
+
+def _describe_shortage(path) -> str:
+    try:
+        columns, rows = photograph_size(path)
+        size = f" for its {columns} × {rows} pixels"
+    except (InputError, MemoryError):
+        size = ""
+    return (
+        f"{path}: not enough memory{size}, {free_memory() / 1e9:.1f} GB are free: raise the limit "
+        "(ulimit -v, that of the container), end other programs, or reduce the photographs"
+    )
 
 
 def _refuse_raw(path):

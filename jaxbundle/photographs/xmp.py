@@ -93,7 +93,7 @@ def _fields(packet: bytes | str) -> Mapping[str, str]:
     head = content[: whole.start()] if whole else b""
     if whole is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
         return {}
-    spaces = {s.decode(): u.decode() for s, u in re.findall(rb'xmlns:(\w+)="([^"]*)"', head)}
+    spaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
     text = whole[0].decode(errors="replace")
     opening = re.match(r"<[\w:]+", text)
     missing = "".join(f' xmlns:{s}="{u}"' for s, u in spaces.items() if f"xmlns:{s}=" not in text)

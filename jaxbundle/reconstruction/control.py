@@ -105,7 +105,13 @@ def _gcp_list(path, system, rows) -> Control:
 def _table(path, head, rows) -> Control:
     records, sigmas = [], {}
     for number, line in rows:
-        cells = dict(zip(head, next(csv.reader([line], skipinitialspace=True))))
+        row = next(csv.reader([line], skipinitialspace=True))
+        if len(row) != len(head):
+            raise InputError(
+                f"{path}, line {number}: {len(row)} cells where the header has {len(head)} "
+                f"({', '.join(head)}); decimals need a point, empty cells their comma"
+            )
+        cells = dict(zip(head, row))
 
         def value(name, otherwise=math.nan, cells=cells, number=number):
             text = (cells.get(name) or "").strip()

@@ -1,8 +1,9 @@
 """Points with names in photographs: coded targets, control points, ends of scale bars."""
 
 import dataclasses
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets
+from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets, memory_of_targets
 from jaxbundle.network.columns import list_some
-from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.photographs.at_once import photographs_at_once
+from jaxbundle.photographs.reading import image_errors, read_photograph
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph
+from jaxbundle.system.threads import map_in_threads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,15 +49,19 @@ def find_named(
     photographs: Sequence[Photograph],
     targets: str | None,
     control: Control | None,
-    run: Callable = map,
+    workers: int | None = None,
 ) -> tuple[Named, list[str]]:
     """The coded targets of all photographs and the measurements of control points; notes.
+    `workers`: photographs in work at once, at most; default: one for each core.
 
     **Raises:** `InputError` if control points are measured in unknown photographs only.
     """
     image, name, xy, sigma, notes = [], [], [], [], []
     if targets:
-        found = list(run(lambda p: _targets_of(p, targets), photographs))
+        columns, rows = max((p.size for p in photographs), key=math.prod)
+        need = memory_of_targets(rows, columns, targets)
+        at_once = photographs_at_once(rows * columns, need, workers)
+        found = map_in_threads(lambda p: _targets_of(p, targets), photographs, at_once)
         for k, one in enumerate(found):
             if one is None:
                 continue
@@ -126,7 +133,8 @@ def _targets_of(photograph: Photograph, kind: str) -> NamedPoints | None:
         grey = read_photograph(photograph.path)
     except InputError:
         return None
-    return find_coded_targets(grey, kind)
+    with image_errors(photograph.path):
+        return find_coded_targets(grey, kind)
 
 
 def read_distances(path: str | Path) -> list[dict]:
@@ -134,9 +142,6 @@ def read_distances(path: str | Path) -> list[dict]:
 
     **Raises:** `InputError`."""
     table = read_csv(Path(path))
-    lacking = [c for c in ("from", "to", "value", "sigma") if c not in table.values]
-    if lacking:
-        raise InputError(f"{path}: the column {lacking[0]!r} is missing")
     value = table.numbers("value", required=True)
     sigma = table.numbers("sigma", required=True)
     return [{"from": a, "to": b, "value": float(v), "sigma": float(s)}

@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +20,7 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
+from jaxbundle.photographs.at_once import photographs_at_once
 from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
@@ -33,9 +35,10 @@ from jaxbundle.reconstruction.block import Block, describe_block
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
-from jaxbundle.reconstruction.georeferencing import ENOUGH_CONTROL, Given, georeference
+from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.named import find_named, name_unused
 from jaxbundle.reconstruction.network import Extra, tie_network, track_name
+from jaxbundle.reconstruction.oriented_block import ENOUGH_CONTROL, Given
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
@@ -51,7 +54,7 @@ from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.calibration import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
-from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.features import Features, memory_of_features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
     detect,
@@ -159,8 +162,7 @@ def reconstruct(
     require_x64()
     photographs, left_out = find_photographs(given)
     cameras = assign_cameras(photographs, camera)
-    with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
-        named, notes = find_named(photographs, settings.targets, control, pool.map)
+    named, notes = find_named(photographs, settings.targets, control, settings.workers)
     notes += name_other_files(given)
     positions, said = find_positions(photographs, control)
     notes += said
@@ -289,8 +291,12 @@ class _Making:
     def _features(self) -> list[Features]:
         read = [self._reader(p) for p in self.photographs]
         prints = [p.fingerprint for p in self.photographs]
-        features = detect(read, prints, self.settings.detection, self.store, self.workers,
-                          self.tell)  # fmt: skip
+        detection = self.settings.detection
+        columns, rows = max((p.size for p in self.photographs), key=math.prod)
+        need = memory_of_features(rows, columns, detection)
+        at_once = photographs_at_once(rows * columns, need, self.workers)
+        features = detect([p.path for p in self.photographs], read, prints, detection, self.store,
+                          at_once, self.tell)  # fmt: skip
         bad = {k for k, f in enumerate(features) if len(f) < TEXTURE}
         for k in sorted(bad):
             self.left_out.setdefault(

@@ -6,6 +6,7 @@ entities on the layer POINTS.
 """
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ PLY_READ = {"double": "<f8", "float64": "<f8", "float": "<f4", "float32": "<f4",
             "uint8": "u1", "char": "i1", "int8": "i1", "int": "<i4", "int32": "<i4",
             "uint": "<u4", "uint32": "<u4", "short": "<i2", "int16": "<i2", "ushort": "<u2",
             "uint16": "<u2"}  # fmt: skip
+LAS_HEAD = 375
+"""Bytes of the header of LAS 1.4; shorter in earlier versions."""
 LEAST_SCALE = 1e-9
 MOST_DXF = 5_000_000
 
@@ -58,15 +61,19 @@ def read_cloud(path: str | Path) -> Cloud:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    match path.suffix.lower():
-        case ".csv" | ".txt" | ".xyz":
-            return read_cloud_csv(path)
-        case ".ply":
-            return _read_ply(path)
-        case ".las" | ".laz":
-            return _read_las(path)
-        case suffix:
-            raise InputError(f"{path}: suffix {suffix!r}; .csv, .ply, .las or .laz is expected")
+    readers = {".csv": read_cloud_csv, ".txt": read_cloud_csv, ".xyz": read_cloud_csv,
+               ".ply": _read_ply, ".las": _read_las, ".laz": _read_las}  # fmt: skip
+    suffix = path.suffix.lower()
+    if suffix not in readers:
+        raise InputError(f"{path}: suffix {suffix!r}; .csv, .ply, .las or .laz is expected")
+    cloud = readers[suffix](path)
+    bad = ~np.isfinite(cloud.X).all(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{path}: {bad.sum()} of {len(bad)} points have coordinates that are not finite, the "
+            f"first is point {bad.argmax() + 1}"
+        )
+    return cloud
 
 
 def _write_ply(cloud, path):
@@ -90,17 +97,7 @@ def _read_ply(path):
     lines = head.decode("ascii", "replace").splitlines()
     if not mark or not lines or lines[0].strip() != "ply":
         raise InputError(f"{path}: not a PLY file")
-    form = next((line.split()[1] for line in lines if line.startswith("format")), "")
-    number, fields, current = 0, [], ""
-    for line in lines:
-        words = line.split()
-        if words[:1] == ["element"]:
-            current = words[1]
-            number = int(words[2]) if current == "vertex" else number
-        elif words[:1] == ["property"] and current == "vertex":
-            if words[1] not in PLY_READ:
-                raise InputError(f"{path}: property of type {words[1]} of a vertex is not read")
-            fields.append((words[2], PLY_READ[words[1]]))
+    form, number, fields = _ply_head(path, lines)
     names = [n for n, _ in fields]
     if not {"x", "y", "z"} <= {*names}:
         raise InputError(f"{path}: vertices without x, y, z")
@@ -117,6 +114,26 @@ def _read_ply(path):
         return _of_columns(column, names, number)
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _ply_head(path, lines):
+    """The format, the number of vertices, and names and types of their fields."""
+    form, number, fields, current = "", 0, [], ""
+    for place, line in enumerate(lines, 1):
+        match line.split():
+            case ["format", form, *_]:
+                pass
+            case ["element", current, text] if current != "vertex" or text.isdecimal():
+                number = int(text) if current == "vertex" else number
+            case ["property", kind, name] if current == "vertex":
+                if kind not in PLY_READ:
+                    raise InputError(f"{path}: property of type {kind} of a vertex is not read")
+                fields.append((name, PLY_READ[kind]))
+            case ["element" | "format", *_]:
+                raise InputError(f"{path}, line {place}: {line!r} in the head of a PLY file")
+            case ["property", *_] if current == "vertex":
+                raise InputError(f"{path}, line {place}: {line!r} of a vertex is not read")
+    return form, number, fields
 
 
 def _of_columns(column, names, n):
@@ -178,10 +195,41 @@ def _write_las(cloud, path):
 
 def _read_las(path):
     laspy = _laspy()
+    _check_las_counts(path)
     try:
-        las = laspy.read(path)
+        return _las_cloud(laspy.read(path))
     except Exception as error:  # laspy and its backends raise any exception
-        raise InputError(f"{path}: {' '.join(str(error).split())[:200]}") from None
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: damaged, or not LAS as expected: {why}") from None
+
+
+def _check_las_counts(path):
+    """Refuse counts in a header that the file has no room for: laspy would read records for hours,
+    lazrs allocate for all chunks and abort the process (LAS 1.4 R15, table 3; LAZ 1.4)."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(LAS_HEAD)
+        at = lambda form, offset: (
+            struct.unpack_from(form, head, offset)[0] if len(head) >= offset + 8 else 0
+        )
+        begin = at("<I", 96)
+        room = {"records": (54 * at("<I", 100), size)}
+        if at("<B", 25) >= 4 and at("<I", 243):
+            room["extended records"] = 60 * at("<I", 243), size - at("<Q", 235)
+        if at("<B", 104) & 128:  # compressed: points begin with the offset of the chunk table
+            file.seek(begin)
+            (table,) = struct.unpack("<q", file.read(8).rjust(8, b"\0"))
+            if table == -1:  # written at the end, by a program that could not go back
+                file.seek(max(size - 8, 0))
+                (table,) = struct.unpack("<q", file.read(8).rjust(8, b"\0"))
+            file.seek(max(table, 0))
+            room["chunks"] = struct.unpack("<II", file.read(8).ljust(8, b"\0"))[1], size
+    for what, (needed, present) in room.items():
+        if needed > present:
+            raise InputError(f"{path}: damaged: its header counts more {what} than it has room for")
+
+
+def _las_cloud(las):
     names = {*las.point_format.dimension_names}
     n = len(las.points)
     X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,6 +10,8 @@ from jaxtyping import Float, UInt8
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.photographs.reading import image_errors
+from jaxbundle.system.threads import map_in_threads
 from jaxbundle.tiepoints import interior, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
@@ -29,6 +32,7 @@ def prepare() -> None:
 
 
 def detect(
+    paths: Sequence[Path],
     read: Sequence[Callable[[], UInt8[np.ndarray, "rows columns"]]],
     fingerprints: list[str],
     settings: Detection,
@@ -41,11 +45,13 @@ def detect(
     def one(k):
         found = store.load_features(fingerprints[k])
         if found is None:
-            found = find_features(read[k](), settings)
+            with image_errors(paths[k]):
+                found = find_features(read[k](), settings)
             store.save_features(fingerprints[k], found)
         return found
 
-    return _each(one, range(len(read)), workers, lambda n: tell("features", n, len(read)))
+    return map_in_threads(one, range(len(read)), workers,
+                          lambda n: tell("features", n, len(read)))  # fmt: skip
 
 
 def match(
@@ -76,16 +82,7 @@ def match(
             store.save_matches(*of(pair), *found)
         return Matches(pair, *found)
 
-    return _each(one, pairs, workers, lambda n: tell("matching", n, len(pairs)))
-
-
-def _each(function, items, workers, advance):
-    with ThreadPoolExecutor(workers) as pool:
-        found = []
-        for one in pool.map(function, items):
-            found.append(one)
-            advance(len(found))
-    return found
+    return map_in_threads(one, pairs, workers, lambda n: tell("matching", n, len(pairs)))
 
 
 def verify(

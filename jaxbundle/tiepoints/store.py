@@ -9,10 +9,10 @@ import os
 import time
 from contextlib import suppress
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
 from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 
@@ -83,9 +83,11 @@ class Store:
         try:
             with (self.folder / f"{name}.npz").open("rb") as file:
                 with np.load(file, allow_pickle=False) as found:
-                    return dict(found)
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+                    arrays = dict(found)
+        except UNREADABLE_ARCHIVE:
             return None
+        # NumPy gives the bytes of other members
+        return arrays if all(isinstance(a, np.ndarray) for a in arrays.values()) else None
 
     def _save(self, name, **arrays):
         if self.folder is None:

@@ -149,7 +149,8 @@ def test_without_a_command(command, arguments, status, said):
 
 @pytest.mark.parametrize("error, status", [
     (OSError("the disk\nis full"), 2), (OverflowError("too large"), 2),
-    (RecursionError("too deep"), 2), (MemoryError(), 3),
+    (RecursionError("too deep"), 2), (MemoryError(), 2),
+    (RuntimeError("RESOURCE_EXHAUSTED: Out of memory"), 2),
 ])  # fmt: skip
 def test_what_nobody_thought_of_ends_in_one_line(command, error, status, monkeypatch):
     def fail(*_, **__):

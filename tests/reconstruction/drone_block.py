@@ -11,8 +11,8 @@ from jaxbundle.network.tables import Points
 from jaxbundle.planning.simulate import simulate_with_truth
 from jaxbundle.planning.stations import Stations
 from jaxbundle.reconstruction.adjusting import Weighted
-from jaxbundle.reconstruction.georeferencing import Given
 from jaxbundle.reconstruction.named import Named
+from jaxbundle.reconstruction.oriented_block import Given
 
 ORIGIN = np.array([235_000.0, 3_811_000.0, 250.0])
 OFFSET = np.array([1.5, -2.0, 31.0])

@@ -7,8 +7,6 @@ of unknown origin can be read.
 import dataclasses
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import jax
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
 from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.system.file_content import check_plain
 
@@ -48,8 +47,7 @@ def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or 'damaged'}") from None
-    except (ValueError, TypeError, AttributeError, LookupError, EOFError, RecursionError,
-            zipfile.BadZipFile, zlib.error):  # fmt: skip
+    except UNREADABLE_ARCHIVE:
         raise InputError(f"{path}: is not {what}, or is damaged") from None
 
 

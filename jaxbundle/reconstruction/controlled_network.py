@@ -1,0 +1,137 @@
+"""The network of an adjusted block with control: control and check points with their good
+measurements, and satellite positions with an offset on the axes that control has."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.io.results.result_project import readjustable_network
+from jaxbundle.network.further import Antennas, ExteriorPriors
+from jaxbundle.network.sightings import keep_points
+from jaxbundle.network.tables import Distances, Network, Points, Source
+from jaxbundle.network.units import from_image_unit
+from jaxbundle.reconstruction.control_choice import ControlChoice
+from jaxbundle.reconstruction.oriented_block import (
+    OFFSET,
+    OFFSET_HEIGHT,
+    Measured,
+    OrientedBlock,
+)
+
+
+class _Added(NamedTuple):
+    """Named points of the final network, and their measurements, σ in pixels."""
+
+    id: tuple[str, ...]
+    role: tuple[str, ...]
+    position: Float[np.ndarray, "points 3"]
+    sigma: Float[np.ndarray, "points 3"]
+    image: Int[np.ndarray, " rays"]
+    point: Int[np.ndarray, " rays"]
+    xy: Float[np.ndarray, "rays 2"]
+    spread: Float[np.ndarray, "rays 2"]
+
+
+def network_with_control(block: OrientedBlock, control: Points, choice: ControlChoice) -> Network:
+    """The network at the solution with control, its measurements and positions."""
+    whole, network = block.network, readjustable_network(block.result)
+    named, ids, distances = set(control.id), network.points.id, network.distances
+    ends = [(ids[a], ids[b]) for a, b in distances.points]
+    network = keep_points(network, np.array([id not in named for id in network.points.id]))
+    row = {id: k for k, id in enumerate(network.points.id)}
+    at = np.array([row.get(id, -1) for id in whole.points.id])
+    rays = whole.observations.take(at[whole.observations.point] >= 0)
+    added = _measured_points(block, control, choice, len(row))
+    xy, sigma = from_image_unit(
+        block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
+    )
+    images, moved = network.images, [block.of_id[id] for id in network.points.id]
+    row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
+    here = np.array([a in row and b in row for a, b in ends], bool)
+    return network.replace(
+        images=dataclasses.replace(images, position=block.X0, angles=block.angles),
+        points=Points(
+            (*network.points.id, *added.id), (*network.points.role, *added.role),
+            np.concatenate([block.X[moved], added.position]),
+            np.concatenate([network.points.sigma, added.sigma]),
+        ),
+        observations=dataclasses.replace(
+            rays, image=np.concatenate([rays.image, added.image]),
+            point=np.concatenate([at[rays.point], added.point]),
+            xy=np.concatenate([rays.xy, xy]), sigma=np.concatenate([rays.sigma, sigma]),
+            source=Source("observations"),
+        ),
+        further=(*(one for one in network.further if not isinstance(one, ExteriorPriors)),
+                 *_positions(block, choice)),
+        distances=Distances(
+            np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep],
+                     int).reshape(-1, 2),
+            distances.value[here], distances.sigma[here], distances.source.take(here),
+        ),
+        datum="control", datum_points=(), object_unit="m", warnings=whole.warnings,
+        notes=whole.notes,
+    )  # fmt: skip
+
+
+def _measured_points(
+    block: OrientedBlock, control: Points, choice: ControlChoice, first: int
+) -> _Added:
+    """Control and check points that can be determined, with their good measurements."""
+    ids, roles, position, sigma, rows, point = [], [], [], [], [], []
+    image, spread = [], []
+    for k, id in enumerate(control.id):
+        one = choice.measured[id]
+        # a point with wrong coordinates is a good tie point
+        role = "check" if control.role[k] == "check" else "tie"
+        role = control.role[k] if choice.used[k] else role
+        if one.good.sum() < (1 if choice.used[k] else 2):
+            continue
+        there = np.isfinite(one.position).all()
+        start = one.position if there else _on_ray(block, one)
+        free = np.isinf(choice.sigma[k]) | (role == "tie")
+        position.append(np.where(free, start, control.position[k]))
+        exact = role in ("fixed", "tie")
+        sigma.append(np.full(3, np.nan) if exact else choice.sigma[k])
+        rows += one.rows[one.good].tolist()
+        image += one.image[one.good].tolist()
+        spread += one.sigma[one.good].tolist()
+        point += [first + len(ids)] * int(one.good.sum())
+        ids.append(id)
+        roles.append(role)
+    return _Added(
+        tuple(ids), tuple(roles), np.reshape(position, (-1, 3)), np.reshape(sigma, (-1, 3)),
+        np.array(image, int), np.array(point, int), block.given.named.xy[np.array(rows, int)],
+        np.repeat(np.reshape(spread, (-1, 1)), 2, 1),
+    )  # fmt: skip
+
+
+def _on_ray(block: OrientedBlock, one: Measured) -> Float[np.ndarray, "3"]:
+    """A place on the first good ray, at the distance of the points around."""
+    first = int(np.flatnonzero(one.good)[0])
+    X0, rays = block.X0[one.image[first]], block.network.observations
+    seen = block.X[rays.point[rays.image == one.image[first]]]
+    depth = np.nanmedian(np.linalg.norm(seen - X0, axis=1))
+    return X0 + depth * one.rays[first]
+
+
+def _positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
+    """Satellite positions as observations, with an offset on the axes that control has."""
+    if block.given.positions is None:
+        return []
+    names = {name: k for k, name in enumerate(block.given.names)}
+    rows = np.array([names[id] for id in block.network.images.id])
+    X, sigma = (one[rows] for one in block.given.positions)
+    there = np.flatnonzero(np.isfinite(X).all(1) & np.isfinite(sigma).all(1))
+    if not len(there):
+        return []
+    axes = [a for k, a in enumerate("XYZ") if np.isfinite(choice.sigma[choice.used, k]).any()]
+    prior = dict(zip("XYZ", (OFFSET, OFFSET, OFFSET_HEIGHT)))
+    settings = {"free": [f"shift_{a}" for a in axes],
+                "sigma": {f"shift_{a}": prior[a] for a in axes}}  # fmt: skip
+    return [Antennas(
+        image=tuple(block.network.images.id[k] for k in there), position=X[there],
+        covariance=np.einsum("ni,ij->nij", sigma[there] ** 2, np.eye(3)),
+        strip=("all",) * len(there), time=np.full(len(there), np.nan), settings=settings,
+    )]  # fmt: skip

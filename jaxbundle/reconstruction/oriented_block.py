@@ -1,0 +1,268 @@
+"""Named points in an adjusted block: their rays, where these meet, and how exactly.
+
+A ray that misses the point of the others is a wrong measurement. Coordinates from the block are
+compared with given ones by their joint covariance and, without satellite positions, up to a
+similarity.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.any_distance import derivative
+from jaxbundle.network.tables import Network, Points
+from jaxbundle.network.units import from_image_unit
+from jaxbundle.orientation import many
+from jaxbundle.orientation.alignment import similarity_of_most
+from jaxbundle.orientation.control_consistency import Discrepancies
+from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.reconstruction.named import Named
+
+OFFSET, OFFSET_HEIGHT = 10.0, 100.0
+"""Prior σ of the offset between satellite positions and control, metres: in the plane the error
+common to the code solutions of one flight; in height geoid undulations reach 107 m (EGM2008)."""
+WRONG = 5.0
+"""A ray that misses its point by more, in σ of the measurement, is a wrong measurement."""
+PAIRED_RAYS = 8
+"""Most rays of one point of which every pair is tried: 28 pairs."""
+ENOUGH_CONTROL = 3
+"""Minimum control points of a block without satellite positions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """What is given about the frame: control and check `points` with `named` measurements
+    (photographs by their row in `names`), the `system` of their coordinates; satellite `positions`
+    [photographs, 3] and their σ in this system, NaN: unknown."""
+
+    points: Points
+    named: Named
+    names: tuple[str, ...]
+    system: str = ""
+    positions: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """The measurements of one point in oriented photographs: rows of `Named`, of the network's
+    images; directions as unit vectors in object space; the angle of a pixel along each; σ, pixels;
+    whether each agrees with the point, and the point intersected from those."""
+
+    rows: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    rays: Float[np.ndarray, "n 3"]
+    pixel: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    good: Bool[np.ndarray, " n"]
+    position: Float[np.ndarray, "3"]
+
+
+class OrientedBlock:
+    """An adjusted block: its orientations, and intersections of named points in it."""
+
+    def __init__(self, result: Adjustment, given: Given):
+        self.result, self.given = result, given
+        self.network: Network = result.problem.network
+        values = result.image_values
+        self.X0, self.angles = values[:, :3], values[:, 3:]
+        self.M = np.asarray(many.matrices(self.angles))
+        self.X, self.A = result.point_values, np.eye(3)
+        self.cameras = tuple(
+            dataclasses.replace(c, parameters=result.camera_parameters(c.id))
+            for c in self.network.cameras
+        )  # fmt: skip
+        self.row = {id: k for k, id in enumerate(self.network.images.id)}
+        points = self.network.points.id
+        known = np.all(np.isfinite(self.X), axis=1)
+        named = set(given.points.id)
+        self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
+        observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
+        self.has_positions = int(observed.sum()) > 2
+        self.of_id = {id: k for k, id in enumerate(points)}
+
+    def measure(self, id: str) -> Measured:
+        """The measurements of a point; all of them agree for now."""
+        named, names = self.given.named, self.given.names
+        rows = [k for k, name in enumerate(named.name)
+                if name == id and names[named.image[k]] in self.row]  # fmt: skip
+        rows = np.array(rows, int)
+        image = np.array([self.row[names[named.image[k]]] for k in rows], int)
+        if not len(rows):
+            nothing = np.zeros(0)
+            return Measured(rows, image, np.zeros((0, 3)), nothing, nothing, np.zeros(0, bool),
+                            np.full(3, np.nan))  # fmt: skip
+        camera = self.network.images.camera[image]
+        ends = [self._ideal(camera, named.xy[rows] + shift) for shift in ([0, 0], [0.5, 0.5])]
+        pixel = np.linalg.norm(ends[1] - ends[0], axis=1) / np.hypot(0.5, 0.5)
+        rays = np.einsum("nij,ni->nj", self.M[image],
+                         np.pad(ends[0], ((0, 0), (0, 1)), constant_values=-1.0))  # fmt: skip
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        good = np.isfinite(rays).all(1)
+        sigma = named.sigma[rows].mean(1)
+        return Measured(rows, image, rays, pixel, sigma, good, np.full(3, np.nan))
+
+    def _ideal(self, camera, xy) -> Float[np.ndarray, "n 2"]:
+        xy, _ = from_image_unit(self.cameras, camera, xy, np.ones_like(xy), "px")
+        found = np.full_like(xy, np.nan)
+        for c in np.unique(camera):
+            found[camera == c] = ideal_points(self.cameras[c], xy[camera == c])
+        return found
+
+    def misses(self, one: Measured, X) -> Float[np.ndarray, " n"]:
+        """Distances of the projections of X from its measurements, pixels."""
+        away = X - self.X0[one.image]
+        along = np.einsum("ni,ni->n", away, one.rays)
+        across = np.linalg.norm(np.cross(away, one.rays), axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(along > 0, across / along / one.pixel, np.inf)
+
+    def resolve(self) -> dict[str, Measured]:
+        """By point, the measurements that agree on one position of it, and that position.
+
+        σ of the measurements are multiplied by the robust scale of all their misclosures, if this
+        is larger than 1: a point is identified worse than it is measured."""
+        measured = {id: self.measure(id) for id in self.given.points.id}
+        first = {id: self._consistent(one) for id, one in measured.items()}
+        off = [self.misses(one, one.position)[one.good] / one.sigma[one.good]
+               / np.sqrt(1 - 1.5 / one.good.sum()) for one in first.values()
+               if one.good.sum() > 1]  # fmt: skip
+        # the median of a Rayleigh distribution is 1.1774 σ
+        scale = max(1.0, float(np.median(np.concatenate(off))) / 1.1774) if off else 1.0
+        if scale == 1.0:
+            return first
+        return {id: self._consistent(dataclasses.replace(one, sigma=scale * one.sigma))
+                for id, one in measured.items()}  # fmt: skip
+
+    def _consistent(self, one: Measured) -> Measured:
+        """The largest set of rays that meet, more than half of them, from the best pair."""
+        usable = np.flatnonzero(np.isfinite(one.rays).all(1))
+        best = np.zeros(len(one.rows), bool)
+        closest = np.inf
+        tried = usable[many.spread(len(usable), PAIRED_RAYS)]
+        for i in tried:
+            for j in tried[tried > i]:
+                pair = np.isin(np.arange(len(one.rows)), [i, j])
+                off = self.misses(one, self._meet(one, pair)) / one.sigma
+                good = off < WRONG
+                if good[[i, j]].all() and (good.sum(), -np.median(off[good])) > (
+                    best.sum(), -closest
+                ):  # fmt: skip
+                    best, closest = good, np.median(off[good])
+        if best.sum() < 2 or 2 * best.sum() <= len(usable):
+            return dataclasses.replace(one, good=np.zeros(len(one.rows), bool))
+        return dataclasses.replace(one, good=best, position=self._meet(one, best))
+
+    def _meet(self, one: Measured, use) -> Float[np.ndarray, "3"]:
+        """The point nearest to some rays, by the angle at which they miss it."""
+        weight, X0 = np.ones(use.sum()), self.X0[one.image[use]]
+        P = np.eye(3) - one.rays[use][:, :, None] * one.rays[use][:, None, :]
+        X = X0[0]
+        for _ in range(3):
+            N = (P * weight[:, None, None]).sum(0)
+            if np.linalg.cond(N) > 1e12:
+                return np.full(3, np.nan)
+            X = np.linalg.solve(N, np.einsum("n,nij,nj->i", weight, P, X0))
+            weight = 1 / np.maximum(((X - X0) ** 2).sum(1), 1e-30)
+        return X
+
+    def move(self, places: Sequence[int], points: Points) -> None:
+        """Move the block by the similarity that fits most of the control points."""
+        ids = [points.id[k] for k in places]
+        target = points.position[list(places)]
+        if len(ids) < ENOUGH_CONTROL or np.isinf(points.sigma[list(places)]).any():
+            raise InputError(
+                f"control points with heights in at least two photographs: expected "
+                f"{ENOUGH_CONTROL}, got {len(ids)} in this part; without satellite positions they "
+                "alone give the frame"
+            )
+        found = similarity_of_most(self.X[[self.determined[id] for id in ids]], target)
+        if found is None:
+            raise InputError("the control points are on a line: they leave a rotation open")
+        A, t = found
+        R = A / np.cbrt(np.linalg.det(A))
+        self.X0, self.X, self.M = self.X0 @ A.T + t, self.X @ A.T + t, self.M @ R.T
+        self.angles, self.A = np.asarray(many.angles(self.M)), A
+
+    @property
+    def ground_sample_distance(self) -> float:
+        """The length of a pixel at the named points, the median."""
+        found = [one.pixel * np.linalg.norm(X - self.X0[one.image], axis=1)
+                 for one, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())]
+        return float(np.median(np.concatenate(found))) if found else 1.0
+
+    def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
+        """Coordinates from the block minus given ones, and their joint cofactors."""
+        rows = [self.determined[points.id[k]] for k in places]
+        if not rows:
+            nothing = np.zeros((0, 3))
+            return Discrepancies(nothing, np.zeros((0, 3, 0, 3)), nothing, np.zeros((0, 3, 0)))
+        X, given = self.X[rows], points.position[list(places)]
+        C = self._joint_cofactors(rows)
+        n, sigma = len(rows), points.sigma[list(places)].copy()
+        if self.has_positions:
+            C = C + np.diag(self.offset_sigma**2)[None, :, None, :]
+            G = np.zeros((n, 3, 0))
+        else:
+            # the generators of a similarity about the middle: shift, rotation, scale
+            x = (X - X.mean(0)) / max(np.ptp(X, axis=0).max(), 1e-12)
+            turn = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
+            G = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turn, x[:, :, None]], 2)
+        fixed = np.array([points.role[k] == "fixed" for k in places])
+        sigma[fixed] = 0.0
+        return Discrepancies(X - given, C, sigma, G)
+
+    def _joint_cofactors(self, rows) -> Float[np.ndarray, "n 3 n 3"]:
+        """The covariance of the coordinates of some points among each other."""
+        problem, n = self.result.problem, len(rows)
+        tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.system.tables}
+        lengths = problem.layout.lengths
+        for k, row in enumerate(rows):
+            D = np.eye(3)
+            if lengths is not None:
+                at = np.append(np.asarray(self.result.values.point)[row], lengths[row])
+                D = np.asarray(derivative(jnp.asarray(at)))
+            tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
+        Q = self.result.cofactors.solution.propagate_rows(tables)
+        return self.result.sigma0**2 * np.asarray(Q).reshape(n, 3, n, 3)
+
+    def removed(self) -> list[tuple[str, str]]:
+        """Image and point, by id, of the image points without weight."""
+        problem = self.result.problem
+        gone = ~(np.asarray(problem.data.image_weight) > 0).any(1)
+        images, points = self.network.images.id, self.network.points.id
+        return [(images[i], points[p]) for i, p in
+                zip(problem.image[gone].tolist(), problem.point[gone].tolist())]  # fmt: skip
+
+    def is_determined(self, id: str, one: Measured) -> bool:
+        """Whether a point was adjusted with the block, from the measurements that agree."""
+        if id not in self.determined or one.good.sum() < 2:
+            return False
+        off = self.misses(one, self.X[self.determined[id]])[one.good]
+        return bool((off < WRONG * one.sigma[one.good]).all())
+
+    def name_of(self, one: Measured, n: int) -> str:
+        """The photograph of a measurement."""
+        return self.network.images.id[one.image[n]]
+
+    def seen_there(self, one: Measured, n: int, id: str, measured: dict[str, Measured]) -> str:
+        """Another point at the place of a measurement: measured in the same photograph, or
+        intersected from others; empty without."""
+        for other, its in measured.items():
+            there = its.rows[its.image == one.image[n]]
+            xy = self.given.named.xy
+            near = np.linalg.norm(xy[there] - xy[one.rows[n]], axis=1) < WRONG * one.sigma[n]
+            if other != id and (near.any() or self.misses(one, its.position)[n] < WRONG *
+                                one.sigma[n]):  # fmt: skip
+                return other
+        return ""
+
+    @property
+    def offset_sigma(self) -> Float[np.ndarray, "3"]:
+        """σ of the system of the block against that of control."""
+        offset = np.array([OFFSET, OFFSET, OFFSET_HEIGHT])
+        return offset if self.has_positions else np.zeros(3)

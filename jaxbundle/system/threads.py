@@ -1,0 +1,34 @@
+"""Work shared out to threads."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+NO_MEMORY = object()
+"""In place of a result, until its item is tried again."""
+
+
+def map_in_threads(
+    function: Callable[[Any], Any],
+    items: Iterable[Any],
+    at_once: int,
+    advance: Callable[[int], None] = lambda done: None,
+) -> list[Any]:
+    """The results of all items, in their order. An item that finds too little memory beside others
+    is tried again alone, after them. `advance(done)`: called after each."""
+    items = list(items)
+
+    def attempt(item):
+        try:
+            return function(item)
+        except MemoryError:
+            if at_once == 1:
+                raise
+            return NO_MEMORY
+
+    found = []
+    with ThreadPoolExecutor(at_once) as pool:
+        for one in pool.map(attempt, items):
+            found.append(one)
+            advance(len(found))
+    return [function(item) if one is NO_MEMORY else one for item, one in zip(items, found)]

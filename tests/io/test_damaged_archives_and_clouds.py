@@ -1,0 +1,165 @@
+"""Damaged clouds, tables and archives: an error that names the file, and no other."""
+
+import io
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+
+from jaxbundle.batch.stacks import read_camera_stack
+from jaxbundle.errors import InputError
+from jaxbundle.io.results.stored_tree import read_tree
+from jaxbundle.photographs.xmp import parse_xmp
+from jaxbundle.reconstruction.control import read_control_measurements
+from jaxbundle.surface.cloud import Cloud
+from jaxbundle.surface.point_files import read_cloud, write_cloud
+from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.store import Store
+
+EVLR_COUNT, RECORDS, TABLE = 243, 100, 96
+"""Offsets in the header of LAS 1.4."""
+
+
+def some_points(n=5):
+    X = np.arange(3.0 * n).reshape(n, 3)
+    return Cloud(X, np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.full(n, 2), np.zeros(n, int),
+                 np.zeros((n, 2)), ("a",))  # fmt: skip
+
+
+def refused(read, path, *words):
+    with pytest.raises(InputError) as told:
+        read(path)
+    for word in (path.name, *words):
+        assert word in str(told.value)
+
+
+def test_a_table_without_the_columns(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text("E,N,H\n1,2,3\n")
+    refused(read_cloud, path, "'X' is missing", "E, N, H")
+
+
+@pytest.mark.parametrize("row", ["P1,1,2,3", "P1,1,2,3,a.jpg,5", "P1,1,2,3,a.jpg,5,6,7"])
+def test_a_row_of_another_length_than_the_header(tmp_path, row):
+    path = tmp_path / "gcp.csv"
+    path.write_text(f"id,X,Y,Z,image,u,v\n{row}\n")
+    refused(read_control_measurements, path, "line 2", "the header has 7")
+
+
+@pytest.mark.parametrize("old, new, word", [
+    (b"vertex 5", b"vertex five", "'element vertex five'"),
+    (b"vertex 5", b"vertex -5", "'element vertex -5'"),
+    (b"vertex 5", b"vertex", "'element vertex'"),
+    (b"vertex 5", b"vertex 500000000000", "c.ply"),
+    (b"double x", b"double", "'property double'"),
+    (b"double x", b"list uchar int x", "'property list uchar int x'"),
+    (b"format binary_little_endian 1.0", b"format", "'format'"),
+])  # fmt: skip
+def test_the_head_of_a_ply_file(tmp_path, old, new, word):
+    path = tmp_path / "c.ply"
+    write_cloud(some_points(), path)
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+    refused(read_cloud, path, word)
+
+
+@pytest.mark.parametrize("value", ["inf", "nan"])
+def test_coordinates_that_are_not_finite(tmp_path, value):
+    path = tmp_path / "c.ply"
+    fields = "".join(f"property double {axis}\n" for axis in "xyz")
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{fields}end_header\n"
+                    f"1 2 3\n1 {value} 3\n")  # fmt: skip
+    refused(read_cloud, path, "1 of 2 points", "point 2")
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("offset, what", [(EVLR_COUNT, "extended records"), (RECORDS, "records")])
+def test_counts_of_las_records_beyond_the_file(tmp_path, suffix, offset, what):
+    pytest.importorskip("laspy")
+    path = tmp_path / f"c{suffix}"
+    write_cloud(some_points(), path)
+    assert len(read_cloud(path)) == 5
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, offset, 2**32 - 1)
+    path.write_bytes(content)
+    refused(read_cloud, path, f"more {what}")
+
+
+def test_the_count_of_laz_chunks_beyond_the_file(tmp_path):
+    pytest.importorskip("laspy")
+    path = tmp_path / "c.laz"
+    write_cloud(some_points(), path)
+    content = bytearray(path.read_bytes())
+    (begin,) = struct.unpack_from("<I", content, TABLE)
+    (table,) = struct.unpack_from("<q", content, begin)
+    assert struct.unpack_from("<II", content, table) == (0, 1)  # version, chunks
+    struct.pack_into("<I", content, table + 4, 2**32 - 1)
+    path.write_bytes(content)
+    refused(read_cloud, path, "more chunks")
+
+
+def test_a_vector_where_las_has_a_number(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.add_extra_dim(laspy.ExtraBytesParams("sX", "3f4"))
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(4.0)
+    las.write(tmp_path / "c.las")
+    refused(read_cloud, tmp_path / "c.las")
+
+
+def test_an_unknown_coordinate_system_of_las(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    keys = laspy.vlrs.known.GeoKeyDirectoryVlr()
+    keys.parse_record_data(struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 9999))
+    header.vlrs.append(keys)
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(4.0)
+    las.write(tmp_path / "c.las")
+    refused(read_cloud, tmp_path / "c.las", "9999")
+
+
+def archive(path, **members):
+    with zipfile.ZipFile(path, "w") as written:
+        for name, content in members.items():
+            written.writestr(f"{name}.npy", content)
+
+
+def array_bytes(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+DAMAGED = {
+    "header that is no Python": lambda good: good.replace(b"{'descr'", b"{('descr", 1),
+    "shape beyond every integer": lambda good: good.replace(
+        b"(2,), }" + 21 * b" ", b"(%d,), }" % (2 * 10**21)),
+    "no array at all": lambda good: b"plain text",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_member_of_an_archive(tmp_path, case):
+    good = array_bytes(np.array([640, 480]))
+    bad = DAMAGED[case](good)
+    assert bad != good
+    path = tmp_path / "c.npz"
+    arrays = {name: good for name in ("object_points", "image_points")}
+    archive(path, image_size=bad, head=bad, xy=bad, **arrays)
+    refused(read_camera_stack, path)
+    refused(lambda p: read_tree(p, (), "a result"), path)
+    store = Store(tmp_path, Detection())
+    archive(tmp_path / f"{store.name('photograph')}.npz", xy=bad, size=bad, angle=bad,
+            descriptor=bad)  # fmt: skip
+    assert store.load_features("photograph") is None  # searched again
+
+
+def test_a_packet_with_a_namespace_that_is_not_utf_8():
+    packet = (b'<x:xmpmeta xmlns:x="\xe9"><rdf:RDF xmlns:rdf="r"><rdf:Description '
+              b'xmlns:c="c" c:Yaw="10" c:Pitch="5" c:Roll="1"/></rdf:RDF></x:xmpmeta>')  # fmt: skip
+    attitude = parse_xmp(packet).attitude
+    assert attitude is not None and attitude.yaw == 10
