@@ -201,8 +201,8 @@ def _bytes_of_evaluation(problem) -> int:
     e = problem.table(plan.eliminated).space.width if plan.eliminated else 0
     W = sum(8 * e * plan.groups[g].width * at.eliminated.size for g, at in plan.incidences.items())
     seen = sum(
-        o.number * (8 * 2 * problem.weights(k).shape[1] + 4 * len(o.kind.of))
-        for k, o in enumerate(problem.observations)
+        o.number * (8 * 2 * problem.weights(o.name).shape[1] + 4 * len(o.kind.of))
+        for o in problem.observations
     )
     return 3 * W + seen
 

@@ -74,10 +74,11 @@ def main() -> int:
     data, found, wrong = pad_data(system, system.data), {}, []
     figures = {"machine": machine.machine(), "image points": len(given.observations.xy),
                "knots": options.columns * options.rows}  # fmt: skip
-    kinds = tuple(dataclasses.replace(kind, local=None) for kind in system.declared.kinds)
-    for name, declared in (
-        ("touched", system.declared), ("dense", dataclasses.replace(system.declared, kinds=kinds)),
-    ):  # fmt: skip
+    kinds = tuple(
+        (name, dataclasses.replace(kind, local=None)) for name, kind in system.declared.named_kinds
+    )
+    dense = dataclasses.replace(system.declared, named_kinds=kinds)
+    for name, declared in (("touched", system.declared), ("dense", dense)):
         def equations(data, declared=declared):
             laid = lay_out_data(system.plan, data)
             return normal_equations(declared, system.plan, data.start, laid)

@@ -101,7 +101,7 @@ def test_what_agrees_comes_back(network):
     spoilt, bad, _ = with_blunders(network, 1)
     whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt)).system
     wrong, right = np.flatnonzero(bad), np.flatnonzero(~bad)[::97]
-    removed = [Removed(0, int(row), None, 9.0) for row in (*wrong, *right)]
+    removed = [Removed("image", int(row), None, 9.0) for row in (*wrong, *right)]
     less = without(whole, removed)
     found = Solution(less, find_minimum(less, max_steps=101).values)
     back = {row for _, row, _ in _passing(whole, found, _Touched(whole), removed, 4.5)}
@@ -113,10 +113,10 @@ def test_predicted_test_of_an_observation(network):
     """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
     problem = jaxbundle.make_problem(jaxbundle.check_network(network))
     row, data = 123, problem.data
-    less = problem.with_system(without(problem.system, [Removed(0, row, None, 0.0)]))
+    less = problem.with_system(without(problem.system, [Removed("image", row, None, 0.0)]))
     minimum = minimise(less, data.start, max_steps=101)
     found = Inspection(less, minimum.values).solution
-    predicted = found.predicted_tests(problem.system.data)[0][row]
+    predicted = found.predicted_tests(problem.system.data)["image"][row]
     i, p = problem.image[row], problem.point[row]
     model = get_model("brown")
 

@@ -60,4 +60,4 @@ def _by_set(problem: Problem, tables, data: Data):
     laid = lay_out_data(system.plan, given)
     parts = residuals_of_parts(system.declared, system.plan, pad_values(system, tables), laid)
     rows = restore_order(system.plan, parts)
-    return {o: rows[o][: given.number] for o, given in enumerate(system.observations)}
+    return {o.name: rows[o.name][: o.number] for o in system.observations}

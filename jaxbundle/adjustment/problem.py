@@ -221,8 +221,8 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
     """Rows with weight, datum conditions, free unknowns."""
     fields = "image", "control", "exterior", "interior", "distance"
     number: dict[str, int] = dict.fromkeys(fields, 0)
-    for s, weight in zip(layout.sets, system.data.weight):
-        number[s.field] += int((np.asarray(weight) > 0).sum())
+    for s in layout.sets:
+        number[s.field] += int((np.asarray(system.data.weight[s.name]) > 0).sum())
     return Counts(
         observations=number["image"], control=number["control"], exterior=number["exterior"],
         interior=number["interior"], distances=number["distance"],
@@ -242,6 +242,6 @@ def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
     tables = tuple(dataclasses.replace(t, value=start[t.name]) for t in declared.tables)
     seen = len([s for s in layout.sets if s.field == "image"])
     system = engine.make_problem(tables, declared.observations[:seen], "point")
-    layout = dataclasses.replace(layout, sets=layout.sets[:seen])
+    layout = dataclasses.replace(layout, sets=layout.sets[:seen], others=())
     counts = count_rows(layout, system)
     return Problem(network, system, layout, declared.data, like.origin, counts)

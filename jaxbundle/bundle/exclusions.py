@@ -171,7 +171,7 @@ def _have_only_rays(problem: Problem) -> Bool[np.ndarray, " images"]:
     """Images whose exterior orientation nothing but image points determines."""
     network = problem.network
     own = np.isnan(network.images.sigma).all(1) & (equations_of(network, "IMAGES") == 0)
-    return own if len(problem.layout.sets) == len(problem.system.observations) else ~own & own
+    return ~own & own if problem.layout.others else own
 
 
 def _width_of_points(problem: Problem, values: Values) -> Float[np.ndarray, " images"]:

@@ -195,10 +195,11 @@ def _are_pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " 
     """Whether vᵀPv decreases with the distance of a point."""
     free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
     solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))
-    for o, s in enumerate(problem.layout.sets):
+    for s in problem.layout.sets:
         if s.field == "image":
             rows = slice(None) if s.rows is None else s.rows
-            along = (solution.residuals[o] * solution.by_eliminated[o][:, :, 2]).sum(1)
+            along = solution.residuals[s.name] * solution.by_eliminated[s.name][:, :, 2]
+            along = along.sum(1)
             np.add.at(slope, problem.point[rows], along)
     return slope > 0
 

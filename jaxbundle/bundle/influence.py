@@ -94,7 +94,7 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     found, problem = inspection.solution, inspection.problem
     by_set = pull_back(found, found.slopes(inspection.of_tables(results.function)))
     of_result = [
-        problem.layout.rows({o: x[r] for o, x in enumerate(by_set)}, problem.data)
+        problem.layout.rows({o: x[r] for o, x in by_set.items()}, problem.data)
         for r in range(len(results.asked))
     ]
     parts = list(observations(problem, *of_result))

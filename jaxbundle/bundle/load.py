@@ -82,8 +82,9 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
     for table, free in zip(problem.system.tables, state.free):
         if not np.array_equal(np.asarray(table.free), free):
             problem = problem.with_free(table.name, free)
-    system, weight = problem.system, _tree(problem.system.data.weight, state.weights)
-    data = dataclasses.replace(system.data, weight=weight)
+    system, names = problem.system, [o.name for o in problem.system.observations]
+    weight = _tree([system.data.weight[o] for o in names], state.weights)
+    data = dataclasses.replace(system.data, weight=dict(zip(names, weight, strict=True)))
     return problem.with_system(engine.with_data(system, data))
 
 

@@ -581,7 +581,7 @@ def _all_angles(rotation, given):
 def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:
     """The weight factors of image points, from those of the observation sets."""
     found = np.ones(len(problem.network.observations))
-    for o, s in enumerate(problem.layout.sets):
+    for s in problem.layout.sets:
         if s.field == "image":
-            found[slice(None) if s.rows is None else s.rows] = weights[o]
+            found[slice(None) if s.rows is None else s.rows] = weights[s.name]
     return found

@@ -168,9 +168,8 @@ def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
 
 def _further(problem: Problem, found: Sequence[Rows]):
     """Observations of further kinds: the rows they touch are in the column of the point."""
-    first = len(problem.layout.sets)
-    for k, given in enumerate(problem.system.observations[first:]):
-        weight = problem.system.weights(first + k)
+    for k, name in enumerate(problem.layout.others):
+        given, weight = problem.system.set(name), problem.system.weights(name)
         touched = [given.label(problem.system.tables, row) for row in range(given.number)]
         touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
         axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))

@@ -146,15 +146,16 @@ class Result:
         """For the observations of a kind, in the given order: v (computed − observed) and sigma (a
         priori) in the unit of the kind, r, w (Baarda), tau (Pope), mdb, external; v is NaN, sigma
         infinite for residuals without weight."""
-        names = [given.kind.name for given in self.problem.observations]
-        if kind not in names:
-            raise KeyError(f"there is no kind {kind!r}; known: {', '.join(dict.fromkeys(names))}")
-        parts = [self._residuals(o) for o, name in enumerate(names) if name == kind]
+        names = {given.name: given.kind.name for given in self.problem.observations}
+        if kind not in names.values():
+            known = ", ".join(dict.fromkeys(names.values()))
+            raise KeyError(f"there is no kind {kind!r}; known: {known}")
+        parts = [self._residuals(o) for o, name in names.items() if name == kind]
         columns = {c: np.concatenate([part[c] for part in parts]) for c in parts[0]}
         one = columns["v"].shape[1] == 1
         return {c: x[:, 0] if one else x for c, x in columns.items()}
 
-    def _residuals(self, o: int):
+    def _residuals(self, o: str):
         found, weight = self.solution.reliability, self.problem.weights(o)
         used = weight > 0
         sigma = np.where(used, 1 / np.where(used, weight, 1.0), np.inf)
@@ -271,8 +272,8 @@ def adjust(
 def kinds_as_groups(problem: Problem) -> list[Group]:
     """Every kind of observations is a separate group."""
     sets: dict[str, list] = {}
-    for o, given in enumerate(problem.observations):
-        sets.setdefault(given.kind.name, []).append((o, np.s_[:]))
+    for given in problem.observations:
+        sets.setdefault(given.kind.name, []).append((given.name, np.s_[:]))
     return [Group(name, parts) for name, parts in sets.items()]
 
 

@@ -153,10 +153,10 @@ class Kind:
 
     def __call__(
         self, rows: Sequence[Int[np.ndarray, " n"]], measured: PyTree = (), *,
-        sigma: Any = None, covariance: Any = None,
+        sigma: Any = None, covariance: Any = None, name: str = "",
     ) -> "Observations":  # fmt: skip
         """Observations of this kind; see `Observations`."""
-        return Observations(self, tuple(rows), measured, sigma, covariance)
+        return Observations(self, tuple(rows), measured, sigma, covariance, name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +185,8 @@ class Observations:
     **Arguments:** `rows`: for each touched table the row (or the label of the row) every
     observation touches, [n];
     `measured`: arrays of n rows; `sigma`: one number, [n] or [n, r] (1 if neither is given;
-    infinite: a weight of 0), or `covariance` [n, r, r] of the residuals of an observation.
+    infinite: a weight of 0), or `covariance` [n, r, r] of the residuals of an observation; `name`:
+    of these observations in the data and the results of a problem, by default that of their kind.
 
     `weight` [n, r] is 1/σ, or [n, r, r] L⁻¹ of the covariance L·Lᵀ.
     """
@@ -195,9 +196,11 @@ class Observations:
     measured: PyTree[np.ndarray]
     sigma: Any = None
     covariance: Any = None
+    name: str = ""
 
     def __post_init__(self):
         name, kind = self.kind.name, self.kind
+        object.__setattr__(self, "name", self.name or name)
         rows = tuple(_row_numbers(name, r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(

@@ -1,6 +1,7 @@
 """A problem prepared for the solver: plan, numbers, and counts of rows and unknowns."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -60,9 +61,13 @@ class Problem:
         """The table of this name."""
         return next(t for t in self.tables if t.name == name)
 
-    def weights(self, o: int) -> Float[np.ndarray, "n r"]:
+    def set(self, name: str) -> Observations:
+        """The observations of this name."""
+        return next(o for o in self.observations if o.name == name)
+
+    def weights(self, name: str) -> Float[np.ndarray, "n r"]:
         """1/σ of the residuals of a set of observations, 0 without weight."""
-        return inverse_sigma(np.asarray(self.data.weight[o]))
+        return inverse_sigma(np.asarray(self.data.weight[name]))
 
     @property
     def reduced_size(self) -> int:
@@ -114,9 +119,10 @@ def make_problem(
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
     observations = tuple(given.resolve_labels(tables) for given in observations)
+    observations = distinct_names(observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
-    declared = Declared(tuple(o.kind for o in observations), spaces, motions)
+    declared = Declared(tuple((o.name, o.kind) for o in observations), spaces, motions)
     ways = REDUCTIONS if reduction is None else (reduction,)
     planned = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
@@ -177,8 +183,8 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
 def with_motions_at(problem: Problem, values: Values) -> Problem:
     """The problem with its open motions at these values: those about a weighted point follow the
     point."""
-    datum, invariant = problem.plan.datum, (kind.invariant for kind in problem.declared.kinds)
-    if datum is None or all(invariant):
+    datum, kinds = problem.plan.datum, problem.declared.kinds.values()
+    if datum is None or all(kind.invariant for kind in kinds):
         return problem
     data = pad_data(problem, dataclasses.replace(problem.data, start=values))
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
@@ -234,7 +240,7 @@ def with_data(problem: Problem, data: Data) -> Problem:
 def count(tables, data: Data) -> Counts:
     """Rows with weight, and free unknowns."""
     return Counts(
-        sum(int(used(np.asarray(w)).sum()) for w in data.weight),
+        sum(int(used(np.asarray(w)).sum()) for w in data.weight.values()),
         sum(int((t.free > 0).sum()) for t in tables),
     )
 
@@ -257,6 +263,18 @@ def check(tables, observations) -> None:
                 )
 
 
+def distinct_names(observations: Sequence[Observations]) -> tuple[Observations, ...]:
+    """The same with names that differ: a second "distance" is "distance 2"."""
+    taken: set[str] = set()
+    found = []
+    for given in observations:
+        names = itertools.chain([given.name], (f"{given.name} {k}" for k in itertools.count(2)))
+        name = next(n for n in names if n not in taken)
+        taken.add(name)
+        found.append(dataclasses.replace(given, name=name))
+    return tuple(found)
+
+
 def check_numbers(tables, observations, weights) -> None:
     """Refuse start values, and measured values with weight, that are not finite."""
     for table in tables:
@@ -265,7 +283,8 @@ def check_numbers(tables, observations, weights) -> None:
             if bad.any():
                 row = table.label(int(np.argwhere(bad)[0][0]))
                 raise InputError(f"{table.title} {row}: a start value is not a finite number")
-    for given, weight in zip(observations, weights):
+    for given in observations:
+        weight = weights[given.name]
         for rows in jax.tree.leaves(given.measured):
             bad = ~np.isfinite(rows).reshape(given.number, math.prod(np.shape(rows)[1:]))
             counts = used(weight)
@@ -283,13 +302,13 @@ def make_data(declared: Declared, tables, observations) -> Data:
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = weights_of(tables, observations)
     check_numbers(tables, observations, weights)
-    measured = tuple(o.measured for o in observations)
-    return Data(*jax.device_put((start, measured, tuple(weights))))
+    measured = {o.name: o.measured for o in observations}
+    return Data(*jax.device_put((start, measured, weights)))
 
 
-def weights_of(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
-    """The weights of sets of observations; the number of residuals of a kind is found from the
-    shapes."""
+def weights_of(tables, observations) -> dict[str, Float[np.ndarray, "n ..."]]:
+    """The weights of sets of observations by name; the number of residuals of a kind is found from
+    the shapes."""
     called = {t.name: t for t in tables}
     one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
 
@@ -298,7 +317,7 @@ def weights_of(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
         values, spaces = [t.value for t in touched], tuple(t.space for t in touched)
         return len(_evaluate.eval_shape(given.kind, spaces, one(values), one(given.measured)))
 
-    return [given.weight(number(given)) for given in observations]
+    return {given.name: given.weight(number(given)) for given in observations}
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -319,8 +338,8 @@ def fill_data(problem: Problem, data: Data) -> Data:
     fill = lambda o: lambda x: _append_unused(x, problem.sizes["observations", o], "constant")
     return Data(
         pad_values(problem, data.start),
-        tuple(jax.tree.map(fill(o), m) for o, m in enumerate(data.measured)),
-        tuple(fill(o)(w) for o, w in enumerate(data.weight)),
+        {o: jax.tree.map(fill(o), m) for o, m in data.measured.items()},
+        {o: fill(o)(w) for o, w in data.weight.items()},
     )
 
 
@@ -366,7 +385,8 @@ def make_solver(
 ) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
     its program."""
-    squares = sum(map(_measured_squares, problem.data.weight, problem.data.measured))
+    given = problem.data
+    squares = sum(_measured_squares(w, given.measured[o]) for o, w in given.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
     rows = round_up(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))

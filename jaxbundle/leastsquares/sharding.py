@@ -77,7 +77,7 @@ def distribute(problem: Problem, devices=None) -> Shards:
     planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
     sizes = common((sizes for _, sizes in planned), choose_rounding(problem.observations))
     here, host = dataclasses.replace(problem, sizes=sizes), jax.tree.map(np.asarray, problem.data)
-    take = lambda of_sets, at: tuple(_take(x, rows) for x, rows in zip(of_sets, at))
+    take = lambda of_sets, at: {o: _take(of_sets[o], rows) for o, rows in at.items()}
     data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]
     datum = problem.plan.datum  # The datum is applied only at the end.
     datum = datum and jax.tree.map(np.asarray, Datum(datum.gauge, {}, datum.pins, {}))
@@ -156,8 +156,10 @@ def _cut(problem: Problem, parts: int):
     work = np.where(tied, 0.0, met * (met - 1) / 2 + OBSERVATION * met)
     middle = (np.cumsum(work) - work / 2) / max(work.sum(), 1.0)
     owner = np.where(tied, 0, np.minimum((parts * middle).astype(int), parts - 1))
-    of_sets = [owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)]
-    found = [tuple(np.flatnonzero(of_set == d) for of_set in of_sets) for d in range(parts)]
+    owners = {
+        o.name: owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)
+    }
+    found = [{o: np.flatnonzero(of == d) for o, of in owners.items()} for d in range(parts)]
     return tuple(np.flatnonzero(stays | (owner == d)) for d in range(parts)), found
 
 
@@ -171,9 +173,9 @@ def _plan_part(problem: Problem, rows, seen):
     row[rows] = np.arange(len(rows))
     cut = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])
     tables = [cut(t) if t.name == e else t for t in problem.tables]
+    rows_of = lambda o, at: [row[r[at]] if t == e else r[at] for t, r in zip(o.kind.of, o.rows)]
     observations = [
-        o.kind([row[r[at]] if name == e else r[at] for name, r in zip(o.kind.of, o.rows)])
-        for o, at in zip(problem.observations, seen)
+        o.kind(rows_of(o, seen[o.name]), name=o.name) for o in problem.observations
     ]
     return make_plan(tables, observations, e, choices)[:2]
 

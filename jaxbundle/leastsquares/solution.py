@@ -58,7 +58,7 @@ ones waiting exceeds computing."""
 RETURNS, COST_TOLERANCE = 10, 1e-12
 """Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
 
-Rows = dict[int, Float[np.ndarray, "n r"]]
+Rows = dict[str, Float[np.ndarray, "n r"]]
 """By set of observations, in the given order."""
 
 
@@ -278,8 +278,7 @@ class Solution:
         return problem.declared, problem.plan, self._values, self._data
 
     def _rows(self, by_set) -> Rows:
-        sets = self._as_given.observations
-        return {o: np.asarray(x)[: sets[o].number] for o, x in by_set.items()}
+        return {o.name: np.asarray(by_set[o.name])[: o.number] for o in self._as_given.observations}
 
 
 @compile_once

@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.rows import Data as EngineData
 from jaxbundle.leastsquares.indexing.rows import Values as Tables
-from jaxbundle.leastsquares.problem import weights_of
+from jaxbundle.leastsquares.problem import distinct_names, weights_of
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
@@ -39,9 +39,10 @@ LEAST_IMAGES = 64
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """A set of observations: the field of `Data`, its rows and columns there (None: all);
+    """A set of observations: its name, the field of `Data`, its rows and columns there (None: all);
     `constant`: further constants per row for its kind."""
 
+    name: str
     field: str
     rows: Int[np.ndarray, " n"] | None = None
     columns: int | None = None
@@ -67,11 +68,13 @@ class Set:
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """The mapping of the arrays of a network; `width`: of `Values.camera`; `given`: the points,
-    images and cameras of the rows of control, exterior and interior; `lengths`: the unit of
-    distance of points at any distance, 0 for the others."""
+    images and cameras of the rows of control, exterior and interior; `others`: the names of the
+    sets of further kinds; `lengths`: the unit of distance of points at any distance, 0 for the
+    others."""
 
     cameras: tuple[CameraTable, ...]
     sets: tuple[Set, ...]
+    others: tuple[str, ...]
     width: int
     given: Mapping[str, Int[np.ndarray, " rows"]]
     lengths: Float[np.ndarray, " points"] | None = None
@@ -115,19 +118,20 @@ class Layout:
 
     def data(self, data: Data) -> EngineData:
         """The data of a network for the engine."""
-        measured = tuple(s.measured(data) for s in self.sets)
-        weight = tuple(_of_rows(s.cut(data.weight(s.field))) for s in self.sets)
-        other = tuple(zip(*data.other)) or ((), ())
-        return EngineData(self.tables(data.start), measured + other[0], weight + other[1])
+        measured = {s.name: s.measured(data) for s in self.sets}
+        weight = {s.name: _of_rows(s.cut(data.weight(s.field))) for s in self.sets}
+        for name, (values, w) in zip(self.others, data.other, strict=True):
+            measured[name], weight[name] = values, w
+        return EngineData(self.tables(data.start), measured, weight)
 
     def with_weights(self, data: Data, weight) -> Data:
         """The data with the weights of the engine's sets."""
         found = {}
-        for s, w in zip(self.sets, weight):
+        for s in self.sets:
             name = f"{s.field}_weight"
             whole = found.get(name, np.array(data.weight(s.field)))
-            found[name] = s.put(whole, np.asarray(w))
-        other = tuple((m, w) for (m, _), w in zip(data.other, weight[len(self.sets) :]))
+            found[name] = s.put(whole, np.asarray(weight[s.name]))
+        other = tuple((m, weight[o]) for o, (m, _) in zip(self.others, data.other, strict=True))
         return dataclasses.replace(data, other=other, **jax.device_put(found))
 
     def rows(self, by_set, data: Data) -> "Rows":
@@ -135,9 +139,9 @@ class Layout:
         found = {}
         for field in ("image", "control", "exterior", "interior", "distance"):
             found[field] = np.zeros(np.shape(data.weight(field)))
-        for o, s in enumerate(self.sets):
-            found[s.field] = s.put(found[s.field], by_set[o])
-        return Rows(**found, other=tuple(by_set[o] for o in range(len(self.sets), len(by_set))))
+        for s in self.sets:
+            found[s.field] = s.put(found[s.field], by_set[s.name])
+        return Rows(**found, other=tuple(by_set[name] for name in self.others))
 
 
 class Rows(NamedTuple):
@@ -218,14 +222,16 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     similarity = kinds.SIMILARITY if lengths is None else kinds.SIMILARITY_AT_ANY_DISTANCE
     actions = (*similarity.actions, *(action for one in declared for action in one.actions))
     start = dataclasses.replace(start, other={t.name: t.value for t in further})
+    given = distinct_names([*given, *others])
+    others = given[len(sets) :]
     weights = weights_of(tables, others)
     data = dataclasses.replace(
-        data, start=start, other=tuple((one.measured, w) for one, w in zip(others, weights))
+        data, start=start, other=tuple((one.measured, weights[one.name]) for one in others)
     )
-    given += others
-    layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors, lengths)
+    names = tuple(one.name for one in others)
+    layout = Layout(cameras, tuple(sets), names, start.camera.shape[1], priors, lengths)
     motions = dataclasses.replace(similarity, actions=actions)
-    return Declared(tuple(tables), tuple(given), layout, data, origin, motions)
+    return Declared(tuple(tables), given, layout, data, origin, motions)
 
 
 def _observe(network: Network, data: Data, priors, cameras: tuple[CameraTable, ...]):
@@ -237,13 +243,13 @@ def _observe(network: Network, data: Data, priors, cameras: tuple[CameraTable, .
         row_of_camera[list(t.cameras)] = np.arange(len(t.cameras))
     sets, given = [], []
 
-    def observe(kind, rows, *where):
+    def observe(kind, rows, name, *where):
         if len(rows[0]):
-            s = Set(*where)
+            s = Set(name, *where)
             sets.append(s)
             weight = s.cut(data.weight(s.field))
             sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.inf)
-            given.append(kind(rows, s.measured(data), sigma=sigma))
+            given.append(kind(rows, s.measured(data), sigma=sigma, name=s.name))
 
     shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
     lines = None if shutter is None else shutter.lines(network)
@@ -254,15 +260,18 @@ def _observe(network: Network, data: Data, priors, cameras: tuple[CameraTable, .
         take = lambda x, rows=rows: x if rows is None or x is None else x[rows]
         motion = () if lines is None else (observations.image, camera)
         touched = observations.image, *motion, row_of_camera[camera], observations.point
-        observe(kind, tuple(map(take, touched)), "image", rows, None, take(lines))
-    observe(kinds.CONTROL, (priors["control"],), "control")
-    observe(kinds.EXTERIOR, (priors["exterior"],), "exterior")
+        name = t.name.replace("camera", "image", 1)
+        observe(kind, tuple(map(take, touched)), name, "image", rows, None, take(lines))
+    observe(kinds.CONTROL, (priors["control"],), "control", "control")
+    observe(kinds.EXTERIOR, (priors["exterior"],), "exterior", "exterior")
     for t in cameras:
         rows = np.flatnonzero(np.isin(priors["interior"], t.cameras))
         kind = kinds.interior_orientation(t.name, t.parameters)
         columns = len(t.parameters)
-        observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
-    observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+        name = t.name.replace("camera", "interior", 1)
+        touched = (row_of_camera[priors["interior"][rows]],)
+        observe(kind, touched, name, "interior", rows, columns)
+    observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance", "distance")
     return sets, given
 
 

@@ -165,9 +165,9 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
     def value(data):
         if task.reliability:
             r = redundancy(declared, plan, data)
-            weights = [diagonal_of(w) for w in data.weight[: task.image_sets]]
+            weights = [diagonal_of(w) for w in (data.weight[o] for o in task.image_sets)]
             inverse = [_mask(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
-                       for o, w in enumerate(weights)]  # fmt: skip
+                       for o, w in zip(task.image_sets, weights)]  # fmt: skip
             return jnp.log(_norm(jnp.concatenate(inverse), POWER)) / 2
         functions, still = task.functions, zero_tangent(plan)
         if functions is None:
@@ -192,12 +192,13 @@ def smallest_redundancy(problem: Problem) -> float:
     system = problem.with_factor().system
     data = pad_data(system, problem.layout.data(problem.data))
     found = redundancy(system.declared, system.plan, data)
-    there = {o: diagonal_of(data.weight[o]) > 0 for o in range(_image_sets(problem))}
+    there = {o: diagonal_of(data.weight[o]) > 0 for o in _image_sets(problem)}
     return min(float(found[o][used].min()) for o, used in there.items())
 
 
-def _image_sets(problem: Problem) -> int:
-    return sum(s.field == "image" for s in problem.layout.sets)
+def _image_sets(problem: Problem) -> tuple[str, ...]:
+    """The names of the sets of image points."""
+    return tuple(s.name for s in problem.layout.sets if s.field == "image")
 
 
 def measure(aim: Aim, blocks: Float[AnyArray, "blocks k k"]) -> float:

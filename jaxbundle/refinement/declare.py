@@ -92,10 +92,10 @@ def sensor_of(one: ScannerImage) -> str:
 
 
 class Part(NamedTuple):
-    """Image points: their set among the engine's; whether it is of scanner images; of each the row
+    """Image points: the name of their set; whether it is of scanner images; of each the row
     in its table of measurements, the image (as in `Given.ids`), the point among those used."""
 
-    set: int
+    set: str
     of_scanner: bool
     rows: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
@@ -143,14 +143,14 @@ class Declared:
 
     def rescale(self, problem: Problem, values: Values) -> tuple[Problem, float]:
         """The problem with S at these values, and the largest relative change of S."""
-        measured, X, change = list(problem.data.measured), np.asarray(values["point"].position), 0.0
+        measured, X, change = dict(problem.data.measured), np.asarray(values["point"].position), 0.0
         for part in self.parts:
             if part.of_scanner:
                 lines, _ = _lines(self.given, values, X, part.rows, part.image, part.point)
                 before, measured[part.set] = np.asarray(measured[part.set].scale), lines
                 size = np.abs(before).max((1, 2), keepdims=True)
                 change = max(change, float((np.abs(lines.scale - before) / size).max()))
-        data = dataclasses.replace(problem.data, measured=tuple(measured))
+        data = dataclasses.replace(problem.data, measured=measured)
         return with_data(problem, data), change
 
 
@@ -189,18 +189,19 @@ def declare(given: Given, rays: Rays, X, values: Values | None = None) -> Declar
         image, point = measured.image[rows], index[measured.point[rows]]
         lines, v = _lines(given, values, X, rows, image, point)
         _check_near(given, rows, v)
-        parts.append(Part(len(observed), True, rows, image, point))
+        name = f"scanner points {len(parts) + 1}"
+        parts.append(Part(name, True, rows, image, point))
         touched = image, given.sensor[image], point
-        observed.append(kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows]))
+        observed.append(kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows], name=name))
     if given.frames is not None:
         network = _network_of(given, rays, index, X + given.origin, checking)
         photographs = declare_network(network, given.origin)
-        for k, s in enumerate(photographs.layout.sets):
+        for s in photographs.layout.sets:
             if s.field == "image":
                 rows = np.arange(len(rays.frame)) if s.rows is None else s.rows
                 image, point = network.observations.image[rows], network.observations.point[rows]
                 image = image + len(given.images)
-                parts.append(Part(len(observed) + k, False, rays.frame[rows], image, point))
+                parts.append(Part(s.name, False, rays.frame[rows], image, point))
         observed += photographs.observations
         tables += [t for t in photographs.tables if t.name != "point"]
         of_cameras = {

@@ -111,7 +111,7 @@ class Inspection:
         return np.asarray(self.solution.values["point"].position) + self.declared.given.origin
 
     @functools.cached_property
-    def residuals(self) -> dict[int, Float[np.ndarray, "n r"]]:
+    def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
         """v of every set of observations in its unit, including removed ones."""
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
@@ -120,11 +120,11 @@ class Inspection:
         return {o: v / unit(o) for o, v in found.items()}
 
     @property
-    def used(self) -> list[np.ndarray]:
+    def used(self) -> dict[str, np.ndarray]:
         """Which residuals of every set carry weight."""
-        return [np.asarray(w) > 0 for w in self.solution.problem.data.weight]
+        return {o: np.asarray(w) > 0 for o, w in self.solution.problem.data.weight.items()}
 
-    def rows(self, o: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def rows(self, o: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """v, r, w of a set of observations, NaN if missing, and the removed ones."""
         used, found = self.used[o], self.solution.reliability
         tell = lambda x: np.where(used, x[o], np.nan)
@@ -178,11 +178,13 @@ def _name(declared: Declared, one) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
     given, chosen = declared.given, declared.rays.points
-    part = next((p for p in declared.parts if p.set == one.set), None)
-    points, set = given.points, declared.problem.observations[one.set]
-    if part is not None:
+    names = [part.set for part in declared.parts]
+    points, set = given.points, declared.problem.set(one.set)
+    if one.set in names:
+        number = names.index(one.set)
+        part = declared.parts[number]
         place = np.argsort(np.argsort(declared.image, kind="stable"))
-        before = sum(len(p.rows) for p in declared.parts if p.set < one.set)
+        before = sum(len(p.rows) for p in declared.parts[:number])
         told = [f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
                 for r in one.rows]  # fmt: skip
         name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"

@@ -141,12 +141,12 @@ class Refinement:
         """One row per distance used: ids of both points, v, r, w, whether it was
         removed."""
         found, rows = self.inspection, []
-        for o, given in enumerate(found.declared.problem.observations):
+        for given in found.declared.problem.observations:
             if given.kind.name == "distances":
                 rows += [
                     {"from": self.point_ids[a], "to": self.point_ids[b], "v": float(v[0]),
                      "r": float(r[0]), "w": float(w[0]), "removed": bool(gone)}
-                    for a, b, v, r, w, gone in zip(*given.rows, *found.rows(o))
+                    for a, b, v, r, w, gone in zip(*given.rows, *found.rows(given.name))
                 ]  # fmt: skip
         return rows
 

@@ -92,9 +92,10 @@ def _shares(vector, names):
 def _observe(declared: Declared, found: Solution):
     """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
     points that distances keep in the engine's reduced system are eliminated here."""
-    priors = [given.kind.snooped == "" and given.kind.of != ("image",)
-              for given in found.problem.observations]  # fmt: skip
-    weight = tuple(0 * w if p else w for w, p in zip(found.problem.data.weight, priors))
+    weight = dict(found.problem.data.weight)
+    for given in found.problem.observations:
+        if given.kind.snooped == "" and given.kind.of != ("image",):
+            weight[given.name] = 0 * weight[given.name]
     data = dataclasses.replace(found.problem.data, weight=weight)
     problem = with_data(found.problem, data)
     S = scaled_system(problem, found.values)[0]

@@ -58,9 +58,9 @@ def image_points_removed(
     places = zip(problem.image.tolist(), problem.point.tolist())
     rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
     return [
-        snooping.Removed(o, row, None, math.inf)
-        for o, s in enumerate(problem.layout.sets) if s.field == "image"
-        for row, place in enumerate(range(problem.system.observations[o].number)
+        snooping.Removed(s.name, row, None, math.inf)
+        for s in problem.layout.sets if s.field == "image"
+        for row, place in enumerate(range(len(problem.image))
                                     if s.rows is None else s.rows.tolist())
         if place in rows
     ]  # fmt: skip
@@ -78,17 +78,17 @@ def name_suspect(problem: Problem, found: robust.Suspect) -> Suspect:
     return Suspect(kind, rows[0], name, found.test, found.weight)
 
 
-def _place(problem: Problem, o: int, rows):
+def _place(problem: Problem, name: str, rows):
     """Kind and rows in the arrays of that kind."""
-    if o >= len(problem.layout.sets):
-        return problem.system.observations[o].kind.name, tuple(rows)
-    s = problem.layout.sets[o]
+    s = next((s for s in problem.layout.sets if s.name == name), None)
+    if s is None:
+        return problem.system.set(name).kind.name, tuple(rows)
     return s.field, tuple(int(row if s.rows is None else s.rows[row]) for row in rows)
 
 
-def _name(problem: Problem, o: int, row: int, residual: int | None) -> str:
-    kind, (place,) = _place(problem, o, (row,))
-    network, given = problem.network, problem.system.observations[o]
+def _name(problem: Problem, name: str, row: int, residual: int | None) -> str:
+    kind, (place,) = _place(problem, name, (row,))
+    network, given = problem.network, problem.system.set(name)
     points = network.points.id
     if kind == "image":
         image = network.images.id[problem.image[place]]

@@ -12,9 +12,9 @@ def groups(problem: Problem) -> list[Group]:
     """Image coordinates (by camera, if several have several images), control points by axis,
     priors, distances; further kinds by name."""
     network, layout, found = problem.network, problem.layout, []
-    of = {f: [o for o, s in enumerate(layout.sets) if s.field == f]
+    of = {f: [s.name for s in layout.sets if s.field == f]
           for f in ("image", "control", "exterior", "interior", "distance")}  # fmt: skip
-    sets = [(o, layout.sets[o].cut(problem.camera)) for o in of["image"]]
+    sets = [(s.name, s.cut(problem.camera)) for s in layout.sets if s.field == "image"]
     own = np.array_equal(network.images.camera, np.arange(len(network.cameras)))
     if len(network.cameras) == 1 or own:
         found.append(Group("image coordinates", [(o, np.s_[:]) for o, _ in sets]))
@@ -35,7 +35,7 @@ def groups(problem: Problem) -> list[Group]:
         Group("distances", every("distance")),
     ]
     further: dict[str, list] = {}
-    for o, given in enumerate(problem.system.observations[len(layout.sets) :], len(layout.sets)):
-        further.setdefault(given.kind.name, []).append((o, np.s_[:]))
+    for given in problem.system.observations[len(layout.sets) :]:
+        further.setdefault(given.kind.name, []).append((given.name, np.s_[:]))
     unit = lambda name: angle if name in OF_ANGLES else 1.0
     return found + [Group(name, parts, unit(name)) for name, parts in further.items()]

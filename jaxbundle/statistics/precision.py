@@ -126,7 +126,7 @@ def redundancy(problem: Problem, data: Data | None = None) -> Rows:
     data, system = problem.data if data is None else data, problem.system
     given = complete_data(system, problem.layout.data(predict(problem, data)))
     found = engine_redundancy(system.declared, system.plan, given)
-    found = {o: found[o][: one.number] for o, one in enumerate(system.observations)}
+    found = {o.name: found[o.name][: o.number] for o in system.observations}
     return problem.layout.rows(found, data)
 
 

@@ -150,13 +150,14 @@ def made(name):
 def residuals(problem, values, data):
     """v/σ of all observations, one after the other as they were given."""
     found = []
-    for o, given in enumerate(problem.observations):
+    for given in problem.observations:
         blocks = []
         for name, rows in zip(given.kind.of, given.rows):
             of_rows = jax.tree.map(lambda x, rows=rows: x[rows], values[name])
             poses = isinstance(values[name], PoseValue)
             blocks.append(jax.vmap(Pose().prepare)(of_rows) if poses else of_rows)
-        v, weight = jax.vmap(given.kind.residual)(*blocks, data.measured[o]), data.weight[o]
+        v = jax.vmap(given.kind.residual)(*blocks, data.measured[given.name])
+        weight = data.weight[given.name]
         v = jnp.stack(v, -1) if isinstance(v, tuple) else v.reshape(len(v), -1)
         found.append(weight * v if weight.ndim == 2 else jnp.einsum("nij,nj->ni", weight, v))
     return jnp.concatenate([v.ravel() for v in found])
@@ -207,14 +208,13 @@ def directions(problem, size):
     random, data = np.random.default_rng(4), jax.tree.map(np.asarray, problem.data)
     zero = jax.tree.map(np.zeros_like, data)
     noise = lambda x, scale: scale * random.normal(size=x.shape)
-    for o, weight in enumerate(data.weight):
-        name = problem.observations[o].kind.name
+    for name, weight in data.weight.items():
         sigma = 1 / np.abs(weight).max()
-        change = noise(data.measured[o], 0.3 * sigma)
-        yield f"{name}: measured", eqx.tree_at(lambda d, o=o: d.measured[o], zero, change)
+        change = noise(data.measured[name], 0.3 * sigma)
+        yield f"{name}: measured", eqx.tree_at(lambda d, name=name: d.measured[name], zero, change)
         lower = weight if weight.ndim == 2 else np.tril(weight)
         change = lower * noise(weight, 0.01)
-        yield f"{name}: weight", eqx.tree_at(lambda d, o=o: d.weight[o], zero, change)
+        yield f"{name}: weight", eqx.tree_at(lambda d, name=name: d.weight[name], zero, change)
     for name, value in data.start.items():
         scale = size if name == "point" else 0.01
         change = jax.tree.map(lambda x, scale=scale: noise(x, scale), value)
@@ -295,10 +295,11 @@ def test_conjugate_gradients_give_the_same_as_a_factor():
 def test_gradient_of_a_gradient_in_a_batch():
     """Reverse over reverse, forward over reverse, both under vmap; one member has no solution."""
     problem = made("inner constraints")
-    (measured,), (weight,) = problem.data.measured, problem.data.weight
+    (name,) = problem.data.measured
+    measured, weight = problem.data.measured[name], problem.data.weight[name]
 
     def scalar(measured, weight):
-        data = dataclasses.replace(problem.data, measured=(measured,), weight=(weight,))
+        data = dataclasses.replace(problem.data, measured={name: measured}, weight={name: weight})
         return jnp.sin(solve(problem, data)["point"]).sum()
 
     gradient = jax.grad(scalar)
@@ -376,42 +377,44 @@ def test_precision_is_that_of_the_dense_inverse():
 def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
     problem = made("a point held")
     data, solution = problem.data, minimum(problem, problem.data)
+    (name,) = data.measured
 
     def points(measured, start, weight):
         start = data.start | {"point": start}
-        given = dataclasses.replace(data, measured=(measured,), weight=(weight,), start=start)
+        own = {"measured": {name: measured}, "weight": {name: weight}, "start": start}
+        given = dataclasses.replace(data, **own)
         given = complete_data(problem, given), "gauss-newton"
         moved = attach_derivatives(problem.declared, problem.plan, solution, *given)
         return (without_filling(problem, moved)["point"].ravel(),) * 2
 
     by_all = jax.jit(jax.jacfwd(points, (0, 1, 2), has_aux=True))
-    by, value = by_all(data.measured[0], data.start["point"], data.weight[0])
+    by, value = by_all(data.measured[name], data.start["point"], data.weight[name])
     values = data.start | {"point": value.reshape(-1, 2)}
     values["device"] = solution["device"][:2]
     J, B = dense(problem, values, data)
     Q, into = bordered(J, B)
     free = np.flatnonzero(problem.tables[0].free)
     # ∂v/∂measured = −1/σ; the datum follows its start values. The first unknown is the device's.
-    expected = (Q @ (J.T * np.asarray(data.weight[0]).T))[1:]
+    expected = (Q @ (J.T * np.asarray(data.weight[name]).T))[1:]
     by = [np.asarray(x) for x in by]
     np.testing.assert_allclose(by[0][free], expected, atol=1e-8 * np.abs(expected).max())
     expected, found = (into @ B.T)[1:, 1:], by[1].reshape(10, 10)[np.ix_(free, free)]
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     # Twice the weight, P = w², not once.
-    v, weight = (np.ravel(x) for x in (residuals(problem, values, data), data.weight[0]))
+    v, weight = (np.ravel(x) for x in (residuals(problem, values, data), data.weight[name]))
     expected = -2 * (Q @ J.T)[1:] * v / weight
     found = by[2].reshape(10, -1)[free]
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     # It is not the exact one: they differ by the curvature.
     u, exact = jax.tree.map(np.zeros_like, jax.tree.map(np.asarray, data)), 0.0
-    u.measured[0][0] = 0.2
+    u.measured[name][0] = 0.2
     for step, factor in STENCIL:
         exact = exact + factor / 0.2 * minimum(problem, along(data, u, step))["point"][:5].ravel()
     apart = np.abs(exact - by[0][:, 0].ravel()).max() / np.abs(exact).max()
     assert 1e-5 < apart < 0.5  # a net of the plane, with residuals of 0.3 in 50
     with pytest.raises(InputError, match="first derivatives only"):
-        given = data.start["point"], data.weight[0]
-        jax.jacfwd(jax.grad(lambda m: points(m, *given)[0][0]))(data.measured[0])
+        given = data.start["point"], data.weight[name]
+        jax.jacfwd(jax.grad(lambda m: points(m, *given)[0][0]))(data.measured[name])
 
 
 def test_what_did_not_converge_is_nan_with_its_derivative():
@@ -422,17 +425,19 @@ def test_what_did_not_converge_is_nan_with_its_derivative():
     )
 
     def root(y, steps):
-        data = dataclasses.replace(problem.data, measured=(y,))
+        data = dataclasses.replace(problem.data, measured={"square": y})
         return solve(problem, data, max_iterations=steps)["x"][0]
 
     both = jax.value_and_grad(root)
-    x, slope = both(problem.data.measured[0], 100)
+    measured = problem.data.measured["square"]
+    x, slope = both(measured, 100)
     np.testing.assert_allclose([x, *slope], [np.sqrt(2), 1 / np.sqrt(8)], rtol=1e-9)
-    assert np.isnan(np.concatenate([np.ravel(a) for a in both(problem.data.measured[0], 1)])).all()
+    assert np.isnan(np.concatenate([np.ravel(a) for a in both(measured, 1)])).all()
 
 
 def test_data_of_another_shape_are_refused():
     problem = made("inner constraints")
-    short = dataclasses.replace(problem.data, measured=(problem.data.measured[0][1:],))
+    cut = {name: measured[1:] for name, measured in problem.data.measured.items()}
+    short = dataclasses.replace(problem.data, measured=cut)
     with pytest.raises(InputError, match="shapes of problem.data"):
         solve(problem, short)

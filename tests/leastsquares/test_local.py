@@ -65,7 +65,7 @@ def test_the_normal_equations_are_those_of_all_columns(problem):
     data = pad_data(problem, problem.data)
     found = []
     for kind in (LOCAL, dataclasses.replace(LOCAL, local=None)):
-        declared = dataclasses.replace(problem.declared, kinds=(kind,))
+        declared = dataclasses.replace(problem.declared, named_kinds=((LOCAL.name, kind),))
         assert problem.plan.parts[0].large
         found.append(normal_equations(
             declared, problem.plan, data.start, rows.lay_out_data(problem.plan, data)

@@ -120,10 +120,10 @@ def compare_derivatives(seed: int, variant: int = 0) -> None:
     along = type(data)(
         {name: held[name] * rng.normal(size=np.shape(x)) for name, x in data.start.items()},
         jax.tree.map(lambda x: rng.normal(size=x.shape), data.measured),
-        tuple(0.1 * w * rng.normal(size=w.shape) for w in data.weight),
+        jax.tree.map(lambda w: 0.1 * w * rng.normal(size=w.shape), data.weight),
     )
     if given.floats:  # As it does after the change.
-        for measured in along.measured:
+        for measured in along.measured.values():
             mean = sum(measured["c"].values()) / len(measured["c"])
             measured["c"].update({slot: c - mean for slot, c in measured["c"].items()})
     unknowns = _Unknowns(given, here.free)
@@ -149,10 +149,10 @@ def compare_derivatives(seed: int, variant: int = 0) -> None:
 
 def _dense_solution(given: Random, held, values, data) -> np.ndarray:
     observations = [
-        dataclasses.replace(o, measured=measured)
-        for o, measured in zip(given.observations, data.measured)
+        dataclasses.replace(o, measured=data.measured[o.name]) for o in given.observations
     ]
-    roots = [w if w.ndim == 3 else np.eye(w.shape[1]) * w[:, :, None] for w in data.weight]
+    weights = [data.weight[o.name] for o in given.observations]
+    roots = [w if w.ndim == 3 else np.eye(w.shape[1]) * w[:, :, None] for w in weights]
     start = {
         name: np.where(held[name] > 0, data.start[name], values[name]) for name in data.start
     }

@@ -245,7 +245,7 @@ def _vtpv_of_images(problem, values):
     rows = residuals(
         problem.system.declared, problem.system.plan, pad_values(problem.system, tables), laid
     )
-    of_images = [o for o, s in enumerate(problem.layout.sets) if s.field == "image"]
+    of_images = [s.name for s in problem.layout.sets if s.field == "image"]
     return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.system.plan.parts)
                if part.observations in of_images)  # fmt: skip
 

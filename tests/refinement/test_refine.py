@@ -106,7 +106,7 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
         misclosure(image, x, image.times.time(line), pixel, WGS84)
         for x, (line, pixel) in zip(X[:6], observations.xy[:6])
     ])
-    scale = refined.inspection.solution.problem.data.measured[0].scale[:6]
+    scale = refined.inspection.solution.problem.data.measured["scanner points 1"].scale[:6]
     assert np.allclose(np.einsum("nij,nj->ni", scale, g), v[:6], atol=2e-3)
 
 

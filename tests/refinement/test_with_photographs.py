@@ -103,7 +103,8 @@ def equations(case):
     at = {str(name): k for k, name in enumerate(own[1])}
     place = np.array([at.get(str(c.name), -1) for c in columns])
     m, free = len(columns), np.flatnonzero(np.array(given.points.role) == "tie")
-    S, start = found.solution.problem.data.measured[0].scale, found.declared.problem.data.start
+    S = found.solution.problem.data.measured["scanner points 1"].scale
+    start = found.declared.problem.data.start
     camera, frame = network.cameras[0], network.observations
     q, sigma = start["image"].rotation[0], np.array([c.sigma for c in columns])
 

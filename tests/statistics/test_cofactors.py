@@ -81,7 +81,7 @@ def test_redundancy_numbers(name):
 
 
 def weights(problem):
-    return [problem.system.weights(o) for o in range(len(problem.system.observations))]
+    return [problem.system.weights(o.name) for o in problem.system.observations]
 
 
 def test_reliability():

@@ -15,6 +15,7 @@ Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -81,12 +82,17 @@ class Rig:
         table = next(t for t in camera_tables(self.cameras) if k in t.cameras)
         return table.name, int(np.flatnonzero(table.cameras == k)[0])
 
-    def in_order(self, by_set) -> Float[np.ndarray, "n 2"]:
-        """The engine's results by set of image points, in the order of the rig."""
+    def in_order(self, by_set: Callable[[str], np.ndarray]) -> Float[np.ndarray, "n 2"]:
+        """The engine's results of a set of image points, in the order of the rig."""
         found = np.zeros(self.xy.shape)
-        for o, (_, rows) in enumerate(self.sets):
-            found[rows] = by_set[o]
+        for table, rows in self.sets:
+            found[rows] = by_set(image_points_of(table))
         return found
+
+
+def image_points_of(table: CameraTable) -> str:
+    """The name of the set of image points of the cameras of a table."""
+    return table.name.replace("camera", "image", 1)
 
 
 def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
@@ -107,10 +113,13 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
         k = rig.camera[rows]
         touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
         kind = kinds.image_points(table.model, "measured", table.name, POSES)
-        observations.append(kind(touched, rig.xy[rows], sigma=rig.sigma[rows]))
+        observations.append(
+            kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=image_points_of(table))
+        )
     if rig.point_sigma is not None:
         every = np.arange(len(rig.points))
-        observations.append(kinds.CONTROL((every,), rig.points, sigma=rig.point_sigma))
+        control = kinds.CONTROL((every,), rig.points, sigma=rig.point_sigma, name="control")
+        observations.append(control)
     return tables, observations
 
 
@@ -128,15 +137,15 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
 
 def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
     """Which image points carry weight."""
-    return np.all(rig.in_order(problem.data.weight), axis=1)
+    return np.all(rig.in_order(problem.data.weight.get), axis=1)
 
 
 def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
     removed = [
-        Removed(o, row, None, 0.0)
-        for o, (_, of_set) in enumerate(rig.sets) for row in np.flatnonzero(rays[of_set]).tolist()
+        Removed(image_points_of(table), row, None, 0.0)
+        for table, of_set in rig.sets for row in np.flatnonzero(rays[of_set]).tolist()
     ]  # fmt: skip
     problem = without(found.problem, removed)
     return Result(problem, find_minimum(problem, max_steps=max_iterations + 1))

@@ -114,7 +114,7 @@ class RigCalibration:
     @functools.cached_property
     def rms(self) -> dict[str, float]:
         """√(Σ|v|²/points) in pixels, by camera."""
-        v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
+        v, found = self.rig.in_order(self.result.solution.residuals.get) * self.rig.sigma, {}
         for k, name in enumerate(self.names):
             given = self.cameras[name].camera
             own = v[self.used & (self.rig.camera == k)]
@@ -132,14 +132,13 @@ class RigCalibration:
         rows = rig.in_order
         parts = [result_tables.residual_rows(
             self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
-            rows([weight(o) for o in range(len(rig.sets))]),
-            Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
+            rows(weight), Tested(*(rows(getattr(found, name).get) for name in Tested._fields)),
         )]  # fmt: skip
         if rig.point_sigma is not None:
-            o, blank = len(rig.sets), np.full(len(ids), "", dtype=object)
+            blank = np.full(len(ids), "", dtype=object)
             parts.append(result_tables.residual_rows(
-                self, "control", blank, ids, tuple("XYZ"), weight(o),
-                Tested(*(getattr(found, name)[o] for name in Tested._fields)),
+                self, "control", blank, ids, tuple("XYZ"), weight("control"),
+                Tested(*(getattr(found, name)["control"] for name in Tested._fields)),
             ))  # fmt: skip
         return result_tables.concatenate(parts)
 
@@ -154,13 +153,14 @@ class RigCalibration:
     def removed(self) -> list[Removed]:
         """Observations removed by data snooping."""
         rig, found = self.rig, []
+        rows_of = {image_points_of(table): rows for table, rows in rig.sets}
         for item in self.result.removed:
-            if item.set == len(rig.sets):
+            if item.set == "control":
                 axis = present(item.residual)  # coordinates are tested individually
                 name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
                 found.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
-            rows = rig.sets[item.set][1][list(item.rows)]
+            rows = rows_of[item.set][list(item.rows)]
             seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
             names = [f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in seen]
             others = tuple(rows[1:].tolist())

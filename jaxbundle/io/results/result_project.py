@@ -162,20 +162,19 @@ def _further(adjustment) -> list[Further]:
     # the engine's sets in the order of declaration, the user's own before those of the network
     kinds = sorted(among(network), key=lambda one: not isinstance(one, RollingShutter))
     numbers = [len(one.declare(network, problem.origin).observations) for one in kinds]
-    at, found = len(system.observations) - sum(numbers), []
+    names, found = iter(problem.layout.others[len(problem.layout.others) - sum(numbers) :]), []
     for one, number in zip(kinds, numbers):
         if not number:
             found.append(one)
             continue
-        first = system.observations[at]
+        first, *_ = [system.set(next(names)) for _ in range(number)]
         factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(one, name):
                 changed: dict = {name: getattr(one, name) * factor**power}
                 one = dataclasses.replace(one, **changed)
         if first.number == len(one):
-            whole = np.abs(np.asarray(system.weights(at))).reshape(len(one), -1).max(1)
+            whole = np.abs(np.asarray(system.weights(first.name))).reshape(len(one), -1).max(1)
             one = one.take(whole > 0)
-        at += number
         found += [one] if len(one) else []
     return found

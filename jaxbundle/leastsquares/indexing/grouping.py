@@ -38,7 +38,7 @@ class Choices:
 class Share:
     """The observations that make a part; `slot`: that of the eliminated row."""
 
-    observations: int
+    observations: str
     source: Int[np.ndarray, " share"]
     slot: int | None
 
@@ -62,7 +62,8 @@ class Grouping:
         eliminate: str | None, choose: Choices,
     ):  # fmt: skip
         self.tables = {t.name: t for t in tables}
-        self.observations, self.eliminate, self.choose = observations, eliminate, choose
+        self.observations = {given.name: given for given in observations}
+        self.eliminate, self.choose = eliminate, choose
         self.moving = choose("moving", found=[t.name for t in tables if t.free.any()])
         self.stays = self._rows_that_stay()
         self.shares = self._share_observations()
@@ -77,7 +78,7 @@ class Grouping:
             return None
         table = self.tables[self.eliminate]
         stays = np.zeros(table.rows, bool)
-        for given in self.observations:
+        for given in self.observations.values():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
@@ -86,7 +87,7 @@ class Grouping:
     def _share_observations(self):
         """Observations of one kind, separated by the slot that touches an eliminated row."""
         shares = []
-        for o, given in enumerate(self.observations):
+        for o, given in self.observations.items():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             slot_of = np.full(given.number, -1)
             for s in slots:

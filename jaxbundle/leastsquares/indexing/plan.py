@@ -79,11 +79,11 @@ class Couple(eqx.Module):
 
 
 class Part(eqx.Module):
-    """Observations of a kind in the order of computation. `lookup`: the rows of the tables of the
+    """Observations of a set in the order of computation. `lookup`: the rows of the tables of the
     slots, one per chunk or (`by_row`) one per observation; `eliminated`: the eliminated row;
     `source`: the observation; `place`: for every observation its position in this part."""
 
-    observations: int = eqx.field(static=True)
+    observations: str = eqx.field(static=True)
     slot: int | None = eqx.field(static=True)
     by_row: tuple[bool, ...] = eqx.field(static=True)
     large: bool = eqx.field(static=True)

@@ -33,7 +33,7 @@ def make_plan(
     choose = Choices(choices or {})
     plan = _Planner(Grouping(tables, observations, eliminate, choose), ways).plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
-    sizes |= {("observations", o): x.number + 1 for o, x in enumerate(observations)}
+    sizes |= {("observations", o.name): o.number + 1 for o in observations}
     return plan, sizes | count(plan), choose.made
 
 
@@ -91,7 +91,7 @@ class _Planner:
         shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
         place = lambda at: (at.row.rows, at.column.rows) if at else np.zeros((2, 0), np.int64)
         ties = lambda g: place(blocks.get((g, g)))
-        number = sum(given.number for given in self.by.observations)
+        number = sum(given.number for given in self.by.observations.values())
         way, band = plan_reduction(shapes, ties, number, ways)
         self.choose.made["ways",] = (way,)
         return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band

@@ -29,13 +29,13 @@ Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 class Data(eqx.Module):
     """The data of a problem, all differentiable.
 
-    `start`: the start values of the tables, including held values; for every set of
-    observations `measured` and `weight` (see `Observations`), in the given order.
+    `start`: the start values of the tables, including held values; `measured` and `weight` of every
+    set of observations (see `Observations`), by its name.
     """
 
     start: Values
-    measured: tuple[PyTree[Float[Array, "n ..."]], ...]
-    weight: tuple[Float[AnyArray, "n ..."], ...]
+    measured: dict[str, PyTree[Float[Array, "n ..."]]]
+    weight: dict[str, Float[AnyArray, "n ..."]]
 
 
 class Laid(eqx.Module):
@@ -47,12 +47,16 @@ class Laid(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """The functions of a problem: its kinds of observations, the spaces of its tables, the motions
-    that may be open. Hashable: a static argument of compiled programs."""
+    """The functions of a problem: the kinds of its sets of observations, the spaces of its tables,
+    the motions that may be open. Hashable: a static argument of compiled programs."""
 
-    kinds: tuple[Kind, ...]
+    named_kinds: tuple[tuple[str, Kind], ...]
     named_spaces: tuple[tuple[str, Space], ...]
     motions: Motions | None = None
+
+    @property
+    def kinds(self) -> dict[str, Kind]:
+        return dict(self.named_kinds)
 
     @property
     def spaces(self) -> dict[str, Space]:
@@ -102,7 +106,6 @@ class Residual:
         changes = ((),) * len(self.spaces) if changes is None else changes
         moved = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
         return whiten(evaluate(self.kind, moved, measured), weight)
-
 
     def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
         """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
@@ -214,10 +217,10 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     return tuple(found)
 
 
-def restore_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
+def restore_order(plan: Plan, parts) -> dict[str, Float[Array, "n ..."]]:
     """Quantities by observation of every part, rearranged by set of observations in the given
     order."""
-    found: dict[int, Float[Array, "n ..."]] = {}
+    found: dict[str, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]
         known = found.get(part.observations)

@@ -30,7 +30,7 @@ class Group(NamedTuple):
     """Observations whose σ are estimated together: sets, and which [rows, residuals] of each."""
 
     name: str
-    parts: Sequence[tuple[int, Any]]
+    parts: Sequence[tuple[str, Any]]
     unit: float = 1.0
 
 
@@ -125,8 +125,8 @@ def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estim
 
 def rescale(problem: Problem, groups: Sequence[Group], factors: Mapping[str, float]) -> Problem:
     """The problem with every group's σ multiplied by its factor."""
-    weight = [np.array(w) for w in problem.data.weight]
+    weight = {o: np.array(w) for o, w in problem.data.weight.items()}
     for group in groups:
         for o, at in group.parts:
             weight[o][at] /= factors.get(group.name, 1.0)
-    return with_data(problem, dataclasses.replace(problem.data, weight=tuple(weight)))
+    return with_data(problem, dataclasses.replace(problem.data, weight=weight))

@@ -51,13 +51,13 @@ class Reliability(eqx.Module):
     of its row sharpen it; the redundancy number; Baarda's w (NaN if uncontrolled); `hat`, h; and
     `own`, its part due to the eliminated row of the observation alone."""
 
-    residual: Mapping[int, Float[AnyArray, "n r"]]
-    standard: Mapping[int, Float[AnyArray, "n r"]]
-    gain: Mapping[int, Float[AnyArray, "n r"]]
-    redundancy: Mapping[int, Float[AnyArray, "n r"]]
-    w: Mapping[int, Float[AnyArray, "n r"]]
-    hat: Mapping[int, Float[AnyArray, "n r"]]
-    own: Mapping[int, Float[AnyArray, "n r"]]
+    residual: Mapping[str, Float[AnyArray, "n r"]]
+    standard: Mapping[str, Float[AnyArray, "n r"]]
+    gain: Mapping[str, Float[AnyArray, "n r"]]
+    redundancy: Mapping[str, Float[AnyArray, "n r"]]
+    w: Mapping[str, Float[AnyArray, "n r"]]
+    hat: Mapping[str, Float[AnyArray, "n r"]]
+    own: Mapping[str, Float[AnyArray, "n r"]]
 
 
 @compile_once

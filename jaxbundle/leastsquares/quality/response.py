@@ -71,7 +71,7 @@ def _add(x, k, row, amount):
 
 def pull_back(
     found: Solution, functions: Mapping[str, Float[AnyArray, "f rows width"]]
-) -> list[Float[np.ndarray, "f n r"]]:
+) -> dict[str, Float[np.ndarray, "f n r"]]:
     """The change of linear functions of the changes of tables by one σ (a priori) of every
     observation, by set.
 
@@ -90,11 +90,12 @@ def pull_back(
         for k in range(number)
     ]  # fmt: skip
     _require(np.array([left for _, _, left in pulled]))
-    effects = []
-    for o, given in enumerate(problem.observations):
+    effects = {}
+    for given in problem.observations:
+        o = given.name
         of_residuals = np.concatenate([np.asarray(by[o]) for _, by, _ in pulled])
         weight, n = np.asarray(problem.data.weight[o]), given.number
-        effects.append(of_residuals[:, :n])
+        effects[o] = of_residuals[:, :n]
         leaves = [jax.tree.leaves(slopes[o])[:1] for slopes, *_ in pulled]
         if weight.ndim == 2 and leaves[0] and leaves[0][0].size == of_residuals[0].size:
             slope = np.concatenate([np.asarray(leaf) for (leaf,) in leaves])[:, :n]

@@ -65,7 +65,7 @@ class Suspect:
     """An observation whose residual exceeds the critical length: its set, row there, the length t
     of its residual in units of σ and scale, its weight factor."""
 
-    set: int
+    set: str
     row: int
     test: float
     weight: float
@@ -77,10 +77,10 @@ class Reweighted:
     the weights converged; `lengths` t in units of σ and scale."""
 
     found: Solution
-    weights: dict[int, Float[np.ndarray, " n"]]
+    weights: dict[str, Float[np.ndarray, " n"]]
     scale: float
     rests: bool
-    lengths: dict[int, Float[np.ndarray, " n"]]
+    lengths: dict[str, Float[np.ndarray, " n"]]
 
     def suspects(self, significance: float = 0.001) -> list[Suspect]:
         """Observations with residuals above the critical length, the worst first; `significance` is
@@ -95,15 +95,15 @@ class Reweighted:
         return sorted(found, key=lambda s: -s.test)
 
 
-def residual_lengths(found: Solution) -> dict[int, Float[np.ndarray, " n"]]:
+def residual_lengths(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """|v/σ| of the observations that are removed or weighted as a whole, by set."""
-    kinds = enumerate(given.kind.snooped for given in found.problem.observations)
     return {
-        o: np.sqrt((found.residuals[o] ** 2).sum(1)) for o, policy in kinds if policy == "whole"
-    }
+        o.name: np.sqrt((found.residuals[o.name] ** 2).sum(1))
+        for o in found.problem.observations if o.kind.snooped == "whole"
+    }  # fmt: skip
 
 
-def robust_scale(problem: Problem, lengths: dict[int, Float[np.ndarray, " n"]]) -> float:
+def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) -> float:
     """s of residual lengths |v/σ| of observations, by set; never 0."""
     normal = []  # |v/σ| by the median of the lengths of as many normal residuals
     for o, t in lengths.items():
@@ -140,9 +140,9 @@ def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: s
             rests = bool(np.sqrt(np.mean(change**2)) < resting)
             if rests:
                 break
-            weight = tuple(
-                np.asarray(p) * _root(w[o], p) if o in w else p for o, p in enumerate(given)
-            )
+            weight = {
+                o: np.asarray(p) * _root(w[o], p) if o in w else p for o, p in given.items()
+            }
             weighted = with_data(problem, dataclasses.replace(problem.data, weight=weight))
             # The first start values may be far from a solution.
             values = move(weighted, values, adjust_from).values

@@ -50,7 +50,7 @@ class Removed:
     """A removed observation: its set, row, residual (None: all) and test value. `others`: rows of
     inseparable observations, removed with it."""
 
-    set: int
+    set: str
     row: int
     residual: int | None
     test: float
@@ -162,23 +162,24 @@ class _Touched:
 
     def __init__(self, problem: Problem):
         self.eliminated = problem.plan.eliminated
-        self.own: dict[int, Int[np.ndarray, " n"]] = {}
-        self.shared: dict[int, Int[np.ndarray, " n"]] = {}
+        self.own: dict[str, Int[np.ndarray, " n"]] = {}
+        self.shared: dict[str, Int[np.ndarray, " n"]] = {}
         first = np.cumsum([0, *(t.rows for t in problem.tables)])
         start = {t.name: n for t, n in zip(problem.tables, first)}
         moves = {t.name: t.free.any(1) for t in problem.tables}
         stays = problem.kept_rows
-        for o, given in enumerate(problem.observations):
+        for given in problem.observations:
             own, shared = np.full(given.number, -1), np.full(given.number, -1)
             for name, rows in zip(given.kind.of, given.rows):
                 if name == self.eliminated:
                     own = np.where(moves[name][rows] & ~stays[rows], rows, own)
                 elif moves[name].any():
                     shared = np.where(shared < 0, start[name] + rows, shared)
-            self.own[o], self.shared[o] = own, shared
-        kinds = [given.kind.snooped for given in problem.observations]
-        self.whole = [o for o, policy in enumerate(kinds) if policy == "whole"]
-        self.single = [o for o, policy in enumerate(kinds) if policy == "single"]
+            self.own[given.name], self.shared[given.name] = own, shared
+        chosen = lambda policy: [
+            given.name for given in problem.observations if given.kind.snooped == policy
+        ]
+        self.whole, self.single = chosen("whole"), chosen("single")
 
     def tested(self, problem: Problem) -> int:
         """The number of tested residuals."""
@@ -202,10 +203,10 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
         lonely = np.where(touched.own[o] < 0, of_one, 0.0)
         alone.append(Removed(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
         together.append(np.where(touched.own[o] < 0, 0.0, of_one))
-        of.append(np.full(len(of_one), o))
+        of.append(np.full(len(of_one), o, dtype=object))
         row.append(np.arange(len(of_one)))
     together, of, row = (np.concatenate([*x, []]) for x in (together, of, row))
-    of, row = of.astype(int), row.astype(int)
+    row = row.astype(int)
     worst = max(alone, key=lambda r: r.test, default=None)
     other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
     if worst and other > max(critical, largest):
@@ -219,11 +220,11 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     )]  # fmt: skip
     rays = _Neighbours(found, touched, unit)
     others = {
-        k: rays.alternatives(int(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
+        k: rays.alternatives(of[k], int(row[k]), critical, apart) for k in chosen.tolist()
     }
     certain = [k for k in others if not others[k]]
     return [
-        Removed(int(of[k]), int(row[k]), None, float(together[k]), others[k])
+        Removed(of[k], int(row[k]), None, float(together[k]), others[k])
         for k in certain or others
     ]
 
@@ -256,7 +257,7 @@ class _Neighbours:
             self.order[o] = rows[np.argsort(own[rows], kind="stable")]
             self.sorted[o] = own[self.order[o]]
 
-    def alternatives(self, o: int, row: int, critical: float, apart: float) -> tuple[int, ...]:
+    def alternatives(self, o: str, row: int, critical: float, apart: float) -> tuple[int, ...]:
         """Inseparable rows of the same set and eliminated row."""
         own = self.sets[o][row]
         rows = {
@@ -303,7 +304,7 @@ def _test_removed(
     Two residuals removed from one correlated observation are tested in separate passes, each
     without the other, which would predict it."""
     correlated = lambda r: r.residual is not None and whole.data.weight[r.set].ndim == 3
-    together: dict[tuple[int, int], list[Removed]] = {}
+    together: dict[tuple[str, int], list[Removed]] = {}
     for r in filter(correlated, removed):
         together.setdefault((r.set, r.row), []).append(r)
     others = lambda r: [x for x in together[r.set, r.row] if x is not r] if correlated(r) else []
@@ -349,7 +350,7 @@ def _finite(tests) -> Float[np.ndarray, "..."]:
 def without(problem: Problem, removed: Sequence[Removed], excluded: Iterable[int] = ()) -> Problem:
     """The problem with the weights of removed observations set to zero, without `excluded`
     eliminated rows and those left with too few residuals."""
-    weight = [np.array(w) for w in problem.data.weight]
+    weight = {o: np.array(w) for o, w in problem.data.weight.items()}
     for r in removed:
         _remove(weight[r.set], r)
     e, lone = problem.plan.eliminated, []
@@ -363,6 +364,6 @@ def without(problem: Problem, removed: Sequence[Removed], excluded: Iterable[int
         lone = sorted({*excluded} | {row for row in changed if left[row] < width})
         for o, own in touched.own.items():
             weight[o][np.isin(own, lone)] = 0.0
-    data = dataclasses.replace(problem.data, weight=tuple(weight))
+    data = dataclasses.replace(problem.data, weight=weight)
     problem = with_data(problem, data)
     return problem if e is None or not lone else hold(problem, e, lone)
