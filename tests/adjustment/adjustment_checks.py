@@ -335,10 +335,10 @@ def linearise(problem: Problem, values=None, data=None) -> Dense:
     values = data.start if values is None else values
     given = pad_data(system, problem.layout.data(data))
     tables = pad_values(system, problem.layout.tables(values))
-    plan, number = system.plan, [given.number for given in system.observations]
+    plan, sets = system.plan, system.observations
     v, J, G, B, index = _linearise(system.declared, plan, tables, given)
     tall = lambda rows: np.concatenate([
-        np.asarray(rows[o])[:n].reshape(-1, *rows[o].shape[2:]) for o, n in enumerate(number)
+        np.asarray(rows[o.name])[: o.number].reshape(-1, *rows[o.name].shape[2:]) for o in sets
     ])  # fmt: skip
     columns = {t.name: np.asarray(index[t.name], int)[: t.rows] - 1
                for t in system.tables if t.name in index}  # fmt: skip
