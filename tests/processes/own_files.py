@@ -46,8 +46,12 @@ def write_project(path: Path) -> None:
 
 
 def write_project_here(path: Path) -> None:
+    """The same, of a camera whose pixels are known."""
     for file in (EXAMPLES / "convergent4").iterdir():
         shutil.copy(file, path.parent)
+    text = path.read_text(encoding="utf-8")
+    size = "image_size = [3000, 2000]\npixel_size = [0.008, 0.008]\n"
+    path.write_text(text.replace("c = 18.556\n", f"{size}c = 18.556\n"), encoding="utf-8")
 
 
 def write_surveyed(path: Path) -> None:
