@@ -12,6 +12,8 @@ from page_reader import Page, column
 
 from jaxbundle.batch.page import compose_batch
 from jaxbundle.batch.run import result_rows
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.reconstruction.adjusting import Weighted
 from jaxbundle.reconstruction.block import Block
 from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
@@ -114,6 +116,15 @@ def test_a_reconstruction_names_what_it_left_out(convergent4):
     assert any(words.startswith("4 of 5 photographs in this part") for words in cells)
     assert column(text, "pairs", "verified").tolist() == [60]
     assert len(column(text, "points", "X")) == len(convergent4.points["id"])
+
+
+def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
+    """The adjustment to control takes the place of that of the measurements alone."""
+    again = lambda: Adjustment(convergent4.network, convergent4.problem, convergent4.minimum)
+    found = dataclasses.replace(Weighted(again(), {"sift": 3.2}, 40), adjustment=again())
+    assert found.adjustment.global_test()["passed"] is None
+    for text in (found.adjustment.report(), "".join(compose(found.adjustment))):
+        assert "not done: the σ of the groups were estimated" in text.replace("\n" + " " * 18, " ")
 
 
 @pytest.mark.parametrize("factor, state, words", [

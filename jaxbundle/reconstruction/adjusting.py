@@ -55,13 +55,20 @@ and others are tried."""
 
 @dataclasses.dataclass(frozen=True)
 class Weighted:
-    """The adjustment, and the factor of σ of each kind of measurement; the number of measurements
-    that agree with it, and of `unused` points of two rays."""
+    """The adjustment, and the factor of σ of each kind of measurement, which is also in it; the
+    number of measurements that agree with it, and of `unused` points of two rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
     agreeing: int
     unused: int = 0
+
+    def __post_init__(self):
+        if self.adjustment.converged:
+            # σ estimated from the residuals are not confirmed by them: no χ² test
+            self.adjustment.sigma_factors = {
+                f"image points {name}": factor for name, factor in self.factors.items()
+            }
 
     @property
     def worst(self) -> float:
@@ -220,9 +227,6 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
     used = np.asarray(result.problem.data.image_weight) > 0
-    if result.converged:
-        # σ estimated from the residuals are not confirmed by them: no χ² test
-        result.sigma_factors = {f"image points {name}": f for name, f in kept.items()}
     return Weighted(result, kept, int(used.any(1).sum()))
 
 
