@@ -74,7 +74,7 @@ def calls(result):
         "calibrate": (lambda **given: jaxbundle.calibrate(**{"photographs": views()} | given), dict(
             photographs=[None, 3], model=["zz", None], free=["fx", 3, ["zz"], []],
             given=["fx", {"zz": 1}, {"fx": "a"}, {"fx": NAN}, {"fx": -1}, {"k1": 1j}],
-            pixel_size=["a", -1, (1, 2, 3), 1j], sigma_image=[0, "a", None, NAN],
+            pixel_size=["a", -1, (1, 2, 3), 1j], sigma_image=[0, "a", NAN],
             board_sigma=["a", -1], robust=["x"], snooping=["x"], significance=[2, "a"],
             camera=[3, ""], max_iterations=[0, 1.5], object_unit=[3],
         )),

@@ -21,7 +21,7 @@ LEVELLED = ls.Kind(
 
 @pytest.fixture(scope="module")
 def network():
-    return jaxbundle.read_network(PROJECT)
+    return jaxbundle.read_network(PROJECT, overrides=("sigma_image=1", "sigma_origin=unit"))
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ def in_the_repository(monkeypatch, request):
 
 @pytest.fixture(scope="module")
 def network(request):
-    return jaxbundle.read_network(request.config.rootpath / CONVERGENT)
+    project = request.config.rootpath / CONVERGENT
+    return jaxbundle.read_network(project, overrides=("sigma_image=1", "sigma_origin=unit"))
 
 
 def saved(result, tmp_path, **given):

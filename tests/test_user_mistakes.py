@@ -21,7 +21,7 @@ PX = Camera("cam", "opencv", {"fx": 4000.0, "fy": 4000.0, "cx": 2999.5, "cy": 19
 
 
 def network(camera=MM, **options):
-    noise = 0.3 * (0.006 if camera is MM else 1)
+    noise = 0.3 * (1 if camera is PX else 0.006)
     return simulate(RING, TARGETS, camera, noise=noise, seed=3, disturb=0.005, **options)
 
 
@@ -91,7 +91,7 @@ def test_control_that_fits_no_similarity_is_named_with_its_residuals(tmp_path):
     right = {id: tuple((A @ TARGETS[int(id) - 1] + [900, 800, 70]).tolist()) for id in ids}
     right["12"] = (910.0, 805.0, 72.0)  # one of them wrong: that is not the similarity's fault
     moved = with_control(network(), read_control(table(tmp_path, right)))
-    assert any("a similarity by 6 points was applied" in line for line in moved.warnings)
+    assert any("a similarity by 6 points was applied" in line for line in moved.notes)
 
 
 # --- conventions of image coordinates -------------------------------------------------------
@@ -161,7 +161,7 @@ def test_a_sigma_that_is_only_poor_is_in_no_other_unit():
     assert name_sigma_unit(given, 5.0) == name_sigma_unit(given, 0.3) == ""
     assert name_sigma_unit(given, 40.0) == ""
     rays = given.observations
-    weights = dataclasses.replace(rays, sigma=np.ones_like(rays.sigma))
+    weights = dataclasses.replace(rays, sigma=np.ones_like(rays.sigma), sigma_origin="unit")
     assert name_sigma_unit(given.replace(observations=weights), 0.0015) == ""
 
 
@@ -196,21 +196,30 @@ def with_control_at(given, change):
     lambda X: X * [1, -1, 1], lambda X: X[:, [1, 0, 2]]
 ], ids=["Y in the other direction", "X and Y exchanged"])  # fmt: skip
 def test_control_of_a_left_handed_system_is_named(change, start):
-    """The nearly plane object has a mirror image that fits its control to 8 σ: no point is blamed
+    """The nearly plane object has a mirror image that nearly fits its control: no point is blamed
     for it, and the right system has a σ0 of 1."""
     given = network(FREE, **CONTROL)
     mirrored = with_control_at(given, change)
-    result = jaxbundle.adjust(mirrored if start else without_start_values(mirrored))
+    said = said_of(mirrored if start else without_start_values(mirrored))
+    assert "the control points fit the mirror image of the network (σ0 1.0" in said
+    assert "X and Y of the control are exchanged" in said and "contradict each other" not in said
+
+
+def said_of(given) -> str:
+    """What is said first of a network without a good result."""
+    try:
+        result = jaxbundle.adjust(given)
+    except NotSolvedError as error:
+        return str(error)
     (said,) = result.findings
-    assert said.startswith("the control points fit the mirror image of the network (σ0 1.0")
-    assert "X and Y of the control are exchanged" in said
     assert said[:60] in " ".join(result.report()[:1500].split())
-    assert result.verdict.state == "not met"
+    assert not result.converged or result.verdict.state == "not met"
+    return said
 
 
 def test_flipped_images_without_start_values_are_named():
     given = with_xy(network(FREE, **CONTROL), lambda xy: xy * [1, -1])
-    (said,) = jaxbundle.adjust(without_start_values(given)).findings
+    said = said_of(without_start_values(given))
     assert "y (or x) of the image coordinates is (expected are mm" in said
 
 

@@ -137,13 +137,24 @@ def adjust(
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
     given = require_network(network)
-    oriented = _place(orient(given)) if lacks_start_values(given) else None
-    options = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
-    if progress is not None:
-        options["progress"] = partial(_tell, progress, max_iterations)
-    first = _First(reduction, also, oriented, options)
+    options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
+    mirror = partial(name_mirrored, given, try_again=partial(_try_mirrored, reduction, options))
+    oriented = None
+    if lacks_start_values(given):
+        try:
+            oriented = _place(orient(given))
+        except NotSolvedError as error:
+            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(sigma0=None)):
+                raise NotSolvedError(
+                    f"no start values found: {mirrored}", [*error.undetermined]
+                ) from None
+            raise
+    told = options if progress is None else options | {
+        "progress": partial(_tell, progress, max_iterations)
+    }  # fmt: skip
+    first = _First(reduction, also, oriented, told)
     problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
-    again = partial(minimise_with_infinity, **options)
+    again = partial(minimise_with_infinity, **told)
     found = _Found(problem.network, problem.with_factor(), minimum, method, problem.reduction)
     if robust:
         found.weight_robustly(again, robust, significance)
@@ -155,22 +166,17 @@ def adjust(
         if eliminate:
             found.eliminate_parameters(again, critical_t)
     result = found.adjustment(check)
-    unexplained = all(CONTRADICTORY_CONTROL in line for line in result.findings)
-    if not also and unexplained and _is_misfit(found):
-        sigma0 = _sigma0(found.problem, found.minimum)
-        again = partial(_try_mirrored, reduction, options)
-        if mirrored := name_mirrored(given, sigma0, again):
+    sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
+    misfit = sigma0 is None or sigma0 > MISFIT
+    # Only guesses so far: a mirrored system is not found by a look at the start values.
+    if misfit and not also and not _name_conventions(problem, minimum, found.inspection):
+        if mirrored := mirror(sigma0=sigma0):
             result.findings = (mirrored,)
     return result
 
 
-def _is_misfit(found: "_Found") -> bool:
-    return not found.inspection or _sigma0(found.problem, found.minimum) > MISFIT
-
-
 def _try_mirrored(reduction: str | None, options, network: Network) -> float | None:
     """σ0 of a network from computed start values; None without a solution."""
-    options = {name: value for name, value in options.items() if name != "progress"}
     problem, minimum, _ = _First(reduction, (), _place(orient(network)), options).find(
         network, outliers=False
     )
@@ -406,15 +412,26 @@ def _likely_causes(
         causes = name_image_convention(network) if far else "", name_sigma_unit(network, sigma0)
         return tuple(filter(None, causes))
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
-    mirrored = name_image_convention(network)
+    conventions = _name_conventions(problem, minimum, inspection)
     causes = (
-        name_pixels(network), name_angle_unit(network), *name_lengths(network), mirrored,
-        name_image_extent(network),
-        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
+        *conventions,
         # Control fits no mirrored image: the points would be blamed for it.
-        "" if told or mirrored else name_contradiction(network),
+        "" if told or conventions else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
+    )  # fmt: skip
+    return tuple(filter(None, causes))
+
+
+def _name_conventions(
+    problem: Problem, minimum: Minimum, inspection: Inspection | None
+) -> tuple[str, ...]:
+    """Units and conventions in which a badly fitting network would fit, in words."""
+    network = problem.network
+    causes = (
+        name_pixels(network), name_angle_unit(network), *name_lengths(network),
+        name_image_convention(network), name_image_extent(network),
+        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
     )  # fmt: skip
     return tuple(filter(None, causes))
 

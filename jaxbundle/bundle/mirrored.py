@@ -24,12 +24,12 @@ FEWEST_AXES = 9
 
 
 def name_mirrored(
-    network: Network, sigma0: float, try_again: Callable[[Network], float | None]
+    network: Network, sigma0: float | None, try_again: Callable[[Network], float | None]
 ) -> str:
     """That control fits the mirror image of the network, in words; else empty.
 
-    **Arguments:** `sigma0`: as given; `try_again(network)`: σ0 of another network, None without a
-    solution."""
+    **Arguments:** `sigma0`: as given, None without a solution; `try_again(network)`: σ0 of
+    another network, None without a solution."""
     given = np.isfinite(network.images.sigma).any()
     if network.further or given or count_controlled_axes(network.points).sum() < FEWEST_AXES:
         return ""
@@ -37,13 +37,14 @@ def name_mirrored(
         mirrored = try_again(_mirror(network))
     except (InputError, NotSolvedError):
         return ""
-    if mirrored is None or MUCH_BETTER * mirrored > sigma0:
+    if mirrored is None or MUCH_BETTER * mirrored > (sigma0 or MUCH_BETTER**2):
         return ""
+    instead = f" instead of {sigma0:.3g}" if sigma0 else ""
     unit = get_model(network.cameras[0].model).unit
     axes = "v (or u)" if unit == "px" else "y (or x)"
     return (
-        f"the control points fit the mirror image of the network (σ0 {mirrored:.3g} instead of "
-        f"{sigma0:.3g}): X and Y of the control are exchanged, or one of its axes is in the other "
+        f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
+        f"X and Y of the control are exchanged, or one of its axes is in the other "
         f"direction (a right-handed system is expected); or {axes} of the image coordinates is "
         f"(expected are {EXPECTED[unit]})"
     )

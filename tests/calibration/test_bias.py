@@ -68,7 +68,7 @@ def test_a_missing_k2_is_of_the_camera():
     for seed in range(2):
         found = bias_of(lens(k2=-0.4), free=FEW, seed=seed)
         assert found.bias.found[0] == "camera" and "another camera model" in found.bias.sentence
-        assert found.advice[-1] == found.bias.sentence
+        assert found.bias.sentence in found.advice
 
 
 def test_a_bent_board_is_of_the_board():

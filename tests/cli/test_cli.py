@@ -46,7 +46,7 @@ def test_adjust_writes_everything(command, tmp_path):
     assert result["converged"] is True
     assert result["redundancy"] == 23 and result["observations"] == 80
     assert result["unknowns"] == 64 and result["defect"] == 7
-    assert result["sigma0"] == pytest.approx(0.63128e-3, rel=1e-5)
+    assert result["sigma0"] == pytest.approx(0.63128 / 0.7, rel=1e-5)
     c = result["cameras"]["cam"]["parameters"]["c"]
     assert c["value"] == pytest.approx(18.528014315, abs=0.002 * 0.0453)
     assert c["sigma"] == pytest.approx(0.0453018675, rel=1e-3)
@@ -70,7 +70,7 @@ def test_json_alone_on_stdout(convergent4):
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert "points" not in result and "residuals" not in result
-    assert result["sigma0"] == pytest.approx(0.63128e-3, rel=1e-5)
+    assert result["sigma0"] == pytest.approx(0.63128 / 0.7, rel=1e-5)
     table = convergent4.cameras["cam"]
     c, x0 = (table["free"].index(name) for name in ("c", "x0"))
     found = result["cameras"]["cam"]["correlations"]["c"]["x0"]
@@ -88,7 +88,9 @@ BROKEN = {
     "unknown model": ("project.toml", '"brown"', '"brwon"', ["brwon", "brown"]),
     "unknown key": ("project.toml", "sigma_image", "sigma_imge", ["sigma_imge", "sigma_image"]),
     "zero principal distance": ("project.toml", "c = 18.556", "c = 0.0", ["c"]),
-    "negative sigma": ("project.toml", "sigma_image = 1.0", "sigma_image = -1.0", ["sigma_image"]),
+    "negative sigma": (
+        "project.toml", "sigma_image = 0.0007", "sigma_image = -1.0", ["sigma_image"]
+    ),
     "duplicate point": ("points.csv", "\n2,tie", "\n1,tie", ["points.csv", "'1'"]),
     "unfixed datum": ("project.toml", '"inner"', '"control"', ["datum", "rotation", "scale"]),
 }
@@ -168,7 +170,7 @@ def test_a_level_of_significance_is_between_0_and_1(command):
 
 
 def test_a_global_test_far_from_passed_is_the_last_line(command, project):
-    edit(project / "project.toml", "sigma_image = 1.0", "sigma_image = 0.0001")
+    edit(project / "project.toml", "sigma_image = 0.0007", "sigma_image = 0.0001")
     done = command("adjust", project / "project.toml")
     assert done.status == 0 and "Warnings" in done.out
     last = done.out.splitlines()[-1]

@@ -279,7 +279,8 @@ def test_control_seen_once_gives_the_frame():
 
 def test_adjust_needs_no_start_values(convergent4):
     """With its σ."""
-    network = jaxbundle.read_network(EXAMPLES / "convergent4" / "project.toml")
+    project = EXAMPLES / "convergent4" / "project.toml"
+    network = jaxbundle.read_network(project, overrides=("sigma_image=1", "sigma_origin=unit"))
     without = bare(network)
     assert lacks_start_values(without) and not lacks_start_values(network)
     found = adjust(without)
