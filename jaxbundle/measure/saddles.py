@@ -23,6 +23,7 @@ import scipy  # its parts are loaded on use
 from jaxtyping import Float
 
 from jaxbundle.measure.corner_quality import LARGEST_SIGMA, NO_CORNER, TOO_SMALL
+from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
 
 LARGEST_HALF = 7
 """Most pixels from the corner: the lens bends lines; 10 make σ smaller by a fifth and take twice
@@ -125,18 +126,17 @@ def _fit(grey, near, lines, strips, largest):
             theta[:, 4:6] = _levels(theta.astype(np.float32), place, g, weight)
         model, J = _model(theta.astype(np.float32), place, strips)
         r = g - model
-        N, b = _normal(J, r, weight, prior, reference - theta, noise)
+        N, b = normal_equations(J, r, weight, prior, reference - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
         limit = [0.7, 0.7, 0.2, 0.2, 100, 100, 0.4, 0.1, 0.1]
         theta = theta + np.clip(d, np.negative(limit), limit)
         theta[:, 6] = np.clip(theta[:, 6], np.log(SHARPEST), np.log(SOFTEST))
-        freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
-        noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))
+        noise = noise_of_residuals(r, weight, UNKNOWNS)
         if step > 2 and np.quantile(np.abs(d[:, :2]), 0.95) < CONVERGED:
             break
     model, J = _model(theta.astype(np.float32), place, strips)
     r = g - model
-    N, _ = _normal(J, r, weight, prior, 0 * theta, noise)
+    N, _ = normal_equations(J, r, weight, prior, 0 * theta, noise)
     Q = np.linalg.inv(N)
     scale = noise * _excess(J, r, weight, Q, noise, place - theta[:, None, :2])
     covariance = scale[:, None, None] ** 2 * Q[:, :2, :2]
@@ -264,14 +264,6 @@ def _joint(z, rho):
     P = F[..., 0] * F[..., 1] + f[..., 0] * f[..., 1] * total
     other = (z[..., ::-1] - rho[..., None] * z) / np.sqrt(1 - np.minimum(rho**2, 0.99))[..., None]
     return P, f * ndtr(other)
-
-
-def _normal(J, r, weight, prior, away, noise):
-    p = prior * noise[:, None] ** 2
-    weighted = J * weight[:, :, None]
-    N = np.matmul(weighted.transpose(0, 2, 1), J) + p[:, :, None] * np.eye(UNKNOWNS)
-    N = N + 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(UNKNOWNS)
-    return N, np.einsum("npi,np->ni", weighted, r) + p * away
 
 
 def _excess(J, r, weight, Q, noise, away):

@@ -27,6 +27,10 @@ import numpy as np
 import scipy  # its parts are loaded on use
 from jaxtyping import Bool, Float
 
+from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
+
+IN_FOCUS = 0.8
+"""τ of a lens in focus, and the pixel: expected with a σ of a factor of e."""
 COLUMNS = 32
 """Most rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a quarter and
 take twice the time."""
@@ -124,6 +128,8 @@ def fit_edges(
     pixels = _Pixels.of(grey, edges, blur)
     theta = _start(pixels, edges, blur, coarse)
     prior = _prior_weights(edges, curvature)
+    expected = np.zeros_like(theta)
+    expected[:, 8] = np.log(IN_FOCUS)
     noise = np.full(len(theta), 1.0)
     part = np.minimum(((pixels.t + 1) / 2 * PARTS).astype(int).clip(0), PARTS - 1)
     weight = pixels.weight
@@ -132,21 +138,20 @@ def fit_edges(
         r = pixels.grey - model
         if step == 3:
             weight = pixels.weight * _consistent_parts(J, r, pixels.weight, part)[0]
-        N, b = _normal(J, r, weight, prior, theta, noise)
+        N, b = normal_equations(J, r, weight, prior, expected - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
         limit = np.exp(theta[:, 8])[:, None]
         d[:, :3] = np.clip(d[:, :3], -limit, limit)
         d[:, 8] = np.clip(d[:, 8], -0.4, 0.4)
         theta = theta + d
         theta[:, 8] = np.clip(theta[:, 8], np.log(SHARPEST), np.log(SOFTEST))
-        freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
-        noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))
+        noise = noise_of_residuals(r, weight, UNKNOWNS)
         if step > 2 and np.quantile(np.abs(d[:, 0]), 0.9) < CONVERGED:
             break
     model, J = _model(theta, pixels)
     r = pixels.grey - model
     _, excess = _consistent_parts(J, r, pixels.weight, part)
-    N, _ = _normal(J, r, weight, prior, theta, noise)
+    N, _ = normal_equations(J, r, weight, prior, expected - theta, noise)
     Q = np.linalg.inv(N)[:, :3, :3]
     contrast = theta[:, 5] - theta[:, 3]
     used = weight.sum(1)
@@ -281,20 +286,6 @@ def _model(theta, pixels):
     return W + step * F + V * beyond, J
 
 
-def _normal(J, r, weight, prior, theta, noise):
-    """Normal matrix and right hand side of residuals r = observed − computed, of unit weight."""
-    p = prior * noise[:, None] ** 2
-    reference = np.zeros_like(theta)
-    reference[:, 8] = np.log(0.8)
-    reference[:, [4, 6]] = 0.0
-    weighted = J * weight[:, :, None]
-    N = np.matmul(weighted.transpose(0, 2, 1), J)
-    N = N + p[:, :, None] * np.eye(UNKNOWNS)
-    N = N + 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(UNKNOWNS)
-    b = np.einsum("npi,np->ni", weighted, r) + p * (reference - theta)
-    return N, b
-
-
 def _consistent_parts(J, r, weight, part):
     """1 for pixels of parts that agree with the edge, and by how much the parts scatter more than
     the noise says."""
@@ -304,8 +295,7 @@ def _consistent_parts(J, r, weight, part):
     information = add(weight * J[:, :, 0] ** 2)
     known = information > 0.02 * information.max(1, keepdims=True)
     shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
-    freedom = np.maximum(weight.sum(1) - UNKNOWNS, 1)
-    noise = np.sqrt(np.maximum((weight * r**2).sum(1) / freedom, 1 / 12))[:, None]
+    noise = noise_of_residuals(r, weight, UNKNOWNS)[:, None]
     z = shift * np.sqrt(information) / noise
     # the median over the known parts: unknown ones come last
     order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)

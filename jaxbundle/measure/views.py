@@ -152,7 +152,10 @@ def measure_boards(
         return (repeated[name], False) if name in repeated else _search(file_of[name], board)
 
     looks, negatives = {}, {}
-    tell = lambda done: progress and progress(SEARCHING, done, len(file_of))
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(SEARCHING, done, len(file_of))
+
     found = map_in_threads(search, file_of, searches_at_once(files, board), tell)
     for name, (look, negative) in zip(file_of, found):
         looks[name], negatives[name] = look, negative

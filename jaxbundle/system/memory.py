@@ -13,7 +13,7 @@ SHORTAGES = (
     "can't start new thread", "failed to map segment",
 )  # fmt: skip
 """What OpenCV, XLA, C++, the system, Python and the dynamic linker say without memory."""
-SMALLEST_ADDRESS_SPACE = {"": 1.65e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
+SMALLEST_ADDRESS_SPACE = {"": 1.7e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
 """Bytes of address space, most of it never used, with which a command, or any other, compiles its
 programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX 0.10,
 two cores)."""

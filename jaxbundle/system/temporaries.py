@@ -10,9 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+TYPE_CHECKING = False  # avoids importing typing
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+
 _temporaries: dict[str, bool] = {}
 """By name, whether its content is removed too."""
 _caches: set[str] = set()
+_processes: set["BaseProcess"] = set()
 _lock = threading.RLock()
 _inside: list[int] = []
 """The thread inside `defer_interrupts`, once per nested block."""
@@ -65,10 +70,19 @@ def watch_cache(folder: str | os.PathLike) -> None:
     _caches.add(os.path.realpath(folder))
 
 
+def watch_process(process: "BaseProcess", running: bool = True) -> None:
+    """Register a process that an interrupt ends with this one, until it is no longer `running`."""
+    _processes.add(process) if running else _processes.discard(process)
+
+
 def remove_temporaries(patience: float) -> None:
-    """Remove temporary files; the process must end at once, since no `defer_interrupts` block can
-    begin after this. A thread in such a block may finish it, within the given seconds."""
+    """Remove temporary files and end the processes of this one, which must end at once, since no
+    `defer_interrupts` block can begin after this. A thread in such a block may finish it, within
+    the given seconds."""
     _lock.acquire(timeout=patience)
+    for process in [*_processes]:
+        with suppress(OSError, ValueError):
+            process.kill()
     for name, content in reversed(list(_temporaries.items())):
         _remove(name, content)
     _remove_open_files(_caches)

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from jaxbundle.system.temporaries import watch_process
+
 EXIT_TIMEOUT = 5.0
 """Seconds for a process without work to end."""
 
@@ -43,6 +45,7 @@ class Workers:
             if connection in self._busy:
                 process.terminate()
             process.join(EXIT_TIMEOUT)
+            watch_process(process, running=False)
         self._idle, self._busy = [], {}
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
@@ -63,6 +66,7 @@ class Workers:
                     result = connection.recv()
                 except (EOFError, OSError):
                     process.join()
+                    watch_process(process, running=False)
                     yield task, Failed(f"its worker process died ({_describe_end(process)})")
                     continue
                 self._idle.append((connection, process))
@@ -73,6 +77,7 @@ class Workers:
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
         process.start()
+        watch_process(process)
         theirs.close()
         return ours, process
 

@@ -135,6 +135,42 @@ with temporary("half"), defer_interrupts():
     assert os.listdir(tmp_path) == []
 
 
+def test_processes_that_work_for_this_one_end_with_it(tmp_path):
+    """Also one that is just starting, and would not look at its closed pipe for a while."""
+    (tmp_path / "task.py").write_text("import time\ndef work(n):\n    time.sleep(300)\n")
+    code = """
+sys.path.insert(0, os.getcwd())
+from multiprocessing import active_children
+from jaxbundle.system.workers import Workers
+import task
+def interrupted(tasks):
+    yield from tasks
+    threading.Timer(0.1, tell).start()
+def tell():
+    print(*[child.pid for child in active_children()], flush=True)
+    interrupt()
+if __name__ == "__main__":
+    with Workers(task.work, 2) as workers:
+        list(workers.run(interrupted([1, 2])))
+"""
+    (tmp_path / "main.py").write_text(STARTED + code)
+    done = subprocess.run([sys.executable, "-B", "main.py"], cwd=tmp_path, capture_output=True,
+                          text=True, timeout=60)  # fmt: skip
+    assert (done.returncode, done.stderr) == (130, "jaxbundle: interrupted\n")
+    numbers = [int(number) for number in done.stdout.split()]
+    # its pipes, which `run` read to their end, are closed: they have ended
+    assert len(numbers) == 2 and not any(is_running(number) for number in numbers)
+
+
+def is_running(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{number}/stat")  # one that nobody has waited for
+    return not state.exists() or state.read_text().rpartition(")")[2].split()[0] not in "ZX"
+
+
 def test_the_line_is_said_while_a_library_is_silenced(tmp_path):
     check(run(STARTED + "os.dup2(os.open(os.devnull, os.O_WRONLY), 2)\ninterrupt()", tmp_path))
 
