@@ -30,11 +30,12 @@ MODEL_FAMILIES = {
 FORMATS = (
     "project", "photo-list", "bal", "column-map", "colmap", "bingo", "metashape", "photomodeler",
     "bundler", "openmvg", "opensfm", "transforms", "kalibr", "micmac", "jaicov", "mrcal",
+    "opencv-stereo", "ros-stereo", "rig", "rig-line",
 )  # fmt: skip
 """Kinds of inputs that are networks."""
 TARGETS = (
     "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
-    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "project",
+    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "opencv-stereo", "ros-stereo", "project",
 )  # fmt: skip
 CAMERA_FILES = (
     "colmap-cameras", "opensfm-cameras", "ros", "cameramodel", "autocal", "opencv", "cameras",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxbundle import cli
+from jaxbundle import choices, cli
 from jaxbundle.io import FORMATS, TARGETS, read_network
 from jaxbundle.io.cameras.camera_files import read_cameras
 from jaxbundle.io.exchange import CAMERA_KINDS
@@ -23,6 +23,9 @@ def test_everything_is_named():
         assert f"| `{name}` |" in TEXT, name
     for name in (*MODELS, *ROTATIONS):
         assert re.search(rf"\b{name}\b", TEXT), name
+    # and the command line, which does not import them, knows them all
+    assert set(choices.FORMATS) == set(FORMATS) and set(choices.TARGETS) == set(TARGETS)
+    assert set(choices.CAMERA_FILES) == set(CAMERA_KINDS)
     for key in set(KEYS) - {"comment"}:
         assert f"{key} = " in TEXT, key
 

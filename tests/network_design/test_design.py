@@ -2,6 +2,7 @@
 gains confirmed by simulation, refusals by name. All networks are six stations and ten targets, so
 that they share the program of the aim."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -29,11 +30,12 @@ SIGMA = 0.002
 
 
 @pytest.fixture(scope="module")
-def page():
-    """The names defined by the code of docs/design.md."""
+def page(tmp_path_factory):
+    """The names defined by the code of docs/design.md, which writes a project."""
     names = {}
-    for code in re.findall(r"```python\n(.*?)```", PAGE, re.S):
-        exec(code, names)
+    with contextlib.chdir(tmp_path_factory.mktemp("page")):
+        for code in re.findall(r"```python\n(.*?)```", PAGE, re.S):
+            exec(code, names)
     return names
 
 
