@@ -4,12 +4,13 @@ Masked values become NaN. Complex numbers are refused, and JAX tracers (under `j
 or `jax.grad`) where numbers are needed.
 """
 
+import functools
 import math
 import numbers
 import operator
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -17,6 +18,8 @@ from jax.core import Tracer
 
 from jaxbundle.errors import InputError
 
+P = ParamSpec("P")
+T = TypeVar("T")
 LARGEST_INTEGER = 10**9
 """Largest integer."""
 
@@ -150,6 +153,23 @@ def refuse_traced(name: str, *values: Any) -> None:
             f"{name} must be numbers, but is traced by JAX: this function does not work under "
             "jax.jit, jax.vmap or jax.grad; jaxbundle.solve does"
         )
+
+
+def without_masks(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, refusing masked arrays, whose masks arithmetic of JAX would ignore.
+
+    **Raises:** `InputError`."""
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **options: P.kwargs) -> T:
+        if any(isinstance(value, np.ma.MaskedArray) for value in (*args, *options.values())):
+            raise InputError(
+                f"{function.__name__}: a masked array, expected numbers: leave masked rows out, or "
+                "give them the weight 0"
+            )
+        return function(*args, **options)
+
+    return checked
 
 
 def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:

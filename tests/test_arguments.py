@@ -271,3 +271,15 @@ def test_what_is_traced_is_refused(transform):
             of(function)(jnp.ones(2) if transform == "vmap" else 1.0)
         assert name in str(error.value) and "traced by JAX" in str(error.value)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("function", [
+    "absolute_orientation", "direct_linear_transformation", "homography", "intersection",
+    "resection", "relative_orientation", "eight_points", "five_points",
+])  # fmt: skip
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_masked_array_is_never_taken_as_numbers_by_an_orientation(function, place):
+    given = [np.ones((8, 3)), np.ones((8, 3))]
+    given[place] = np.ma.masked_array(given[place], given[place] > 2)
+    with pytest.raises(jaxbundle.errors.InputError, match=f"{function}: a masked array"):
+        getattr(jaxbundle.orientation, function)(*given)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.geometry import (
     matrix_from_quaternion,
     rotation_vector_from_quaternion,
@@ -37,6 +38,7 @@ class AbsoluteOrientation(eqx.Module):
     status: Int[AnyArray, ""]
 
 
+@without_masks
 def absolute_orientation(
     source: Float[AnyArray, "n 3"],
     target: Float[AnyArray, "n 3"],

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
@@ -50,6 +51,7 @@ class RefinedCamera(eqx.Module):
     status: Int[AnyArray, ""]
 
 
+@without_masks
 def direct_linear_transformation(
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],

@@ -20,6 +20,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Bool, Float
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.orientation.linear import normalisation, null_space, null_vector, ones_unless
 from jaxbundle.orientation.pose import ray_of
 from jaxbundle.types import AnyArray
@@ -34,6 +35,7 @@ _BASIS = [(2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 
           (0, 0, 1), (0, 0, 0)]  # fmt: skip
 
 
+@without_masks
 def eight_points(
     xy1: Float[AnyArray, "n 2"],
     xy2: Float[AnyArray, "n 2"],
@@ -51,6 +53,7 @@ def eight_points(
     return _nearest_essential(T2.T @ h.reshape(3, 3) @ T1), singular
 
 
+@without_masks
 def five_points(
     xy1: Float[AnyArray, "n 2"],
     xy2: Float[AnyArray, "n 2"],

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.orientation.status import Status, first_of
@@ -30,6 +31,7 @@ SMALLEST_SINGULAR_VALUE = 1e-7
 """Second last singular value, in parts of the first, of a system that determines nothing."""
 
 
+@without_masks
 def homography(
     source: Float[AnyArray, "n 2"],
     target: Float[AnyArray, "n 2"],

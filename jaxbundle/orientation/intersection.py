@@ -16,6 +16,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import adjust
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.status import Status, first_of
@@ -38,6 +39,7 @@ class Intersection(eqx.Module):
     status: Int[AnyArray, ""]
 
 
+@without_masks
 def intersection(
     X0: Float[AnyArray, "n 3"],
     rays: Float[AnyArray, "n 3"],

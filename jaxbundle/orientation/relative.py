@@ -21,6 +21,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
 from jaxbundle.geometry.vectors import dot, read, rotate, rotate_back, unpack
 from jaxbundle.leastsquares.iterations.small import finish, minimise
@@ -58,6 +59,7 @@ class RelativeOrientation(eqx.Module):
     status: Int[AnyArray, ""]
 
 
+@without_masks
 def relative_orientation(
     xy1: Float[AnyArray, "n 2"],
     xy2: Float[AnyArray, "n 2"],

@@ -15,6 +15,7 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.linear import extent, normalisation, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
@@ -35,6 +36,7 @@ class Resection(eqx.Module):
     status: Int[AnyArray, ""]
 
 
+@without_masks
 def resection(
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],
