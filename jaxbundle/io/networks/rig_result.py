@@ -71,8 +71,9 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file, line and entry.
     """
     path = Path(path)
-    file, key = LINE.fullmatch(str(path)).groups()
-    rigs = {row["key"]: row for row in _rows(Path(file))
+    file = file_of_line(path)
+    key = str(path)[len(str(file)) + 1 :] or None
+    rigs = {row["key"]: row for row in _rows(file)
             if "mounting" in row.get("further_unknowns", {})}  # fmt: skip
     if not rigs:
         raise InputError(f"{file}: no rig is in it; expected lines of jaxbundle batch --rig")
@@ -102,16 +103,17 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
         raise InputError(f"{where}: not a line of jaxbundle batch --rig: {what}") from None
-    return network_of_rig(Path(file), cameras, turns, bases, overrides)
+    return network_of_rig(file, cameras, turns, bases, overrides)
 
 
 def _rows(file: Path) -> Iterator[dict]:
     for number, line in enumerate(read_text(file).splitlines(), 1):
         try:
             row = json.loads(line)
-            row["key"], row["status"]
-        except (ValueError, TypeError, KeyError, RecursionError):
-            raise InputError(f"{file}, line {number}: not a line of jaxbundle batch") from None
+        except (ValueError, RecursionError):
+            row = None
+        if not isinstance(row, dict) or not {"key", "status"} <= row.keys():
+            raise InputError(f"{file}, line {number}: not a line of jaxbundle batch")
         yield row
 
 
