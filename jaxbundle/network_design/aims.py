@@ -125,7 +125,7 @@ def points_of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
 class Task(NamedTuple):
     """An aim for the engine: `functions` of its tables, None for points and reliability; `mask`:
     of the points aimed at, filled as the tables are; `measure`: its number among `AIMS`;
-    `image_sets`: the first sets of observations, which are image coordinates."""
+    `image_sets`: the names of the sets of image coordinates."""
 
     declared: Declared
     plan: Plan
@@ -133,7 +133,7 @@ class Task(NamedTuple):
     reliability: bool
     measure: Int[np.ndarray, ""]
     mask: Float[np.ndarray, " points"]
-    image_sets: int
+    image_sets: tuple[str, ...]
 
 
 def task_of(problem: Problem, aim: Aim) -> Task:

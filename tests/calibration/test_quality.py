@@ -17,7 +17,7 @@ from jaxbundle import cli
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
-from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.advice import advice, suggest
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.calibration.simulate import simulate_views
@@ -292,7 +292,9 @@ def test_what_is_missing_is_said():
     left = coverage(np.array([[10.0, 10], [10, 350], [470, 10]]), (480, 360))
     said = poses_in_words(good, covered=left, rms=2.0, t={"fx": 900.0, "k3": 0.4})
     assert "no point in the lower right corner" in said[0] and "cover 3 %" in said[1]
-    assert "RMS 2.00 px" in said[2] and said[3].startswith("not significant: k3 (t 0.4)")
+    assert "RMS 2.00 px" in said[2] and len(said) == 3
+    (suggestion,) = suggest({"fx": 900.0, "k3": 0.4}, get_model("opencv"))
+    assert suggestion.startswith("not significant: k3 (t 0.4)")
 
 
 def test_report_and_json_and_files(calibration, folder, tmp_path):

@@ -310,7 +310,7 @@ def test_cameras_of_other_models_have_tables_of_their_own():
         labels = np.array(names[given.kind.of[2]].labels)[given.rows[2]]
         assert (labels == np.array([c.id for c in cameras])[given.rows[1]]).all()
     measured = {o.name: o.measured for o in observations}
-    np.testing.assert_array_equal(rig.in_order(measured.get), rig.xy)
+    np.testing.assert_array_equal(rig.in_order(measured), rig.xy)
 
 
 def test_points_of_the_object_are_exact_weighted_or_free():

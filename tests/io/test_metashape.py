@@ -78,7 +78,6 @@ def test_cameras_and_orientations(tmp_path, transform):
     theirs = np.stack(published(*(rays * [1, -1, -1]).T), 1) - 0.5
     assert_allclose(images_of(get_model("opencv"), values, rays), theirs, atol=1e-10)
     assert "not aligned" in net.warnings[-1] and "off" in net.warnings[-1]
-    assert "no image points" in net.warnings[0]
 
 
 def test_markers(tmp_path):

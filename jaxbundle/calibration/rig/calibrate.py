@@ -182,7 +182,7 @@ def _rays(calibration: Calibration, keys, epochs):
 def _contradictions(rig: Rig, found, size):
     """Epochs seen by several cameras that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
-    v = rig.in_order(found.solution.residuals.get) * rig.sigma / size[rig.camera]
+    v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
     number = np.zeros((len(rig.epochs), len(size)))
     np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
     rays = number.sum(1)

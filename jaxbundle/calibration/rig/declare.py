@@ -15,7 +15,8 @@ Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -82,11 +83,11 @@ class Rig:
         table = next(t for t in camera_tables(self.cameras) if k in t.cameras)
         return table.name, int(np.flatnonzero(table.cameras == k)[0])
 
-    def in_order(self, by_set: Callable[[str], np.ndarray]) -> Float[np.ndarray, "n 2"]:
-        """The engine's results of a set of image points, in the order of the rig."""
+    def in_order(self, by_set: Mapping[str, Any]) -> Float[np.ndarray, "n 2"]:
+        """The engine's results by set of image points, in the order of the rig."""
         found = np.zeros(self.xy.shape)
         for table, rows in self.sets:
-            found[rows] = by_set(image_points_of(table))
+            found[rows] = by_set[image_points_of(table)]
         return found
 
 
@@ -137,7 +138,7 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
 
 def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
     """Which image points carry weight."""
-    return np.all(rig.in_order(problem.data.weight.get), axis=1)
+    return np.all(rig.in_order(problem.data.weight), axis=1)
 
 
 def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:

@@ -16,7 +16,7 @@ from jaxbundle.bundle import tables as result_tables
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.declare import Rig, image_points_of, used_rays
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
 from jaxbundle.display import print_in_one_screen
@@ -114,7 +114,7 @@ class RigCalibration:
     @functools.cached_property
     def rms(self) -> dict[str, float]:
         """√(Σ|v|²/points) in pixels, by camera."""
-        v, found = self.rig.in_order(self.result.solution.residuals.get) * self.rig.sigma, {}
+        v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
         for k, name in enumerate(self.names):
             given = self.cameras[name].camera
             own = v[self.used & (self.rig.camera == k)]
@@ -132,7 +132,8 @@ class RigCalibration:
         rows = rig.in_order
         parts = [result_tables.residual_rows(
             self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
-            rows(weight), Tested(*(rows(getattr(found, name).get) for name in Tested._fields)),
+            rows({name: weight(name) for name in map(image_points_of, next(zip(*rig.sets)))}),
+            Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
         )]  # fmt: skip
         if rig.point_sigma is not None:
             blank = np.full(len(ids), "", dtype=object)

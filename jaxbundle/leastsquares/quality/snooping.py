@@ -220,11 +220,11 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     )]  # fmt: skip
     rays = _Neighbours(found, touched, unit)
     others = {
-        k: rays.alternatives(of[k], int(row[k]), critical, apart) for k in chosen.tolist()
+        k: rays.alternatives(str(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
     }
     certain = [k for k in others if not others[k]]
     return [
-        Removed(of[k], int(row[k]), None, float(together[k]), others[k])
+        Removed(str(of[k]), int(row[k]), None, float(together[k]), others[k])
         for k in certain or others
     ]
 
