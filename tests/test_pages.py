@@ -124,7 +124,7 @@ def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
     found = dataclasses.replace(Weighted(again(), {"sift": 3.2}, 40), adjustment=again())
     assert found.adjustment.global_test()["passed"] is None
     for text in (found.adjustment.report(), "".join(compose(found.adjustment))):
-        assert "not done: the σ of the groups were estimated" in text.replace("\n" + " " * 18, " ")
+        assert "not done: the σ were estimated from these" in text.replace("\n" + " " * 18, " ")
 
 
 @pytest.mark.parametrize("factor, state, words", [
