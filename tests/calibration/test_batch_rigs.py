@@ -113,6 +113,7 @@ def test_arrays_of_rigs_in_a_file(rigs, tmp_path):
         again(settings=["free=fx"])
 
 
+@pytest.mark.further
 def test_folders_of_rigs(command, tmp_path, monkeypatch):
     """Simultaneous photographs by their numbers; a folder with one camera fails alone."""
     monkeypatch.chdir(tmp_path)

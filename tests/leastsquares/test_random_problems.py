@@ -32,7 +32,7 @@ def test_as_dense_algebra(seed):
         compare(seed, variant)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.further)])
 def test_derivatives_as_differences_of_dense_algebra(seed):
     for variant in range(2):
         compare_derivatives(seed, variant)

@@ -127,6 +127,7 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
 
 
+@pytest.mark.further
 def test_the_principal_point_of_few_photographs_is_estimated(tmp_path):
     """Held at the centre of the photographs it would bias the principal distance by many σ."""
     write_photographs(tmp_path, "a", 3, 2)
