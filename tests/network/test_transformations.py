@@ -10,6 +10,7 @@ import pytest
 import jaxbundle
 from jaxbundle.network.build import make_further
 from jaxbundle.network.further import KINDS
+from jaxbundle.network.tables import EXTERIOR
 
 EPOCHS, SIGMA = 4, 0.002
 pytestmark = pytest.mark.further  # minutes of compiling for twenty kinds at once
@@ -41,6 +42,11 @@ def rows(images):
         "differences": [{"from": "1", "to": "27", "dX": 0.0, "dY": 0.0, "dZ": None,
                          "sdX": 0.01, "sdY": 0.01, "sdZ": None}],
         "angles": [{"from": "1", "at": "2", "to": "14", "value": 1.0, "sigma": 1e-3}],
+        "camera_parameters": [
+            {"camera": "right", "parameter": "c", "value": 30.02, "sigma": 0.05}
+        ],
+        "exterior_priors": {"image": images[:2]} | dict.fromkeys(EXTERIOR, [0.0] * 2)
+        | {f"s{name}": [0.05] * 2 for name in EXTERIOR},
         "ties": [{"camera": "left", "other": "right", "parameter": "c", "sigma": 0.1}],
         "figures": [{"figure": "floor", "type": "plane", "point": p, "sigma": 0.01} for p in plane],
         "shapes": [

@@ -90,8 +90,10 @@ class Checkout:
         (packages / "clone.pth").write_text("\n".join([str(self.path), *installed]) + "\n")
         program = environment / "bin" / "jaxbundle"
         program.write_text(
+            # As pip writes it: worker processes import it again.
             f"#!{environment / 'bin' / 'python'}\nimport sys\n"
-            "from jaxbundle.__main__ import main\nsys.exit(main())\n"
+            "from jaxbundle.__main__ import main\nif __name__ == '__main__':\n"
+            "    sys.exit(main())\n"
         )
         program.chmod(0o755)
         (environment / "installed").touch()  # so that `make demo` installs nothing
