@@ -373,7 +373,9 @@ def complete_data(problem: Problem, data: Data | None) -> Data:
     shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
     if shapes(data) != shapes(known):
         raise InputError("data must be a Data with arrays of the shapes of problem.data")
-    return pad_data(problem, data)
+    # Numbers of single precision are taken as they are, and adjusted in double precision.
+    double = lambda x: x.astype(float) if isinstance(x, Tracer) else np.asarray(x, float)
+    return pad_data(problem, jax.tree.map(double, data))
 
 
 LEAST_ROWS, MOST_ROWS = 128, 10_000
