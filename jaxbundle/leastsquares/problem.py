@@ -330,7 +330,11 @@ def _evaluate(kind, spaces, values, measured):
 
 def pad_data(problem: Problem, data: Data) -> Data:
     """The data padded to the sizes of the plan, on the device."""
-    return jax.device_put(fill_data(problem, data))
+    filled = fill_data(problem, data)
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(filled)):
+        # One by one: JAX cannot batch several together whose batch axes differ.
+        return jax.tree.map(jax.device_put, filled)
+    return jax.device_put(filled)
 
 
 def fill_data(problem: Problem, data: Data) -> Data:
