@@ -23,6 +23,12 @@ PEERS ?=
   install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
+# An extra of the package beside what the tests need.
+define install_extra
+if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -e '.[$(1)]'; \
+else $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(1)]'; fi
+endef
+
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
@@ -74,11 +80,7 @@ mutants: $(VENV)/mutated
 	$(BIN)/python tests/mutants.py
 
 $(VENV)/mutated: $(VENV)/installed
-	@if command -v uv >/dev/null 2>&1; then \
-	  uv pip install --quiet --python $(BIN)/python -e '.[mutants]'; \
-	else \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[mutants]'; \
-	fi
+	@$(call install_extra,mutants)
 	@touch $@
 
 # Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
@@ -103,11 +105,7 @@ $(BOUNDS:%=test-%): test-%: install-%
 	out/$*/bin/python benchmarks/first.py --repeat 1
 
 $(VENV)/documented: $(VENV)/installed
-	@if command -v uv >/dev/null 2>&1; then \
-	  uv pip install --quiet --python $(BIN)/python -e '.[docs]'; \
-	else \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'; \
-	fi
+	@$(call install_extra,docs)
 	@touch $@
 
 install-docs: $(VENV)/documented
@@ -118,11 +116,7 @@ docs: install-docs
 	@echo "out/docs/index.html"
 
 $(VENV)/compared: $(VENV)/installed
-	@if command -v uv >/dev/null 2>&1; then \
-	  uv pip install --quiet --python $(BIN)/python -e '.[bench]'; \
-	else \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'; \
-	fi || echo "the extra 'bench' could not be installed: peers that are missing will be skipped"
+	@$(call install_extra,bench) || echo "the extra 'bench' could not be installed: peers that are missing will be skipped"
 	@touch $@
 
 bench: $(BENCHES:%=bench-%)

@@ -31,7 +31,8 @@ import jaxbundle
 from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
-from jaxbundle.reconstruction.reconstruct import Part, reconstruct
+from jaxbundle.reconstruction.reconstruct import reconstruct
+from jaxbundle.reconstruction.result import Part
 from jaxbundle.system.configuration import allow_programs_at_once
 
 SETS = SETS | LIFELIKE

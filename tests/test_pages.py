@@ -16,7 +16,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.reconstruction.adjusting import Weighted
 from jaxbundle.reconstruction.block import Block
 from jaxbundle.reconstruction.page import compose_part
-from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+from jaxbundle.reconstruction.result import Part, Reconstruction
 from jaxbundle.report.page import Addition, Finding, Section, compose
 from jaxbundle.report.page.charts import draw_field, draw_histogram
 from jaxbundle.report.verdict import BAD

@@ -19,7 +19,7 @@ from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
 from jaxbundle.reconstruction.page import compose_part, conclude_part, describe_part
-from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+from jaxbundle.reconstruction.result import Part, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
 from jaxbundle.types import Progress
 

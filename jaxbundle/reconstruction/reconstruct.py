@@ -6,14 +6,13 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, list_some
@@ -21,19 +20,16 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.at_once import photographs_at_once
-from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
 from jaxbundle.reconstruction.adjusting import (
     LARGEST_MISFIT,
-    WRONG_MISFIT,
     Weighted,
     adjust_weighted,
 )
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
-from jaxbundle.reconstruction.block import Block, describe_block
+from jaxbundle.reconstruction.block import describe_block
 from jaxbundle.reconstruction.control import Control
-from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
 from jaxbundle.reconstruction.georeferencing import georeference
 from jaxbundle.reconstruction.named import find_named, name_unused
@@ -47,9 +43,15 @@ from jaxbundle.reconstruction.photographs import (
     find_photographs,
     name_other_files,
 )
+from jaxbundle.reconstruction.result import (
+    Part,
+    Reconstruction,
+    misfit_in_words,
+    principal_distances,
+)
+from jaxbundle.reconstruction.satellite_positions import find_positions
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
-from jaxbundle.report.head import count_points
 from jaxbundle.system.configuration import available_cores, can_run_two_programs
 from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.calibration import start_cameras
@@ -74,68 +76,11 @@ NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
 """Share of contradictory pairs above which the result is doubtful."""
-FARTHEST_CONTROL = 10_000.0
-"""Metres between control in a system without a name and satellite positions in their UTM zone; a
-block from the air is smaller, another system is farther."""
 CONTRADICTS_FILE = 3.29
 """Difference from the principal distance of the files, in σ, that chance explains in one of a
 thousand."""
 TEXTURE = 16
 """Minimum features of a photograph."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
-    kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
-    could not be used, with the reason in `no_control`."""
-
-    name: str
-    adjustment: Adjustment
-    colours: Mapping[str, tuple[int, int, int]]
-    factors: Mapping[str, float]
-    block: Block
-    control: ControlTable | None = None
-    no_control: str = ""
-
-    @property
-    def misfit(self) -> float:
-        """How many times worse than their σ from matching measurements of the worst kind fit."""
-        return max(self.factors.values(), default=1.0)
-
-
-@print_in_one_screen
-@dataclasses.dataclass(frozen=True)
-class Reconstruction:
-    """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
-    why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
-    matches, agreeing matches, kind; `photographs`: the examined files, by name;
-    `name` of the whole."""
-
-    parts: tuple[Part, ...]
-    left_out: Mapping[str, str]
-    notes: tuple[str, ...]
-    pairs: tuple[tuple[str, str, int, int, str], ...]
-    photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    name: str = ""
-
-    def __str__(self) -> str:
-        lines = [f"warning: {said}" for said in self.warnings]
-        lines += [
-            f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
-            f"{count(count_points(part.adjustment), 'point')}, "
-            f"σ0 {part.adjustment.sigma0:.3f}{_distances_found(part.adjustment)}"
-            for part in self.parts
-        ]  # fmt: skip
-        lines += [f"warning: {part.name}: {said}" for part in self.parts
-                  for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
-        for part in self.parts:
-            if part.control is not None:
-                lines.append(part.control.sigma)
-                lines += [f"control: {said}" for said in part.control.notes]
-        lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
-        return "\n".join([*lines, *self.notes])
 
 
 def reconstruct(
@@ -186,48 +131,13 @@ def reconstruct(
     first = Path(given[0])
     name = name or (first if first.is_dir() else first.parent).resolve().name
     kept = Store(store, settings.detection)
-    making = _Making(photographs, left_out, cameras, settings, kept, progress, extra)
-    making.notes += notes
-    making.frame, making.system, making.title = frame, system, name
-    return making.run()
+    run = _ReconstructionRun(photographs, left_out, cameras, settings, kept, progress, extra)
+    run.notes += notes
+    run.frame, run.system, run.title = frame, system, name
+    return run.run()
 
 
-def find_positions(
-    photographs: Sequence[Photograph], control: Control | None
-) -> tuple[MapPositions | None, list[str]]:
-    """The satellite positions of the photographs in the system of control, else in their UTM zone,
-    and what is done with them."""
-    places = [p.exif.place for p in photographs]
-    there = sum(place is not None for place in places)
-    if control is None:
-        found = map_positions(places)
-        if found is None:
-            return None, [f"satellite positions of {there} photographs are not used: expected "
-                          "three or more with heights"] * bool(there)  # fmt: skip
-        if not found.define_frame:
-            return found, ["satellite positions of the photographs extend over less than 8 σ: they "
-                           "do not define the frame"]  # fmt: skip
-        return found, [f"satellite positions of the photographs: {found.words}"]
-    notes = [f"control in {control.system or 'a system that its file does not name'}"]
-    if not there:
-        return None, [*notes, "no satellite positions in the photographs: control alone gives the "
-                      "frame"]  # fmt: skip
-    found = map_positions(places, control.system)
-    if found is None:
-        return None, [*notes, f"satellite positions of {there} photographs are not used: they need "
-                      "heights, three photographs, and a system of control in metres"]  # fmt: skip
-    if not control.system:
-        away = np.nanmedian(found.X, 0) - np.median(control.points.position, axis=0)
-        distance = float(np.hypot(*away[:2]))
-        if distance > FARTHEST_CONTROL:
-            return None, [*notes, "satellite positions of the photographs are not used: they are "
-                          f"{distance / 1000:.0f} km from control in {found.system}; name the "
-                          "system of control in the first line of gcp_list.txt"]  # fmt: skip
-    return found, [*notes, f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
-                   f"photographs with their σ, in {found.words}"]  # fmt: skip
-
-
-class _Making:
+class _ReconstructionRun:
     """The state of a running reconstruction."""
 
     def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell, extra):
@@ -448,7 +358,7 @@ class _Making:
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors, block, control,
                     no_control)  # fmt: skip
         if part.misfit >= LARGEST_MISFIT:
-            self._warn(f"{name}: {_misfit_in_words(part)}", part.misfit)
+            self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         for said in (*self._contradict_files(weighted.adjustment), *doubts):
             self._warn(f"{name}: {said}")
         return part, dict(oriented.images)
@@ -457,7 +367,7 @@ class _Making:
         """Principal distances that contradict those of the files, in words."""
         stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated)}
         said = []
-        for id, found in _principal_distances(result).items():
+        for id, found in principal_distances(result).items():
             file = stated.get(id)
             if file is None or not found["sigma"]:
                 continue
@@ -534,19 +444,6 @@ class _Making:
         return adjust_weighted(placed, kinds, named, significance, self._begin), note
 
 
-def _principal_distances(result: Adjustment) -> dict[str, dict]:
-    """Value and σ, by camera."""
-    return {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
-            if "fx" in camera["parameters"]}  # fmt: skip
-
-
-def _distances_found(result: Adjustment) -> str:
-    """The free principal distances, with their σ."""
-    return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
-                   for id, c in _principal_distances(result).items()
-                   if c["free"] and c["sigma"])  # fmt: skip
-
-
 def _ratio_in_words(ratio: aspect_ratio.Ratio) -> str:
     return f"{1 + ratio.deviation:.5f} ± {ratio.sigma:.5f}"
 
@@ -556,7 +453,7 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
         why = "; ".join([result.termination, *result.findings, *result.weakness.lines])
         return NotSolvedError(f"not solved: {why}", list(result.undetermined))
     found = ", ".join(
-        f"{c['value']:.0f} px in {id}" for id, c in _principal_distances(result).items()
+        f"{c['value']:.0f} px in {id}" for id, c in principal_distances(result).items()
     )
     return NotSolvedError(
         f"not solved: impossible principal distance {found}; take photographs from "
@@ -569,16 +466,6 @@ def _name_unused(name: str, weighted: Weighted) -> list[str]:
         return []
     return [f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
             "measurements contradict each other, as on an object that repeats itself"]  # fmt: skip
-
-
-def _misfit_in_words(part: Part) -> str:
-    """Measurements that contradict each other by far more than their σ."""
-    wrong = part.misfit >= WRONG_MISFIT
-    return (
-        f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "
-        "worse than their σ from matching: the object repeats itself or moves, or the camera model "
-        "does not fit the lens; compare the result with the object"
-    )
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

@@ -18,7 +18,7 @@ from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing
 from jaxbundle.reconstruction.block import CameraPositions, describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
-from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+from jaxbundle.reconstruction.result import Part, Reconstruction
 
 SIGMA = 0.5
 """Of handheld control, metres."""

@@ -14,7 +14,7 @@ from jaxbundle.photographs.exif import Place
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
 from jaxbundle.reconstruction.named import Named, name_unused, read_distances
-from jaxbundle.reconstruction.reconstruct import find_positions
+from jaxbundle.reconstruction.satellite_positions import find_positions
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

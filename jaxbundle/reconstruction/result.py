@@ -1,0 +1,90 @@
+"""The result of a reconstruction: its parts, what was left out, what is doubtful."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.network.columns import count
+from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
+from jaxbundle.reconstruction.block import Block
+from jaxbundle.reconstruction.control_table import ControlTable
+from jaxbundle.report.head import count_points
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
+    kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
+    could not be used, with the reason in `no_control`."""
+
+    name: str
+    adjustment: Adjustment
+    colours: Mapping[str, tuple[int, int, int]]
+    factors: Mapping[str, float]
+    block: Block
+    control: ControlTable | None = None
+    no_control: str = ""
+
+    @property
+    def misfit(self) -> float:
+        """How many times worse than their σ from matching measurements of the worst kind fit."""
+        return max(self.factors.values(), default=1.0)
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
+    why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
+    matches, agreeing matches, kind; `photographs`: the examined files, by name;
+    `name` of the whole."""
+
+    parts: tuple[Part, ...]
+    left_out: Mapping[str, str]
+    notes: tuple[str, ...]
+    pairs: tuple[tuple[str, str, int, int, str], ...]
+    photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    name: str = ""
+
+    def __str__(self) -> str:
+        lines = [f"warning: {said}" for said in self.warnings]
+        lines += [
+            f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
+            f"{count(count_points(part.adjustment), 'point')}, "
+            f"σ0 {part.adjustment.sigma0:.3f}{distances_found(part.adjustment)}"
+            for part in self.parts
+        ]  # fmt: skip
+        lines += [f"warning: {part.name}: {said}" for part in self.parts
+                  for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
+        for part in self.parts:
+            if part.control is not None:
+                lines.append(part.control.sigma)
+                lines += [f"control: {said}" for said in part.control.notes]
+        lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
+        return "\n".join([*lines, *self.notes])
+
+
+def principal_distances(result: Adjustment) -> dict[str, dict]:
+    """Value and σ, by camera."""
+    return {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
+            if "fx" in camera["parameters"]}  # fmt: skip
+
+
+def distances_found(result: Adjustment) -> str:
+    """The free principal distances, with their σ."""
+    return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
+                   for id, c in principal_distances(result).items()
+                   if c["free"] and c["sigma"])  # fmt: skip
+
+
+def misfit_in_words(part: Part) -> str:
+    """Measurements that contradict each other by far more than their σ."""
+    wrong = part.misfit >= WRONG_MISFIT
+    return (
+        f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "
+        "worse than their σ from matching: the object repeats itself or moves, or the camera model "
+        "does not fit the lens; compare the result with the object"
+    )
