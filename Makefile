@@ -75,7 +75,7 @@ random-problems: install
 	cd tests/leastsquares && seq 0 $$(($(WORKERS) - 1)) | \
 	  xargs -P $(WORKERS) -I{} ../../$(BIN)/python test_random_problems.py 500 {} $(WORKERS)
 
-# 300 changes of the package, each with the tests that should notice it: hours; goes on where it was stopped.
+# 300 changes of the package, each with the tests that should notice it: hours; resumes.
 mutants: $(VENV)/mutated
 	$(BIN)/python tests/mutants.py
 

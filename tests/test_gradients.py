@@ -52,3 +52,10 @@ def test_a_camera_model():
     p = np.array([20.0, 0.1, -0.1, 2e-4, -1e-6, 4e-9, 3e-5, -2e-5, -1e-3, 4e-4, 0.0])
     found = jaxbundle.check_gradients(model, p, np.array([0.2, -0.1, -1.0]))
     assert found.passed, str(found)
+
+
+def test_a_camera_on_its_axis_is_moved_too():
+    """The image point is 0 there: a step relative to it would compare nothing."""
+    model = get_model("brown")
+    found = jaxbundle.check_gradients(model, np.array([20.0] + [0.0] * 10), np.array([0.0, 0, -1]))
+    assert found.passed and found.differences > 0, str(found)

@@ -202,7 +202,7 @@ def test_control_of_a_left_handed_system_is_named(change, start):
     mirrored = with_control_at(given, change)
     said = said_of(mirrored if start else without_start_values(mirrored))
     assert "the control points fit the mirror image of the network (σ0 1.0" in said
-    assert "X and Y of the control are exchanged" in said and "contradict each other" not in said
+    assert "exchange X and Y of the control" in said and "contradict each other" not in said
 
 
 def said_of(given) -> str:
@@ -220,7 +220,7 @@ def said_of(given) -> str:
 def test_flipped_images_without_start_values_are_named():
     given = with_xy(network(FREE, **CONTROL), lambda xy: xy * [1, -1])
     said = said_of(without_start_values(given))
-    assert "y (or x) of the image coordinates is (expected are mm" in said
+    assert "y (or x) of the image coordinates (expected: mm" in said
 
 
 def test_control_in_mm_beside_start_values_in_m_is_named_where_nothing_is_solved():

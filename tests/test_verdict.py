@@ -221,3 +221,19 @@ def test_a_unit_of_weight_beside_control_with_sigma_is_no_good_result():
     result = jaxbundle.adjust(given.replace(observations=rays))
     assert result.verdict.state != GOOD and finding(result, "χ² test").state == DOUBTFUL
     assert any("1 mm was assumed beside the σ of other observations" in w for w in result.warnings)
+
+
+def test_a_prior_beside_fixed_points_needs_a_stated_sigma_too():
+    """Three fixed points give the datum: every prior is weighted against the image coordinates."""
+    given = network(control=(), datum="control")
+    role = ["fixed" if k in (0, 4, 20, 24) else r for k, r in enumerate(given.points.role)]
+    sigma = np.full_like(given.points.sigma, np.nan)
+    rays = dataclasses.replace(
+        given.observations, sigma=np.ones_like(given.observations.xy), sigma_origin=UNIT
+    )
+    prior = dataclasses.replace(given.cameras[0], sigma={"c": 0.001})
+    result = jaxbundle.adjust(given.replace(
+        points=dataclasses.replace(given.points, role=tuple(role), sigma=sigma),
+        observations=rays, cameras=(prior,),
+    ))  # fmt: skip
+    assert result.weights_matter and finding(result, "χ² test").state == DOUBTFUL

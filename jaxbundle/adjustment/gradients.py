@@ -155,6 +155,7 @@ def _size(leaf) -> float:
 
 
 def _sizes_by_effect(f: Callable, x: jax.Array, otherwise: jax.Array) -> jax.Array:
-    """The change of every argument that changes f by |f|; `otherwise` where it has no effect."""
-    effects = jnp.linalg.norm(jax.jacfwd(f)(x), axis=0)
-    return jnp.where(effects > 0, jnp.linalg.norm(f(x)) / effects, otherwise)
+    """The change of every argument that changes f by |f|; `otherwise` where it has no effect, or
+    where f is 0."""
+    effects, size = jnp.linalg.norm(jax.jacfwd(f)(x), axis=0), jnp.linalg.norm(f(x))
+    return jnp.where((effects > 0) & (size > 0), size / effects, otherwise)

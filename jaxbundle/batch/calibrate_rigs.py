@@ -11,7 +11,7 @@ from jaxbundle.arguments import integer, numeric_array, one_of, positive, show, 
 from jaxbundle.batch.camera import SOLVED
 from jaxbundle.batch.input import any_model, free_parameters
 from jaxbundle.batch.population import Population
-from jaxbundle.batch.rigs import SIGMA, Rig, RigSettings, solve_rigs, with_free
+from jaxbundle.batch.rigs import Rig, RigSettings, solve_rigs, with_free
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel
@@ -75,7 +75,7 @@ def calibrate_rigs(
     pixel_size: float | tuple[float, float] | None = None,
     rolling_shutter: Mapping[str, Any] | None = None,
     rig: Mapping[str, Any] | None = None,
-    sigma_image: float = SIGMA,
+    sigma_image: float | None = None,
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
@@ -129,7 +129,7 @@ def calibrate_rigs(
 
 def rig_settings(
     model: str | CameraModel, free, sections: Mapping[str, Any], pixel_size=None,
-    sigma_image: float = SIGMA, max_iterations: int = 100, snooping: str | None = None,
+    sigma_image: float | None = None, max_iterations: int = 100, snooping: str | None = None,
     significance: float = 0.001,
 ) -> RigSettings:  # fmt: skip
     """Checked settings.
@@ -159,7 +159,7 @@ def rig_settings(
         raise InputError(f"model {found.name!r} is in mm: give the size of a pixel (--pixel-size)")
     return RigSettings(
         found, free_parameters(found, free), size, dict(sections),
-        positive("sigma_image", sigma_image),
+        None if sigma_image is None else positive("sigma_image", sigma_image),
         integer("max_iterations", max_iterations), snooping, significance,
     )  # fmt: skip
 

@@ -30,10 +30,8 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.network.build import make_network
 from jaxbundle.network.further.rolling_shutter import VELOCITY
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 
-SIGMA = 0.1
-"""A priori σ of an image coordinate, pixels, if none is given."""
 UNEXPECTED = (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError)
 """Errors of one network that must not end the others."""
 
@@ -58,16 +56,22 @@ class Rig:
 class RigSettings:
     """How the rigs of a batch are adjusted: the camera model, the parameters to estimate, the size
     of a pixel in mm for a model in mm, sections `rolling_shutter` and `rig` as in a project, the a
-    priori σ of an image coordinate (pixels; it matters beside priors), and options of `adjust`."""
+    priori σ of an image coordinate (pixels; None: nobody stated one, and `UNSTATED_BOARD_SIGMA` is
+    a unit of weight), and options of `adjust`."""
 
     model: CameraModel
     free: tuple[str, ...]
     pixel_size: tuple[float, float] | None = None
     sections: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    sigma_image: float = SIGMA
+    sigma_image: float | None = None
     max_iterations: int = 100
     snooping: str | None = None
     significance: float = 0.001
+
+    @property
+    def sigma(self) -> float:
+        """σ of an image coordinate in the weights, pixels."""
+        return UNSTATED_BOARD_SIGMA if self.sigma_image is None else self.sigma_image
 
 
 def solve_rigs(
@@ -168,7 +172,7 @@ def _contradicting(
     place = {id: e for of in rig.images for e, id in enumerate(of)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
     of_ray = epoch[result.problem.image]
-    lengths = settings.sigma_image * np.hypot(*np.asarray(result.inspection.residuals.image).T)
+    lengths = settings.sigma * np.hypot(*np.asarray(result.inspection.residuals.image).T)
     number = np.bincount(of_ray, minlength=len(rig.epochs))
     rms = np.sqrt(np.bincount(of_ray, lengths**2, len(rig.epochs)) / np.maximum(number, 1))
     shared = np.bincount(epoch, minlength=len(rig.epochs)) > 1
@@ -182,7 +186,7 @@ def _residual_lengths(
     if result is None:
         return np.zeros(0)
     used = (np.asarray(result.problem.data.image_weight) > 0).all(1)
-    v = settings.sigma_image * np.asarray(result.inspection.residuals.image)
+    v = settings.sigma * np.asarray(result.inspection.residuals.image)
     return np.hypot(*v.T)[used]
 
 
@@ -207,7 +211,7 @@ def declare_rig(rig: Rig, firsts: Sequence[FirstCamera | None], settings: RigSet
     model, size_of_pixel = settings.model, settings.pixel_size
     cameras, images, rays = [], [], []
     prior = {name: s for name, s in dict(model.prior).items() if name in settings.free}
-    sigma = settings.sigma_image * np.array(size_of_pixel if model.unit == "mm" else (1.0, 1.0))
+    sigma = settings.sigma * np.array(size_of_pixel if model.unit == "mm" else (1.0, 1.0))
     for c, (name, first) in enumerate(zip(rig.cameras, firsts)):
         if first is None or not first.solved:
             why = "no finite image points" if first is None else first.status
@@ -258,5 +262,6 @@ def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -
         {"id": points, "role": ["fixed"] * len(points), "X": X, "Y": Y, "Z": Z},
         {"image": ids[image], "point": points[point], "x": rays[:, 2], "y": rays[:, 3],
          "sx": np.full(len(rays), sigma[0]), "sy": np.full(len(rays), sigma[1])},
-        residuals="measured", image_unit=settings.model.unit, **further,
+        residuals="measured", image_unit=settings.model.unit,
+        sigma_origin=UNIT if settings.sigma_image is None else STATED, **further,
     )  # fmt: skip

@@ -21,7 +21,7 @@ from jaxbundle.batch.photographs import (
     of_photographs,
 )
 from jaxbundle.batch.rig_photographs import RigFolders, rig_of_views
-from jaxbundle.batch.rigs import SIGMA, UNEXPECTED, RigSettings, solve_rigs
+from jaxbundle.batch.rigs import UNEXPECTED, RigSettings, solve_rigs
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.batch.stacks import CameraStack, is_camera_stack, read_camera_stack
 from jaxbundle.bundle.adjust import adjust
@@ -117,7 +117,7 @@ class BatchSettings:
     def as_rigs(self) -> RigSettings:
         """The settings of cameras and rigs that are adjusted as networks."""
         sections = self.sections()
-        sigma = sections.pop(SIGMA_IMAGE, SIGMA)
+        sigma = sections.pop(SIGMA_IMAGE, None)
         return rig_settings(self.model, self.free, sections, self.pixel_size, sigma,
                             **self.adjusting)  # fmt: skip
 

@@ -20,7 +20,8 @@ from jaxbundle.orientation.conventions import EXPECTED, image_frame
 MUCH_BETTER = 5.0
 """Least ratio of σ0 of the given images and of the mirrored ones; below, control is no witness."""
 FEWEST_AXES = 9
-"""Controlled coordinates: seven hold a similarity, and only more can contradict it."""
+"""Controlled coordinates: those of three points, of which seven hold a similarity and two can
+contradict it."""
 
 
 def name_mirrored(
@@ -44,9 +45,9 @@ def name_mirrored(
     axes = "v (or u)" if unit == "px" else "y (or x)"
     return (
         f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
-        f"X and Y of the control are exchanged, or one of its axes is in the other "
-        f"direction (a right-handed system is expected); or {axes} of the image coordinates is "
-        f"(expected are {EXPECTED[unit]})"
+        "exchange X and Y of the control (lists often give northing first), or reverse "
+        f"one of its axes (a right-handed system is expected) or {axes} of the image coordinates "
+        f"(expected: {EXPECTED[unit]})"
     )
 
 

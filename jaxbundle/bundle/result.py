@@ -162,8 +162,8 @@ class Adjustment:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is good to know and spoils nothing, in words: where start values come from, what was
-        left out, how uncertain the georeference is."""
+        """Information that does not lower the verdict, in words: where start values come from, what
+        was left out, how uncertain the georeference is."""
         return tuple(dict.fromkeys((*self.problem.network.notes, *self.weakness.notes)))
 
     @functools.cached_property
@@ -267,8 +267,11 @@ class Adjustment:
     @property
     def weights_matter(self) -> bool:
         """Whether the ratio of the σ of image coordinates to those of other observations has an
-        effect: there are more of these than the datum needs."""
-        return self.counts.pseudo_observations > SIMILARITY - self.counts.datum
+        effect: there are more of these than the datum needs beside what is held."""
+        points, images = self.problem.network.points, self.problem.network.images
+        held = 3 * int(points.has_role("fixed").sum()) + int((images.sigma == 0).sum())
+        needed = max(SIMILARITY - self.counts.datum - held, 0)
+        return self.counts.pseudo_observations > needed
 
     def global_test(self, significance: float = 0.05) -> dict:
         """χ² test of vᵀPv against a variance factor of 1 (two-sided): `vtpv`, the interval `low` to

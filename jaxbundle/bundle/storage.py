@@ -128,7 +128,7 @@ def _state(problem: Problem, minimum: Any) -> State:
         tables=tuple(t.name for t in system.tables),
         kinds=tuple(o.kind.name for o in system.observations),
         reduction=problem.reduction, lengths=problem.layout.lengths,
-        free=tuple(np.asarray(t.free) for t in system.tables), 
+        free=tuple(np.asarray(t.free) for t in system.tables),
         weights=leaves([system.data.weight[o.name] for o in system.observations]),
         start=leaves(problem.data.start), values=leaves(minimum.values),
         termination=int(minimum.termination), iterations=steps,

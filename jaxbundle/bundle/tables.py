@@ -169,7 +169,7 @@ def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
 def _further(problem: Problem, found: Sequence[Rows]):
     """Observations of further kinds: the rows they touch are in the column of the point."""
     for k, name in enumerate(problem.layout.others):
-        given, weight = problem.system.set(name), problem.system.weights(name)
+        given, weight = problem.system.observations_of(name), problem.system.weights(name)
         touched = [given.label(problem.system.tables, row) for row in range(given.number)]
         touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
         axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))

@@ -37,13 +37,11 @@ from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
-from jaxbundle.network.tables import STATED, UNIT, Camera, Network
+from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Progress, present
 
-SIGMA = 0.1
-"""σ of an image coordinate in pixels where none is stated: a unit of weight, which σ0 estimates."""
 ECCENTRICITY_ROUNDS = 2
 
 
@@ -75,7 +73,8 @@ def calibrate(
     - `model`, `free`: camera model, by name or a `CameraModel`, and the parameters to estimate; the
       model's standard ones by default. `given`: values of parameters, held if they are not free.
     - `pixel_size`: mm, for models in mm.
-    - `sigma_image`: a priori σ of an image coordinate, pixels; None: `SIGMA`, a unit of weight.
+    - `sigma_image`: a priori σ of an image coordinate, pixels; None: `UNSTATED_BOARD_SIGMA` as
+      a unit of weight, without a χ² test.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
       estimated. Default: the board is exact.
     - `robust`: "huber", "cauchy" or "tukey": points that fit badly are downweighted instead of
@@ -156,7 +155,7 @@ def board_network(
     board = views.board
     view, point = np.nonzero(views.visible)
     xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
-    sx, sy = (sigma_image or SIGMA) * np.array(unit_size(model, camera.pixel_size))
+    sx, sy = (sigma_image or UNSTATED_BOARD_SIGMA) * np.array(unit_size(model, camera.pixel_size))
     role = "tie" if board_free else "fixed" if board_sigma is None else "control"
     X, Y, Z = board.points.T
     points = {"id": board.ids, "role": [role] * len(X), "X": X, "Y": Y, "Z": Z}

@@ -121,7 +121,7 @@ def convert_camera(
         starts = start_values(source, values, target, sizes, r0)
         if free:
             default = default_parameters(target)
-            held = {name: default[name] for name in target.parameters if name not in free}
+            held = {name: v for name, v in default.items() if name not in free}
             starts = [{**start, **held} for start in starts]
         found = fit_parameters(target, rays, wanted, starts, free)
     length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
@@ -141,7 +141,7 @@ def convert_camera(
 def _check_defaults(found, target, free) -> None:
     """**Raises:** `NotExact` if a parameter that is not free has another value than its default."""
     default = default_parameters(target)
-    more = [n for n in target.parameters if free and n not in free and found[n] != default[n]]
+    more = [n for n, v in default.items() if free and n not in free and found[n] != v]
     if more:
         raise NotExact(f"{', '.join(more)} must keep the default")
 

@@ -55,8 +55,8 @@ def calibrate(
     ] = False,
     sigma_image: Annotated[
         float | None,
-        typer.Option(help="a priori σ of an image coordinate, pixels; default: 0.1, a unit of "
-                     "weight that no test is about"),
+        typer.Option(help="a priori σ of an image coordinate, pixels; default: 0.1 as a unit "
+                     "of weight, without a χ² test"),
     ] = None,
     snooping: Annotated[
         str, choice((*TESTS, "none"), "removal of gross errors and of rig epochs")
@@ -187,7 +187,8 @@ def calibrate(
     if failed:
         names = found.cameras[failed[0]].adjustment.undetermined
         what = f"; not determined: {', '.join(names[:12])}" if names else ""
-        more = f"; nor {count(len(failed) - 1, 'other camera')}: {', '.join(failed[1:])}"
+        others = count(len(failed) - 1, "other camera")
+        more = f"; {others} not solved either: {', '.join(failed[1:])}"
         raise NotSolvedError(
             f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
             f"{what}; free fewer parameters (--free), or take photographs from more directions"

@@ -61,9 +61,14 @@ class Problem:
         """The table of this name."""
         return next(t for t in self.tables if t.name == name)
 
-    def set(self, name: str) -> Observations:
-        """The observations of this name."""
-        return next(o for o in self.observations if o.name == name)
+    def observations_of(self, name: str) -> Observations:
+        """The set of observations of this name.
+
+        **Raises:** `KeyError`."""
+        sets = {o.name: o for o in self.observations}
+        if name not in sets:
+            raise KeyError(f"there are no observations {name!r}; known: {', '.join(sets)}")
+        return sets[name]
 
     def weights(self, name: str) -> Float[np.ndarray, "n r"]:
         """1/σ of the residuals of a set of observations, 0 without weight."""

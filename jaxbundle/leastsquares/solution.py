@@ -59,7 +59,7 @@ RETURNS, COST_TOLERANCE = 10, 1e-12
 """Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
 
 Rows = dict[str, Float[np.ndarray, "n r"]]
-"""By set of observations, in the given order."""
+"""By the name of the set, rows in the given order."""
 
 
 def find_minimum(

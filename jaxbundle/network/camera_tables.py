@@ -23,6 +23,16 @@ class CameraTable:
     cameras: Int[np.ndarray, " rows"]
     tie: tuple[tuple[str, ...], ...] = ()
 
+    @property
+    def image_set(self) -> str:
+        """The name of the set of image points of these cameras."""
+        return self.name.replace("camera", "image", 1)
+
+    @property
+    def interior_set(self) -> str:
+        """The name of the set of priors of these cameras."""
+        return self.name.replace("camera", "interior", 1)
+
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
         """The table; only parameters that are free in some camera are unknowns."""
         own = [cameras[c] for c in self.cameras]

@@ -260,17 +260,15 @@ def _observe(network: Network, data: Data, priors, cameras: tuple[CameraTable, .
         take = lambda x, rows=rows: x if rows is None or x is None else x[rows]
         motion = () if lines is None else (observations.image, camera)
         touched = observations.image, *motion, row_of_camera[camera], observations.point
-        name = t.name.replace("camera", "image", 1)
-        observe(kind, tuple(map(take, touched)), name, "image", rows, None, take(lines))
+        observe(kind, tuple(map(take, touched)), t.image_set, "image", rows, None, take(lines))
     observe(kinds.CONTROL, (priors["control"],), "control", "control")
     observe(kinds.EXTERIOR, (priors["exterior"],), "exterior", "exterior")
     for t in cameras:
         rows = np.flatnonzero(np.isin(priors["interior"], t.cameras))
         kind = kinds.interior_orientation(t.name, t.parameters)
         columns = len(t.parameters)
-        name = t.name.replace("camera", "interior", 1)
         touched = (row_of_camera[priors["interior"][rows]],)
-        observe(kind, touched, name, "interior", rows, columns)
+        observe(kind, touched, t.interior_set, "interior", rows, columns)
     observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance", "distance")
     return sets, given
 

@@ -51,7 +51,7 @@ class TurnAboutSeen:
         position, points = values["image"].position, values["point"][:, :3]
         seen = jnp.zeros((position.shape[0], 4))
         for part in plan.parts:
-            if not isinstance(self.declared.kinds[part.observations].residual, ImagePoint):
+            if not isinstance(self.declared.kinds[part.set_name].residual, ImagePoint):
                 continue
             image, point = part.lookup[0], points[part.lookup[-1]]
             centre = position[image] if part.by_row[0] else position[image][:, None]

@@ -32,6 +32,9 @@ EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 STATED, UNIT, ESTIMATED = SIGMA_ORIGINS = ("stated", "unit", "estimated")
 """Where the σ of image coordinates come from: somebody stated them; nobody did, so that they are
 units of weight; they were estimated from the residuals of the same measurements."""
+UNSTATED_BOARD_SIGMA = 0.1
+"""σ of an image coordinate of a calibration, pixels, where none is stated: a unit of weight, about
+what corners of boards have, which σ0 estimates."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,7 +39,10 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
     values = np.where(np.abs(values) < 1e-6 * (values[1] - values[0]), 0.0, values) + 0.0
     if 1e-4 <= largest < 10.0**TICK_DIGITS:
         return [f"{value:.{max(places, 0)}f}" for value in values]
-    return [_with_exponent(value, places) for value in values]
+    exponent = math.floor(math.log10(largest) + 1e-9)  # one for all ticks of an axis
+    shown = max(exponent + places, 0)
+    return [f"{value / 10.0**exponent:.{shown}f}e{exponent:+03d}" if value else "0"
+            for value in values]  # fmt: skip
 
 
 def _places(values: Float[np.ndarray, " n"]) -> int:
@@ -75,9 +78,3 @@ def label_coordinates(ax, axis: str, unit: str) -> None:
     of.set_major_formatter(WithoutOffset())
     label(ax, axis, axis.upper(), unit)
     of.set_label_text(of.get_label_text() + offset_in_words(offset))
-
-
-def _with_exponent(value: float, places: int) -> str:
-    if value == 0:
-        return "0"
-    return f"{value:.{max(math.floor(math.log10(abs(value)) + 1e-9) + places, 0)}e}"

@@ -63,7 +63,7 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     here = Solution(problem, start)
     A = _slopes(*here.given, found.shared, found.estimate)
-    real = lambda o: np.asarray(A[o])[: problem.set(o).number]
+    real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
     weight = problem.data.weight
     of_rays = lambda by_set: checks.image_by_image([np.asarray(x) for x in by_set])

@@ -179,7 +179,7 @@ def _name(declared: Declared, one) -> Removed:
     `Refinement.image_points`, others as in their sets (three per control point)."""
     given, chosen = declared.given, declared.rays.points
     names = [part.set for part in declared.parts]
-    points, set = given.points, declared.problem.set(one.set)
+    points, set = given.points, declared.problem.observations_of(one.set)
     if one.set in names:
         number = names.index(one.set)
         part = declared.parts[number]

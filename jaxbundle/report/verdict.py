@@ -179,13 +179,15 @@ def _checks(adjustment) -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
+    given = np.concatenate(adjustment.check[0].sigma.T)
+    s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))
     known = (s > 0) & np.isfinite(d)
     largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)
     limit = critical_value(adjustment, level=level_of_one(LEVEL, int(known.sum())))
     words = (
         f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
-        f"difference {significant(largest)} times the σ of its intersection, critical value "
-        f"{significant(limit)}"
+        f"difference {significant(largest)} times its σ, of intersection and given coordinates, "
+        f"critical value {significant(limit)}"
     )
     state = DOUBTFUL if largest > limit else GOOD
     brief = f"a check point {significant(largest)} σ off"
@@ -222,7 +224,7 @@ def _blunders(adjustment) -> Finding:
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
     many = over > explained_by_chance(len(tau))
-    return Finding("Blunders", NOTED if many else GOOD, words, f"{over} large residuals")
+    return Finding("Blunders", NOTED if many else GOOD, words, count(over, "large residual"))
 
 
 def explained_by_chance(number: float, level: float = LEVEL) -> float:

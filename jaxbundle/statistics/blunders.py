@@ -82,13 +82,13 @@ def _place(problem: Problem, name: str, rows):
     """Kind and rows in the arrays of that kind."""
     s = next((s for s in problem.layout.sets if s.name == name), None)
     if s is None:
-        return problem.system.set(name).kind.name, tuple(rows)
+        return problem.system.observations_of(name).kind.name, tuple(rows)
     return s.field, tuple(int(row if s.rows is None else s.rows[row]) for row in rows)
 
 
 def _name(problem: Problem, name: str, row: int, residual: int | None) -> str:
     kind, (place,) = _place(problem, name, (row,))
-    network, given = problem.network, problem.system.set(name)
+    network, given = problem.network, problem.system.observations_of(name)
     points = network.points.id
     if kind == "image":
         image = network.images.id[problem.image[place]]

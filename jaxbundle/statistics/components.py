@@ -35,7 +35,7 @@ def groups(problem: Problem) -> list[Group]:
         Group("distances", every("distance")),
     ]
     further: dict[str, list] = {}
-    for given in problem.system.observations[len(layout.sets) :]:
+    for given in map(problem.system.observations_of, layout.others):
         further.setdefault(given.kind.name, []).append((given.name, np.s_[:]))
     unit = lambda name: angle if name in OF_ANGLES else 1.0
     return found + [Group(name, parts, unit(name)) for name, parts in further.items()]

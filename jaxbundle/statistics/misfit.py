@@ -102,8 +102,8 @@ def doubt_of_unit(sigma0: float, redundancy: int, unit: str) -> str | None:
         return None
     return (
         f"no a priori σ of image coordinates was given: {unit} was assumed beside the σ of other "
-        f"observations, but σ0 is {sigma0:.3g}, so that these have a wrong weight: give "
-        "sigma_image, or estimate it (--components)"
+        f"observations, but σ0 is {sigma0:.3g}, so the other observations are wrongly weighted: "
+        "give sigma_image, or estimate it (--components)"
     )
 
 

@@ -91,6 +91,9 @@ def test_without_snooping_they_are_misfits(rigs):
     found = calibrate(np.concatenate([rigs[:4], rigs[:1], rigs[:1]]))
     assert found.status[[0, 1, 4, 5]].tolist() == ["converged"] * 4
     assert found.status[2] == found.status[3] == "misfit"
+    # Nobody stated a σ of image coordinates.
+    assert found.adjustments[0].global_test()["sigma_origin"] == "unit"
+    assert not any("χ²" in said for said in found.adjustments[0].warnings)
 
 
 def test_arrays_of_rigs_in_a_file(rigs, tmp_path):

@@ -414,7 +414,7 @@ def test_the_project_of_the_documentation(tmp_path):
     text = DOCS.read_text(encoding="utf-8")
     first, row, _ = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "project.toml").write_text(first, encoding="utf-8")
-    for name, content in re.findall(r"`(\w+\.csv)`:\n\n```csv\n(.*?)```", text, re.DOTALL):
+    for name, content in re.findall(r"`(\w+\.csv)`:\n\n```text\n(.*?)```", text, re.DOTALL):
         (tmp_path / name).write_text(content, encoding="utf-8")
     network = check_network(read_project(tmp_path, ["free=c", "sigma_image=0.003"]))
     assert network.warnings == ()

@@ -247,7 +247,7 @@ def _vtpv_of_images(problem, values):
     )
     of_images = [s.name for s in problem.layout.sets if s.field == "image"]
     return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.system.plan.parts)
-               if part.observations in of_images)  # fmt: skip
+               if part.set_name in of_images)  # fmt: skip
 
 
 def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):

@@ -87,13 +87,8 @@ class Rig:
         """The engine's results by set of image points, in the order of the rig."""
         found = np.zeros(self.xy.shape)
         for table, rows in self.sets:
-            found[rows] = by_set[image_points_of(table)]
+            found[rows] = by_set[table.image_set]
         return found
-
-
-def image_points_of(table: CameraTable) -> str:
-    """The name of the set of image points of the cameras of a table."""
-    return table.name.replace("camera", "image", 1)
 
 
 def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
@@ -115,7 +110,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
         touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
         kind = kinds.image_points(table.model, "measured", table.name, POSES)
         observations.append(
-            kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=image_points_of(table))
+            kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
     if rig.point_sigma is not None:
         every = np.arange(len(rig.points))
@@ -145,7 +140,7 @@ def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
     removed = [
-        Removed(image_points_of(table), row, None, 0.0)
+        Removed(table.image_set, row, None, 0.0)
         for table, of_set in rig.sets for row in np.flatnonzero(rays[of_set]).tolist()
     ]  # fmt: skip
     problem = without(found.problem, removed)

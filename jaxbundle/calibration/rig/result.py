@@ -16,7 +16,7 @@ from jaxbundle.bundle import tables as result_tables
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig.declare import Rig, image_points_of, used_rays
+from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
 from jaxbundle.display import print_in_one_screen
@@ -132,7 +132,7 @@ class RigCalibration:
         rows = rig.in_order
         parts = [result_tables.residual_rows(
             self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
-            rows({name: weight(name) for name in map(image_points_of, next(zip(*rig.sets)))}),
+            rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
             Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
         )]  # fmt: skip
         if rig.point_sigma is not None:
@@ -154,7 +154,7 @@ class RigCalibration:
     def removed(self) -> list[Removed]:
         """Observations removed by data snooping."""
         rig, found = self.rig, []
-        rows_of = {image_points_of(table): rows for table, rows in rig.sets}
+        rows_of = {table.image_set: rows for table, rows in rig.sets}
         for item in self.result.removed:
             if item.set == "control":
                 axis = present(item.residual)  # coordinates are tested individually

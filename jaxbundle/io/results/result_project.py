@@ -167,7 +167,7 @@ def _further(adjustment) -> list[Further]:
         if not number:
             found.append(one)
             continue
-        first, *_ = [system.set(next(names)) for _ in range(number)]
+        first, *_ = [system.observations_of(next(names)) for _ in range(number)]
         factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(one, name):

@@ -73,7 +73,7 @@ def _survey(declared, plan, data, real, moves) -> Survey:
     }  # fmt: skip
     products, squares = [], jnp.zeros(motions)
     for number, part in enumerate(plan.parts):
-        if declared.kinds[part.observations].invariant:
+        if declared.kinds[part.set_name].invariant:
             continue
         _, touches, E = differentiate(declared, plan, number, prepared, laid)
         blocks = [(J, everywhere[t.group][t.row, t.start : t.stop][:, None])

@@ -43,7 +43,7 @@ def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: La
     """½|v|² of every observation of a part, its gradient and Hessian by all directions of its
     slots, with a column of zeros at the end."""
     part = plan.parts[number]
-    kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
+    kind, widths = declared.kinds[part.set_name], widths_of(declared, plan, part)
     one = _HalfSquare(residual_of(declared, part), widths)
     return map_observations(part, kind, prepared, laid, number, one)
 

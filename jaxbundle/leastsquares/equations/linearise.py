@@ -31,7 +31,7 @@ ROWS_AT_ONCE = 1 << 16
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
     """The directions in which every slot of a part is differentiated."""
-    of = declared.kinds[part.observations].of
+    of = declared.kinds[part.set_name].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
     return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
 
@@ -46,7 +46,7 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
     each, and of its eliminated rows (None without). Columns of held unknowns are zero."""
     part = plan.parts[number]
-    kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
+    kind, widths = declared.kinds[part.set_name], widths_of(declared, plan, part)
     rows = _Rows(residual_of(declared, part), widths, part.large)
     r, found = map_observations(part, kind, prepared, laid, number, rows)
     # Computed once, not again in every loop that uses some of its columns.

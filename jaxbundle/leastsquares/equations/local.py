@@ -45,7 +45,7 @@ class LocalJacobian:
 
 def local_touch(declared: Declared, part: Part) -> int | None:
     """The touch of a part that uses few of many columns; None if there is none."""
-    kind = declared.kinds[part.observations]
+    kind = declared.kinds[part.set_name]
     if kind.local is None or not part.large:
         return None
     space = declared.spaces[kind.of[kind.local.slot]]
@@ -60,7 +60,7 @@ def differentiate_locally(
 ) -> LocalJacobian:
     """As `differentiate`, for a part that has such a touch."""
     part = plan.parts[number]
-    kind, local = declared.kinds[part.observations], declared.kinds[part.observations].local
+    kind, local = declared.kinds[part.set_name], declared.kinds[part.set_name].local
     assert local is not None
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
     measured, weight = laid.measured[number], laid.weight[number]

@@ -38,7 +38,7 @@ class Choices:
 class Share:
     """The observations that make a part; `slot`: that of the eliminated row."""
 
-    observations: str
+    set_name: str
     source: Int[np.ndarray, " share"]
     slot: int | None
 
@@ -85,7 +85,7 @@ class Grouping:
         return self.choose("stays", found=stays & table.free.any(1))
 
     def _share_observations(self):
-        """Observations of one kind, separated by the slot that touches an eliminated row."""
+        """Observations of one set, separated by the slot that touches an eliminated row."""
         shares = []
         for o, given in self.observations.items():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
@@ -139,7 +139,7 @@ class Grouping:
             return False
         met = False
         for share in self.shares:
-            given = self.observations[share.observations]
+            given = self.observations[share.set_name]
             of, rows = given.kind.of, given.rows
             if share.slot is None:
                 continue
@@ -175,7 +175,7 @@ class Grouping:
         Slots of one group are one touch if they have the same row in every observation of the
         share. This is decided for each share: tables that always meet where rows are eliminated
         may cross elsewhere, as the velocity of one image and the pose of the next."""
-        given, found = self.observations[share.observations], []
+        given, found = self.observations[share.set_name], []
         for s, name in enumerate(given.kind.of):
             if s == share.slot or name not in self.group_of:
                 continue

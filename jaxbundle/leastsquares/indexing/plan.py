@@ -83,7 +83,7 @@ class Part(eqx.Module):
     slots, one per chunk or (`by_row`) one per observation; `eliminated`: the eliminated row;
     `source`: the observation; `place`: for every observation its position in this part."""
 
-    observations: str = eqx.field(static=True)
+    set_name: str = eqx.field(static=True)
     slot: int | None = eqx.field(static=True)
     by_row: tuple[bool, ...] = eqx.field(static=True)
     large: bool = eqx.field(static=True)

@@ -98,7 +98,7 @@ class _Planner:
 
     def lay_out(self, k: int, share: Share) -> _LaidPart:
         """Part k in chunks, with its touches (couples and incidences are added later)."""
-        given = self.by.observations[share.observations]
+        given = self.by.observations[share.set_name]
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
         slots = self.by.touched_groups(k, share)
@@ -137,9 +137,9 @@ class _Planner:
         if share.slot is not None:
             at = self.by.row_in[chunk(rows[share.slot])]
             eliminated = as_index(at, along, ("group", self.by.eliminate))
-        number = ("observations", share.observations)
+        number = ("observations", share.set_name)
         made = Part(
-            observations=share.observations, slot=share.slot, by_row=tuple(by_row),
+            set_name=share.set_name, slot=share.slot, by_row=tuple(by_row),
             large=large, lookup=tuple(lookup), eliminated=eliminated,
             source=as_index(source, along, number), place=as_index(place, number, along, length),
             touches=tuple(touches), couples=(),

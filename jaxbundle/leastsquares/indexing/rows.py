@@ -67,8 +67,8 @@ def lay_out_data(plan: Plan, data: Data) -> Laid:
     """The measurements, looked up once per solution."""
     of = lambda rows, part: look_up(scalars(rows), part.source)
     return Laid(
-        tuple(of(data.measured[part.observations], part) for part in plan.parts),
-        tuple(of(data.weight[part.observations], part) for part in plan.parts),
+        tuple(of(data.measured[part.set_name], part) for part in plan.parts),
+        tuple(of(data.weight[part.set_name], part) for part in plan.parts),
     )
 
 
@@ -133,7 +133,7 @@ class Residual:
 
 def residual_of(declared: Declared, part: Part) -> Residual:
     """The residuals of one observation of a part."""
-    kind = declared.kinds[part.observations]
+    kind = declared.kinds[part.set_name]
     return Residual(kind, tuple(declared.spaces[name] for name in kind.of))
 
 
@@ -211,18 +211,18 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     """Residuals divided by σ of every part, [chunks, length, r]."""
     prepared, found = prepare(declared, values), []
     for number, part in enumerate(plan.parts):
-        kind = declared.kinds[part.observations]
+        kind = declared.kinds[part.set_name]
         rows = map_observations(part, kind, prepared, laid, number, residual_of(declared, part))
         found.append(jnp.stack(rows, -1))
     return tuple(found)
 
 
 def restore_order(plan: Plan, parts) -> dict[str, Float[Array, "n ..."]]:
-    """Quantities by observation of every part, rearranged by set of observations in the given
+    """Quantities by observation of every part, by the name of its set, rows in the given
     order."""
     found: dict[str, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]
-        known = found.get(part.observations)
-        found[part.observations] = flat if known is None else known + flat
+        known = found.get(part.set_name)
+        found[part.set_name] = flat if known is None else known + flat
     return found

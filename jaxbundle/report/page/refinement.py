@@ -5,7 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
+from jaxbundle.leastsquares.quality.distributions import (
+    level_of_one,
+    normal_quantile,
+    tau_quantile,
+)
 from jaxbundle.network.columns import count
 from jaxbundle.refinement import UNIT_OF_WEIGHT, point_rows
 from jaxbundle.report.layout import estimate, significant
@@ -24,7 +28,7 @@ from jaxbundle.report.verdict import (
     describe_reliability,
     judge_fit,
 )
-from jaxbundle.statistics.global_test import describe_test
+from jaxbundle.statistics.global_test import describe_test, is_tested
 
 KIND = "refinement of scanner images"
 MOST_CORRELATED = 40
@@ -78,12 +82,14 @@ def _image_points(result) -> list[dict]:
 
 def _judge(result, used, w) -> list[Finding]:
     found = result.global_test()
-    # As many tests as coordinates; σ a priori only where they were stated.
-    size = np.abs(w) if found["passed"] else np.abs(w) / result.sigma0
+    # As many tests as coordinates: Baarda's w with σ that were stated, else Pope's τ.
+    stated = is_tested(result.redundancy, found["sigma_origin"])
+    size = np.abs(w) if stated else np.abs(w) / result.sigma0
     largest = float(np.fmax.reduce(size, initial=np.nan))
-    limit = normal_quantile(1 - level_of_one(LEVEL, len(w)) / 2)
+    probability = 1 - level_of_one(LEVEL, len(w)) / 2
+    limit = normal_quantile(probability) if stated else tau_quantile(probability, result.redundancy)
     blunders = (
-        f"largest |{'w' if found['passed'] else 'w/σ0'}| {significant(largest)}, critical value of "
+        f"largest |{'w' if stated else 'τ'}| {significant(largest)}, critical value of "
         f"{count(len(w), 'coordinate')} at {100 * LEVEL:g} % {significant(limit)}; "
         f"{len(result.removed)} removed by data snooping"
     )
@@ -101,7 +107,8 @@ def _judge(result, used, w) -> list[Finding]:
         limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)
         rms = ", ".join(significant(value) for value in check.rms)
         words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
-                 f"difference {significant(largest)} times its σ")  # fmt: skip
+                 f"difference {significant(largest)} times its σ, critical value "
+                 f"{significant(limit)}")  # fmt: skip
         findings.append(Finding("Check points", DOUBTFUL if largest > limit else GOOD, words))
     return findings
 
