@@ -16,19 +16,22 @@ from jaxbundle.calibration.report import (
     rig_facts,
     rig_parameter_rows,
 )
-from jaxbundle.calibration.verdict import WITHOUT, coverage_in_words, cross_validation_in_words
+from jaxbundle.calibration.verdict import (
+    WITHOUT,
+    conclude_calibrations,
+    coverage_in_words,
+    cross_validation_in_words,
+)
 from jaxbundle.calibration.verdict import find as find_own
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import (
     UNKNOWN,
     Addition,
-    Finding,
     Listing,
     Origin,
     Page,
     Section,
     compose,
-    find,
     give_verdict,
     write,
 )
@@ -38,7 +41,6 @@ from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
 from jaxbundle.report.page.overview import list_messages
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
-from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, in_words
 
 KIND = "calibration of cameras"
 
@@ -138,22 +140,11 @@ def _models(choice) -> Section:
 
 
 def _describe_several(found, origin: Origin) -> Page:
-    """The common page: one finding per camera, the rig, the parameters of all."""
-    findings, sections, tables = [], [], {"cameras": _table_of_cameras(found)}
-    for name, one in found.cameras.items():
-        if not one.converged:
-            said = BAD, f"not solved: {one.adjustment.termination}"
-        else:
-            also = _describe_one(one)
-            warnings = (*also.warnings, *one.adjustment.warnings)
-            said = in_words(find(one.adjustment, also), len(warnings))
-        findings.append(Finding(f"Camera {name}", *said))
+    """The common page: the verdict, the rig, the parameters of all."""
+    sections, tables = [], {"cameras": _table_of_cameras(found)}
     rig = found.rig
     if rig is not None:
         unit = _unit(next(iter(rig.cameras.values())))
-        state = DOUBTFUL if rig.left_out or rig.contradicting or not rig.converged else GOOD
-        words = f"{len(rig.epochs)} epochs, {len(rig.left_out)} left out, σ0 {rig.sigma0:.4f}"
-        findings.append(Finding("Rig", state, words))
         sections += [_rig(rig, unit)]
         for number, name in enumerate(rig.names):
             maps = rig.reported_maps(name)
@@ -168,7 +159,7 @@ def _describe_several(found, origin: Origin) -> Page:
                 sections.append(_quality(one.coverage, maps, _unit(one), name, number))
     more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
-    first = give_verdict(findings, (), more)
+    first = give_verdict(conclude_calibrations(found).findings, (), more)
     return Page(title, [first, *sections], origin, tables=tables)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxbundle.calibration.verdict import (
     conclude_calibration,
+    conclude_calibrations,
     coverage_in_words,
     cross_validation_in_words,
 )
@@ -274,6 +275,14 @@ def _mapping_error_dict(error) -> dict | None:
 def _rig_quality(rig, name: str) -> dict:
     return {"coverage": _coverage_dict(rig.coverage(name)),
             "uncertainty": _maps_dict(rig.reported_maps(name))}  # fmt: skip
+
+
+def several_text(found) -> str:
+    """The verdict on several cameras, and what it follows from."""
+    _, words, findings = conclude_calibrations(found)
+    rows = [("Verdict", words), *((clean(one.about), one.words) for one in findings)]
+    lines = [f"Calibration of {len(found.cameras)} cameras", "=" * 100, *facts(rows)]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
 def rig_text(rig) -> str:

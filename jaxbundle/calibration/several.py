@@ -28,13 +28,12 @@ class Calibrations:
         return all(one.converged for one in self.cameras.values())
 
     def report(self) -> str:
-        """The reports of all cameras, preceded by that of the rig."""
-        from jaxbundle.calibration.report import rig_text
+        """The verdict on several cameras, the report of their rig, and those of all cameras."""
+        from jaxbundle.calibration.report import rig_text, several_text
 
-        parts = [one.report() for one in self.cameras.values()]
-        if self.rig is not None:
-            parts.insert(0, rig_text(self.rig))
-        return "\n\n".join(parts)
+        parts = [] if len(self.cameras) == 1 else [several_text(self)]
+        parts += [] if self.rig is None else [rig_text(self.rig)]
+        return "\n\n".join([*parts, *(one.report() for one in self.cameras.values())])
 
 
 def _tell(progress: Progress, name: str, stage: str, done: int, total: int) -> None:

@@ -1,7 +1,7 @@
 """The verdict on a calibration: that of its adjustment, with coverage and cross-validation."""
 
 from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
-from jaxbundle.report.verdict import DOUBTFUL, GOOD, Finding, Verdict, conclude
+from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Finding, Verdict, conclude, in_words
 
 WITHOUT = ("Control",)
 """Findings of the adjustment that do not apply to a board."""
@@ -12,6 +12,27 @@ def conclude_calibration(calibration) -> Verdict:
     return conclude(
         calibration.adjustment, find(calibration), WITHOUT, len(calibration.shortcomings)
     )
+
+
+def conclude_calibrations(found) -> Verdict:
+    """The verdict on several cameras (`Calibrations`): a finding for each, and for their rig."""
+    findings = [_judge_camera(name, one) for name, one in found.cameras.items()]
+    if found.rig is not None:
+        findings.append(_judge_rig(found.rig))
+    return Verdict(*in_words(findings, 0), tuple(findings))
+
+
+def _judge_camera(name: str, calibration) -> Finding:
+    about = f"Camera {name}"
+    if not calibration.converged:
+        return Finding(about, BAD, f"not solved: {calibration.adjustment.termination}")
+    return Finding(about, *conclude_calibration(calibration)[:2])
+
+
+def _judge_rig(rig) -> Finding:
+    doubtful = rig.left_out or rig.contradicting or not rig.converged
+    words = f"{len(rig.epochs)} epochs, {len(rig.left_out)} left out, σ0 {rig.sigma0:.4f}"
+    return Finding("Rig", DOUBTFUL if doubtful else GOOD, words)
 
 
 def find(calibration) -> list[Finding]:

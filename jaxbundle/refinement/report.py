@@ -60,8 +60,9 @@ def _points(result):
     return rows
 
 
-def report(result: Refinement) -> str:
-    """The report: input, warnings, unknowns, correlations, blunders, checks."""
+def report(result: Refinement, verdict: str = "") -> str:
+    """The report: the `verdict` if given, input, warnings, unknowns, correlations, blunders,
+    checks."""
     found = result.inspection
     rows = result.image_points()
     used = [row for row in rows if not row["removed"]]
@@ -71,6 +72,7 @@ def report(result: Refinement) -> str:
     lines = [
         "Refinement of scanner images",
         "",
+        *([f"verdict          {verdict}"] if verdict else []),
         f"scanner images   {len(result.images)}, photographs {frames}",
         f"points           {counts}; {len(used)} image points",
         f"sigma0           {result.sigma0:.4f}   redundancy {result.redundancy}, "

@@ -269,8 +269,11 @@ def test_what_only_the_mounting_shows_is_removed(flawed):
     without = leave_out(rig, adjust_rig(rig), rays)
     assert found.sigma0 == pytest.approx(without.sigma0 / 0.1, rel=1e-9)
     np.testing.assert_allclose(mounting.base, base_of(without)[0], atol=1e-9)
-    text = rig_text(found)
-    document = calibrations_dict(dataclasses.replace(flawed, rig=found))["rig"]
+    both = dataclasses.replace(flawed, rig=found)
+    text, document = rig_text(found), calibrations_dict(both)
+    assert document["verdict"]["state"] == "doubtful"
+    assert document["verdict"]["words"] in " ".join(both.report()[:1000].split())
+    document = document["rig"]
     assert "Data snooping: removed observations" in text and all(name in text for name in said)
     assert {item["name"] for item in document["removed"]} == said
     assert len(document["residuals"]) == len(tested["tau"])

@@ -100,6 +100,8 @@ def test_the_command_writes_what_locate_reads(folder):
     for words in ("refine.toml", "computed 20", "jaxbundle"):
         assert words in plain.splitlines()[0] and words in "".join(Page(text).texts["p"])
     assert Page(text).texts["h2"][0] == "Verdict"
+    assert f"verdict          {result['verdict']['words']}" in plain
+    assert result["verdict"]["words"] in "".join(Page(text).texts["p"])
     v = np.array([row["v"] for row in result["image_points"]])
     np.testing.assert_allclose(column(text, "observations", "v").reshape(-1, 2), v, rtol=1e-6)
     assert set(column(text, "observations", "axis")) == {"line", "pixel"}

@@ -35,7 +35,7 @@ def refine(
     )
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project
-    from jaxbundle.io.results.result_json import without_nan
+    from jaxbundle.io.results.result_json import verdict_dict, without_nan
     from jaxbundle.io.scanner.refinement import read_refinement
     from jaxbundle.io.scanner.writing import names_of, write_scanner_image
     from jaxbundle.io.text.csv_tables import write_csv, write_text
@@ -44,6 +44,7 @@ def refine(
     from jaxbundle.refinement import refine as refine_images
     from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
+    from jaxbundle.report.refinement import conclude_refinement
 
     file = read_refinement(input)
     names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
@@ -60,7 +61,9 @@ def refine(
         snooping=file.snooping, significance=file.significance,
     )  # fmt: skip
     result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
-    text, document = head_line(origin) + report(result), without_nan(to_json(result))
+    verdict = conclude_refinement(result)
+    text = head_line(origin) + report(result, verdict.words)
+    document = without_nan({"verdict": verdict_dict(verdict), **to_json(result)})
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     page = partial(compose_refinement, result, origin)
     with write_result(json, as_json, out, "pushbroom refine", names, force, html, page) as new:

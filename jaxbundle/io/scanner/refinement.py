@@ -218,10 +218,17 @@ def _observations(table, ids, images, section, where) -> Observations:
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
     given = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
+    lacking = np.isnan(given)
+    if not stated and lacking.any() and not lacking.all():
+        row = int(lacking.any(1).argmax())
+        raise InputError(
+            f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
+            f"sigma in [{section.title}] for those without"
+        )
     return Observations(
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
         table.indices("point", "point", ids, section.text("points")),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(np.isnan(given), sigma, given), table.source,
-        STATED if stated or not np.isnan(given).any() else UNIT,
+        np.where(lacking, sigma, given), table.source,
+        STATED if stated or not lacking.any() else UNIT,
     )  # fmt: skip

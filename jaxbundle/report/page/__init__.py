@@ -10,7 +10,6 @@ calibrations, reconstructions and batches declare theirs in their subpackages.
 from jaxbundle.report.page.adjustment import Addition as Addition
 from jaxbundle.report.page.adjustment import compose as compose
 from jaxbundle.report.page.adjustment import compose_failure as compose_failure
-from jaxbundle.report.page.adjustment import find as find
 from jaxbundle.report.page.document import Listing as Listing
 from jaxbundle.report.page.document import Page as Page
 from jaxbundle.report.page.document import Section as Section

@@ -84,20 +84,14 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
         first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
         return Page(title, [first, *also.sections], origin, settings, also.tables)
     noted = list_messages("Notes", adjustment.notes)
-    first = give_verdict(
-        find(adjustment, also), warnings, also.overview, noted, *_whole(adjustment)
-    )
+    findings = also.conclude(adjustment).findings
+    first = give_verdict(findings, warnings, also.overview, noted, *_whole(adjustment))
     drawings: dict[str, Any] = {
         "network-data": describe_network(adjustment), "frames": describe_frames(adjustment)
     }  # fmt: skip
     shown = [first, *also.sections, *sections.collect(adjustment)]
     tables = {**also.tables, **collect_tables(adjustment)}
     return Page(title, shown, origin, settings, tables, drawings)
-
-
-def find(adjustment, also: Addition = ALONE) -> list[Finding]:
-    """The findings of a solved adjustment, those of an addition first."""
-    return list(also.conclude(adjustment).findings)
 
 
 def _whole(adjustment) -> list[str]:

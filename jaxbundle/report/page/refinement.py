@@ -5,14 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.quality.distributions import (
-    level_of_one,
-    normal_quantile,
-    tau_quantile,
-)
 from jaxbundle.network.columns import count
-from jaxbundle.refinement import UNIT_OF_WEIGHT, point_rows
-from jaxbundle.report.layout import estimate, significant
+from jaxbundle.refinement import point_rows
+from jaxbundle.report.layout import estimate
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
 from jaxbundle.report.page.markup import facts, grid
@@ -20,15 +15,7 @@ from jaxbundle.report.page.origin import UNKNOWN, Origin
 from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
-from jaxbundle.report.verdict import (
-    DOUBTFUL,
-    GOOD,
-    LEVEL,
-    Finding,
-    describe_reliability,
-    judge_fit,
-)
-from jaxbundle.statistics.global_test import describe_test, is_tested
+from jaxbundle.report.refinement import conclude_refinement
 
 KIND = "refinement of scanner images"
 MOST_CORRELATED = 40
@@ -45,7 +32,8 @@ def _describe(result, origin: Origin) -> Page:
     found = _image_points(result)
     used = [row for row in found if not row["removed"]]
     w = np.concatenate([row["w"] for row in used])
-    first = give_verdict(_judge(result, used, w), result.warnings, _whole(result, used))
+    findings = conclude_refinement(result).findings
+    first = give_verdict(findings, result.warnings, _whole(result, used))
     sections = [first, photographs("w"), _unknowns(result), show_residuals(w, "w")]
     tables = {
         "images": Listing("Images", _images(result, used), "result.json"),
@@ -78,39 +66,6 @@ def _image_points(result) -> list[dict]:
         row | {"measured": at, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
         for row, at in zip(result.image_points(), measured)
     ]
-
-
-def _judge(result, used, w) -> list[Finding]:
-    found = result.global_test()
-    # As many tests as coordinates: Baarda's w with σ that were stated, else Pope's τ.
-    stated = is_tested(result.redundancy, found["sigma_origin"])
-    size = np.abs(w) if stated else np.abs(w) / result.sigma0
-    largest = float(np.fmax.reduce(size, initial=np.nan))
-    probability = 1 - level_of_one(LEVEL, len(w)) / 2
-    limit = normal_quantile(probability) if stated else tau_quantile(probability, result.redundancy)
-    blunders = (
-        f"largest |{'w' if stated else 'τ'}| {significant(largest)}, critical value of "
-        f"{count(len(w), 'coordinate')} at {100 * LEVEL:g} % {significant(limit)}; "
-        f"{len(result.removed)} removed by data snooping"
-    )
-    likely = f"{count(int((size > limit).sum()), 'blunder')} likely"
-    findings = [
-        judge_fit(found, describe_test(found, UNIT_OF_WEIGHT), result.sigma0,
-                  bool(np.isfinite(result.prior_sigma).any()), result.redundancy),
-        describe_reliability(np.concatenate([row["r"] for row in used]), "coordinate"),
-        Finding("Blunders", DOUBTFUL if largest > limit else GOOD, blunders, likely),
-    ]
-    check = result.check
-    if check is not None:
-        ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
-        largest = np.fmax.reduce(ratio, initial=np.nan)
-        limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)
-        rms = ", ".join(significant(value) for value in check.rms)
-        words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
-                 f"difference {significant(largest)} times its σ, critical value "
-                 f"{significant(limit)}")  # fmt: skip
-        findings.append(Finding("Check points", DOUBTFUL if largest > limit else GOOD, words))
-    return findings
 
 
 def _whole(result, used) -> str:
