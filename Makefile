@@ -62,6 +62,7 @@ $(VENV)/installed-demo: pyproject.toml
 test: CASES = -m 'not further'
 test test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
+	$(BIN)/python -m ruff format --check --quiet jaxbundle
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
 

@@ -41,8 +41,9 @@ def integer(name: str, value: Any, least: int = 1, most: int = LARGEST_INTEGER) 
         number = least - 1
     if not least <= number <= most:
         last = "10⁹" if most == LARGEST_INTEGER else most
-        raise InputError(f"{name} must be a whole number from {least} to {last}, but is "
-                         f"{show(value)}")  # fmt: skip
+        raise InputError(
+            f"{name} must be a whole number from {least} to {last}, but is {show(value)}"
+        )
     return number
 
 

@@ -45,10 +45,11 @@ CAMERA_FILES = (
 AIMS = ("mean", "worst", "determinant", "reliability")
 """Measures of σ that a design minimises."""
 ORDERS = {
-    "zero": "zero order: the datum", "first": "first order: the configuration",
+    "zero": "zero order: the datum",
+    "first": "first order: the configuration",
     "second": "second order: the weights of photographs",
     "third": "third order: further photographs",
-}  # fmt: skip
+}
 """Problems of design, with their names."""
 DESIGNED = ("position", "direction", "roll", "targets")
 """Variables of a first-order design."""

@@ -39,8 +39,10 @@ def _as_printed(say: Callable[[Any], str]) -> Callable[[Any], str]:
 def describe(value: Any) -> str:
     """One screen about a result: what its class says of it, else its fields in short."""
     if type(value).__str__ is not object.__str__:
-        lines = [line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"
-                 for line in str(value).splitlines()]  # fmt: skip
+        lines = [
+            line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"
+            for line in str(value).splitlines()
+        ]
     else:
         fields = [f for f in dataclasses.fields(value) if f.repr]
         lines = [f"  {f.name}={abbreviate(getattr(value, f.name))}," for f in fields]

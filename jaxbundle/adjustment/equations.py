@@ -32,9 +32,7 @@ def design_matrix(
     system, layout = problem.system, problem.layout
     data = problem.data if data is None else data
     tables = layout.tables(values)
-    places = [
-        (t, row, column) for t in system.tables for row, column in zip(*np.nonzero(t.free))
-    ]  # fmt: skip
+    places = [(t, row, column) for t in system.tables for row, column in zip(*np.nonzero(t.free))]
     still, unravel = ravel_pytree(
         {t.name: jnp.zeros((t.rows, t.space.width)) for t in system.tables}
     )

@@ -130,9 +130,7 @@ class Problem:
         """The same problem with other data (except start values that define the datum)."""
         return self._with(engine.with_data(self.system, self.layout.data(data)), data)
 
-    def hold(
-        self, table: str, rows, columns: slice | Sequence[int] = slice(None)
-    ) -> "Problem":
+    def hold(self, table: str, rows, columns: slice | Sequence[int] = slice(None)) -> "Problem":
         """The same problem with some unknowns held at their start values."""
         return self._with(engine.hold(self.system, table, rows, columns), self.data)
 
@@ -147,7 +145,9 @@ class Problem:
 
 
 def make_problem(
-    network: Network, *, reduction: str | None = None,
+    network: Network,
+    *,
+    reduction: str | None = None,
     also: Sequence[Table | Observations] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> Problem:
@@ -173,10 +173,14 @@ def make_problem(
     declared = declare(network, origin, also, lengths)
     try:
         system = engine.make_problem(
-            declared.tables, declared.observations, "point", motions=declared.motions,
+            declared.tables,
+            declared.observations,
+            "point",
+            motions=declared.motions,
             datum=lambda gauge: _datum(network, gauge, declared.origin, chosen),
-            reduction=reduction, retraction=TurnAboutSeen,
-        )  # fmt: skip
+            reduction=reduction,
+            retraction=TurnAboutSeen,
+        )
     except CannotHold as error:
         raise InputError(
             f"the {int(chosen.sum())} datum points cannot fix the datum, of which "
@@ -206,13 +210,13 @@ def _datum(network: Network, gauge, origin, chosen):
         raise InputError(
             f"the datum is not fixed: the observations leave open {words}"
             f" ({gauge.shape[1]} of 7). Give control points or distances, or choose datum = "
-            "\"inner\" or \"minimal\"."
+            '"inner" or "minimal".'
         )
     sized = [one for one in among(network) if one.has_size]
     if sized and np.abs(gauge[SEVEN.index("scale")]).max() > HELD:
         raise InputError(
             f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
-            "network a scale: add a distance or control points, or write \"exact\" (no σ)"
+            'network a scale: add a distance or control points, or write "exact" (no σ)'
         )
     return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
 
@@ -224,11 +228,15 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
     for s in layout.sets:
         number[s.field] += int((np.asarray(system.data.weight[s.name]) > 0).sum())
     return Counts(
-        observations=number["image"], control=number["control"], exterior=number["exterior"],
-        interior=number["interior"], distances=number["distance"],
-        other=system.counts.observations - sum(number.values()), datum=system.counts.datum,
+        observations=number["image"],
+        control=number["control"],
+        exterior=number["exterior"],
+        interior=number["interior"],
+        distances=number["distance"],
+        other=system.counts.observations - sum(number.values()),
+        datum=system.counts.datum,
         unknowns=system.counts.unknowns,
-    )  # fmt: skip
+    )
 
 
 def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:

@@ -43,9 +43,13 @@ def solve(
     one_of("method", method, METHODS)
     data = problem.data if data is None else data
     tables = derivatives.solve(
-        problem.system, problem.layout.data(data), sensitivity=sensitivity,
-        max_iterations=max_iterations, atol=atol, search=SEARCHES[method],
-    )  # fmt: skip
+        problem.system,
+        problem.layout.data(data),
+        sensitivity=sensitivity,
+        max_iterations=max_iterations,
+        atol=atol,
+        search=SEARCHES[method],
+    )
     return problem.layout.values(tables)
 
 

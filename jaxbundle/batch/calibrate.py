@@ -143,10 +143,13 @@ def calibrate_batch(
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
     """The rows of the cameras of a portion, views at their original positions."""
     views, points = shape
-    rows = {name: values[: len(portion.cameras)] for name, values in solved.items()
-            if name not in OF_A_START}  # fmt: skip
+    rows = {
+        name: values[: len(portion.cameras)]
+        for name, values in solved.items()
+        if name not in OF_A_START
+    }
     camera = np.arange(len(portion.cameras))[:, None]
-    for name in ({"views", "removed", *OF_A_VIEW} & {*rows}):
+    for name in {"views", "removed", *OF_A_VIEW} & {*rows}:
         values = rows[name] if name != "removed" else rows[name][:, :, :points]
         rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
         rows[name][camera, portion.views] = values[:, : portion.views.shape[1]]
@@ -210,17 +213,31 @@ def _snoop(
     failed = np.zeros(len(weight), int)
     for _ in range(ROUNDS):
         used = np.stack([camera.used for camera in found]).astype(float)
-        tests = np.asarray(_tests_program(
-            model, free, on_cpu, portion.seen, used, rows["interior"], rows["quaternion"],
-            rows["shift"], rows["views"],
-        ))  # fmt: skip
+        tests = np.asarray(
+            _tests_program(
+                model,
+                free,
+                on_cpu,
+                portion.seen,
+                used,
+                rows["interior"],
+                rows["quaternion"],
+                rows["shift"],
+                rows["views"],
+            )
+        )
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
         failed += rows["status"] != CONVERGED
-        open_ones = np.array([
-            i for i in open_ones
-            if tested[i] and failed[i] <= MOST_FAILED
-            and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
-        ], int)  # fmt: skip
+        open_ones = np.array(
+            [
+                i
+                for i in open_ones
+                if tested[i]
+                and failed[i] <= MOST_FAILED
+                and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
+            ],
+            int,
+        )
         if not len(open_ones):
             break
         left = np.zeros_like(weight)
@@ -253,9 +270,18 @@ def _tests_program(model, free, on_cpu, seen, used, interior, quaternion, shift,
 def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
     """The rows of a `BatchCalibration`, with the status as its number."""
     result = _portion_program(
-        model, free, known, portion.flat, on_cpu, max_steps, size,
-        portion.seen, portion.interior, portion.axes, portion.middle,
-    )  # fmt: skip
+        model,
+        free,
+        known,
+        portion.flat,
+        on_cpu,
+        max_steps,
+        size,
+        portion.seen,
+        portion.interior,
+        portion.axes,
+        portion.middle,
+    )
     return jax.tree.map(np.array, result)
 
 

@@ -111,9 +111,15 @@ def calibrate_rigs(
     points = numeric_array("object_points", object_points, "numbers [points, 3]").astype(float)
     sections = {"rolling_shutter": rolling_shutter, "rig": rig}
     settings = rig_settings(
-        model, free, {name: given for name, given in sections.items() if given is not None},
-        pixel_size, sigma_image, max_iterations, snooping, significance,
-    )  # fmt: skip
+        model,
+        free,
+        {name: given for name, given in sections.items() if given is not None},
+        pixel_size,
+        sigma_image,
+        max_iterations,
+        snooping,
+        significance,
+    )
     if visible is not None:
         expected = "true or false [rigs, cameras, epochs, points]"
         visible = numeric_array("visible", visible, expected, truths=True)
@@ -128,10 +134,15 @@ def calibrate_rigs(
 
 
 def rig_settings(
-    model: str | CameraModel, free, sections: Mapping[str, Any], pixel_size=None,
-    sigma_image: float | None = None, max_iterations: int = 100, snooping: str | None = None,
+    model: str | CameraModel,
+    free,
+    sections: Mapping[str, Any],
+    pixel_size=None,
+    sigma_image: float | None = None,
+    max_iterations: int = 100,
+    snooping: str | None = None,
     significance: float = 0.001,
-) -> RigSettings:  # fmt: skip
+) -> RigSettings:
     """Checked settings.
 
     **Raises:** `InputError`."""
@@ -158,10 +169,15 @@ def rig_settings(
     if found.unit == "mm" and size is None:
         raise InputError(f"model {found.name!r} is in mm: give the size of a pixel (--pixel-size)")
     return RigSettings(
-        found, free_parameters(found, free), size, dict(sections),
+        found,
+        free_parameters(found, free),
+        size,
+        dict(sections),
         None if sigma_image is None else positive("sigma_image", sigma_image),
-        integer("max_iterations", max_iterations), snooping, significance,
-    )  # fmt: skip
+        integer("max_iterations", max_iterations),
+        snooping,
+        significance,
+    )
 
 
 def rigs_of_arrays(points, xy, image_size, visible=None, cameras=None) -> list[Rig]:
@@ -189,8 +205,10 @@ def check_rigs(
 
     **Raises:** `InputError`."""
     if xy.ndim != 5 or xy.shape[4] != 2 or not all(xy.shape):
-        raise InputError("image_points of rigs must have the shape [rigs, cameras, epochs, points, "
-                         f"2], but has {xy.shape}")  # fmt: skip
+        raise InputError(
+            "image_points of rigs must have the shape [rigs, cameras, epochs, points, "
+            f"2], but has {xy.shape}"
+        )
     rigs, number, _, of, _ = xy.shape
     if points.shape not in ((of, 3), (rigs, of, 3)):
         raise InputError(
@@ -198,8 +216,9 @@ def check_rigs(
             f"has {of} points a view, but has {points.shape}"
         )
     if visible is not None and visible.shape != xy.shape[:4]:
-        raise InputError(f"visible must have the shape {xy.shape[:4]} of image_points, but has "
-                         f"{visible.shape}")  # fmt: skip
+        raise InputError(
+            f"visible must have the shape {xy.shape[:4]} of image_points, but has {visible.shape}"
+        )
     size = numeric_array("image_size", image_size, "columns and rows in pixels").astype(float)
     if size.shape not in ((2,), (number, 2)) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(

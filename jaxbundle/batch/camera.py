@@ -23,15 +23,25 @@ from jaxbundle.leastsquares.iterations.loop import iterate
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
 STATUS = (
-    "converged", "iteration limit", "singular", "not finite", "too few points", "weak", "misfit"
-)  # fmt: skip
+    "converged",
+    "iteration limit",
+    "singular",
+    "not finite",
+    "too few points",
+    "weak",
+    "misfit",
+)
 CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK, MISFIT = range(7)
 SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
 """Statuses of cameras that have values."""
 MEANING = {
-    stopping.LIMIT: LIMIT, stopping.SETTLED: CONVERGED, stopping.RELATIVE_COST: CONVERGED,
-    stopping.SINGULAR: SINGULAR, stopping.STUCK: LIMIT, stopping.NOT_FINITE: NOT_FINITE,
-}  # fmt: skip
+    stopping.LIMIT: LIMIT,
+    stopping.SETTLED: CONVERGED,
+    stopping.RELATIVE_COST: CONVERGED,
+    stopping.SINGULAR: SINGULAR,
+    stopping.STUCK: LIMIT,
+    stopping.NOT_FINITE: NOT_FINITE,
+}
 """The status of a camera by termination."""
 
 TOLERANCE = 1e-5
@@ -84,15 +94,27 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
 
     few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
-        linearise, change, lambda at, d: retract(free, at, *d), start, lambda _: tolerance,
-        max_steps, ~few,
-    )  # fmt: skip
+        linearise,
+        change,
+        lambda at, d: retract(free, at, *d),
+        start,
+        lambda _: tolerance,
+        max_steps,
+        ~few,
+    )
     factor = factorise(loop.equations, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
     status = jnp.where(few, TOO_FEW, meaning[loop.termination])
     lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
     return Solved(
-        loop.trial, loop.cost, Q_interior, Q_pose, factor.reduced, redundancy, views,
-        jnp.where(lost, SINGULAR, status), loop.steps,
-    )  # fmt: skip
+        loop.trial,
+        loop.cost,
+        Q_interior,
+        Q_pose,
+        factor.reduced,
+        redundancy,
+        views,
+        jnp.where(lost, SINGULAR, status),
+        loop.steps,
+    )

@@ -68,6 +68,9 @@ def _connected(keys) -> bool:
     sets = {name: {*k} for name, k in keys.items()}
     reached = [next(iter(sets))]
     for name in reached:
-        reached += [other for other in sets if other not in reached
-                    and len(sets[name] & sets[other]) >= FEWEST]  # fmt: skip
+        reached += [
+            other
+            for other in sets
+            if other not in reached and len(sets[name] & sets[other]) >= FEWEST
+        ]
     return len(reached) == len(sets)

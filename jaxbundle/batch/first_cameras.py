@@ -89,9 +89,14 @@ def first_cameras(
     for name, wanted, start in tried:
         X = points[left] if points.ndim == 3 else points
         batch = calibrate_batch(
-            X, xy[left], image_size, model=name, free=wanted, start=start,
+            X,
+            xy[left],
+            image_size,
+            model=name,
+            free=wanted,
+            start=start,
             threads=threads,
-        )  # fmt: skip
+        )
         found |= {int(i): FirstCamera(batch, row) for row, i in enumerate(left)}
         left = left[~batch.solved]
         if not len(left):
@@ -148,9 +153,10 @@ def parameters_of(
     sign = -1 if model.own_formula == "to_ideal" else 1
     parameters = {"c": c, "x0": x0, "y0": y0, "K1": sign * found["k1"] / c**2}
     parameters = {
-        name: value for name, value in parameters.items()
+        name: value
+        for name, value in parameters.items()
         if name in free or name in model.principal_distance
-    }  # fmt: skip
+    }
     if "format_factor" in model.parameters:
         # the radial polynomial is zero at 100/F: in the corners of the image
         diagonal = np.hypot(*(np.array(image_size) * (width, height)))
@@ -169,13 +175,21 @@ def _fit(first, xy, image_size, model, free, pixel_size, given) -> dict[str, flo
     for area in [None, *areas] if model.prior else areas:
         try:
             cost = convert_camera(
-                first.model, first.interior, model, image_size=image_size, pixel_size=pixel_size,
-                area=area, free=wanted,
-            )  # fmt: skip
+                first.model,
+                first.interior,
+                model,
+                image_size=image_size,
+                pixel_size=pixel_size,
+                area=area,
+                free=wanted,
+            )
         except ValueError as error:
             problem = error
         else:
             return dict(cost.parameters)
-    hint = "choose a larger field of view" if "spline" in model.name else (
-        "start with fewer parameters (free), or give values (given)")  # fmt: skip
+    hint = (
+        "choose a larger field of view"
+        if "spline" in model.name
+        else ("start with fewer parameters (free), or give values (given)")
+    )
     raise NotSolvedError(f"not solved: no start values of model {model.name!r}: {problem}; {hint}")

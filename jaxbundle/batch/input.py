@@ -142,16 +142,24 @@ class Batch:
         seen = np.any(visible, axis=1)
         X = np.where(seen[..., None], X, 0.0)
         xy = np.where(visible[..., None], xy, 0.0)
-        finite = np.all([
-            np.all(_usable(numbers), axis=tuple(range(1, numbers.ndim)))
-            for numbers in (X, xy, interior)
-        ], axis=0)  # fmt: skip
+        finite = np.all(
+            [
+                np.all(_usable(numbers), axis=tuple(range(1, numbers.ndim)))
+                for numbers in (X, xy, interior)
+            ],
+            axis=0,
+        )
         X[~finite], xy[~finite] = 0.0, 0.0
         return cls(
-            finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,
-            free=tuple(model.parameters.index(name) for name in free), known=known,
+            finite,
+            *_principal_axes(X, seen),
+            xy=xy,
+            visible=visible,
+            interior=interior,
+            free=tuple(model.parameters.index(name) for name in free),
+            known=known,
             image_size=size.astype(float),
-        )  # fmt: skip
+        )
 
     def portions(self, on_cpu: bool) -> Iterator[Portion]:
         """Cameras in portions, separated by planar and spatial objects, and by number of views."""
@@ -197,9 +205,14 @@ class Batch:
         )
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
         return Portion(
-            cameras, views, flat, seen, interior,
-            wide(self.axes[cameras], size), wide(self.middle[cameras], size),
-        )  # fmt: skip
+            cameras,
+            views,
+            flat,
+            seen,
+            interior,
+            wide(self.axes[cameras], size),
+            wide(self.middle[cameras], size),
+        )
 
 
 def _usable(numbers: np.ndarray) -> np.ndarray:

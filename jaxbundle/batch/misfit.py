@@ -103,9 +103,7 @@ def _beyond(xy, size, down: bool, margin: float):
     return ((xy < low - margin * size) | (xy > low + (1 + margin) * size)).any(-1)
 
 
-def axes_remark(
-    xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool
-) -> str:
+def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool) -> str:
     """A remark about suspicious axes of image points; if most of them are in the image, the number
     of points far outside, if any.
 

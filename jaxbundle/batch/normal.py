@@ -147,8 +147,13 @@ def factorise(N, views, damping) -> Factor:
     S = interior_scale[:, None] * reduced[:k, :k] * interior_scale + damping * jnp.eye(k)
     factor = jnp.linalg.cholesky(S)
     return Factor(
-        pose=L, eliminated=Y, reduced=S, scale=scale, interior=factor,
-        interior_scale=interior_scale, right=reduced[:k, k],
+        pose=L,
+        eliminated=Y,
+        reduced=S,
+        scale=scale,
+        interior=factor,
+        interior_scale=interior_scale,
+        right=reduced[:k, k],
     )
 
 

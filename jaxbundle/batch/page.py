@@ -30,9 +30,10 @@ MOST_OUTLYING = 30
 
 
 def compose_batch(
-    rows: Iterable[Mapping] | Population, origin: Origin = UNKNOWN,
+    rows: Iterable[Mapping] | Population,
+    origin: Origin = UNKNOWN,
     against: Mapping[str, np.ndarray] = NOTHING,
-) -> Iterator[str]:  # fmt: skip
+) -> Iterator[str]:
     """The page of the results of `run_batch`, as their lines are read (`result_rows`): HTML, in
     pieces. `against`: columns to correlate with (`Population.correlations`)."""
     found = rows if isinstance(rows, Population) else Population(rows)
@@ -40,8 +41,12 @@ def compose_batch(
 
 
 def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarray]) -> Page:
-    sections = [*_rms(found), *_parameters(found), *_correlations(found, against),
-                *_outlying(found)]  # fmt: skip
+    sections = [
+        *_rms(found),
+        *_parameters(found),
+        *_correlations(found, against),
+        *_outlying(found),
+    ]
     first = give_verdict(_judge(found), (), "<h3>Status</h3>\n", _states(found))
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
@@ -56,16 +61,19 @@ def _judge(found: Population) -> list[Finding]:
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
     far = int((np.nan_to_num(found.farthest) > OUTLIER_LIMIT).sum())
     if np.isfinite(found.farthest).any():
-        words = (f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
-                 "deviations from the median")  # fmt: skip
+        words = (
+            f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
+            "deviations from the median"
+        )
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
 
 
 def _states(found: Population) -> str:
     counts = Counter(found.status.tolist()).most_common()
-    return grid(("status", "number", "%"),
-                [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts])  # fmt: skip
+    return grid(
+        ("status", "number", "%"), [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
+    )
 
 
 def _rms(found: Population) -> list[Section]:
@@ -102,9 +110,11 @@ def _parameters(found: Population) -> list[Section]:
             rows.append((name, len(there), *estimate(middle, deviation), significant(sigma), *ends))
     if not rows:
         return []
-    note = paragraph("Converged cameras. Robust σ: 1.4826 times the median absolute deviation. A "
-                     "spread far above the median σ comes from the cameras, not from the "
-                     "measurements.")
+    note = paragraph(
+        "Converged cameras. Robust σ: 1.4826 times the median absolute deviation. A "
+        "spread far above the median σ comes from the cameras, not from the "
+        "measurements."
+    )
     header = ("parameter", "cameras", "median", "robust σ", "median σ", "least", "greatest")
     shown = grid(header, rows) + note + "".join(_histograms(found))
     return [Section("population", "Parameters of the population", shown, "Population")]
@@ -114,8 +124,10 @@ def _histograms(found: Population) -> Iterator[str]:
     for name, values in found.values.items():
         edges, counted = found.histogram(values)
         if counted.sum() >= FEWEST and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
-            yield figure(draw_histogram(edges, counted, name, "number of cameras"),
-                         f"{name} of {counted.sum()} converged cameras")  # fmt: skip
+            yield figure(
+                draw_histogram(edges, counted, name, "number of cameras"),
+                f"{name} of {counted.sum()} converged cameras",
+            )
 
 
 def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[Section]:
@@ -125,19 +137,30 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
         return []
     level = LEVEL / len(told)
     rows = [
-        (f"{one.parameter} with {one.column}", one.cameras, fixed(one.rank_correlation, 3),
-         significant(one.probability, 2), "yes" if one.probability < level else "no",
-         significant(one.change))
+        (
+            f"{one.parameter} with {one.column}",
+            one.cameras,
+            fixed(one.rank_correlation, 3),
+            significant(one.probability, 2),
+            "yes" if one.probability < level else "no",
+            significant(one.change),
+        )
         for one in told
-    ]  # fmt: skip
+    ]
     note = paragraph(
         "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
         f"large by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
         "the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
-    return [Section("correlations", "What parameters correlate with", grid(header, rows) + note,
-                    "Correlations")]  # fmt: skip
+    return [
+        Section(
+            "correlations",
+            "What parameters correlate with",
+            grid(header, rows) + note,
+            "Correlations",
+        )
+    ]
 
 
 def _outlying(found: Population) -> list[Section]:
@@ -145,12 +168,20 @@ def _outlying(found: Population) -> list[Section]:
     said = found.outlying()
     if not said:
         return []
-    rows = [(found.keys[i], significant(found.numbers["rms"][i], 4), words)
-            for i, words in said[:MOST_OUTLYING]]  # fmt: skip
+    rows = [
+        (found.keys[i], significant(found.numbers["rms"][i], 4), words)
+        for i, words in said[:MOST_OUTLYING]
+    ]
     more = len(said) - len(rows)
     note = paragraph(f"and {more} more: sort the table.") if more else ""
-    return [Section("outlying", "Outlying cameras and networks",
-                    grid(("input", "RMS [px]", "why"), rows, "words") + note, "Outlying")]
+    return [
+        Section(
+            "outlying",
+            "Outlying cameras and networks",
+            grid(("input", "RMS [px]", "why"), rows, "words") + note,
+            "Outlying",
+        )
+    ]
 
 
 def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, Column]:
@@ -158,11 +189,14 @@ def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, 
     columns = {"id": Column(found.keys, "input"), "status": Column(found.status, "status")}
     columns |= {
         name: Column(values, places.get(name, name), -4)
-        for name, values in found.numbers.items() if np.isfinite(values).any()
-    }  # fmt: skip
+        for name, values in found.numbers.items()
+        if np.isfinite(values).any()
+    }
     for name, values in found.values.items():
-        columns |= {name: estimates(values, found.sigma[name], name),
-                    f"sigma_{name}": Column(found.sigma[name], f"σ {name}")}  # fmt: skip
+        columns |= {
+            name: estimates(values, found.sigma[name], name),
+            f"sigma_{name}": Column(found.sigma[name], f"σ {name}"),
+        }
     if np.isfinite(found.farthest).any():
         columns["farthest"] = Column(found.farthest, "largest deviation [robust σ]", 1)
     columns |= {

@@ -78,9 +78,10 @@ class PhotographFolders:
         files = {folder: self._files(folder) for folder in chosen}
         contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
         tasks = {
-            content: (path, self.board) for path, content in contents.items()
+            content: (path, self.board)
+            for path, content in contents.items()
             if content and self.kept.look(content, self.board) is None
-        }  # fmt: skip
+        }
         died: dict[str, str] = {}
         for done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
             content = contents[task[0]]
@@ -99,10 +100,12 @@ class PhotographFolders:
         for name, path in files.items():
             content = contents[path]
             looks[name] = (
-                "cannot be read" if not content
-                else f"is the same file as {first[content]}" if content in first
+                "cannot be read"
+                if not content
+                else f"is the same file as {first[content]}"
+                if content in first
                 else died.get(content) or self.kept.look(content, self.board) or "was not searched"
-            )  # fmt: skip
+            )
             first.setdefault(content, name)
         try:
             return collect_views(files, looks, self.board, hints=not {*died} & {*first})
@@ -120,8 +123,10 @@ def _why_empty(folder) -> str:
     inside = [one.name for one in camera_folders(folder)]
     if not inside:
         return "no photographs in this folder"
-    return (f"no photographs in this folder, but in {list_some(inside, 3, str)} in it: give --rig "
-            "for cameras on one mounting, or these folders")  # fmt: skip
+    return (
+        f"no photographs in this folder, but in {list_some(inside, 3, str)} in it: give --rig "
+        "for cameras on one mounting, or these folders"
+    )
 
 
 def calibrate_views(

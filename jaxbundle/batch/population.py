@@ -66,12 +66,14 @@ class Population:
         of = lambda name, what: numbers(row["parameters"].get(name, {}).get(what) for row in kept)
         self.values = {name: of(name, "value") for name in names}
         self.sigma = {name: of(name, "sigma") for name in names}
-        self.apart = {name: np.abs(self._apart(values, self.sigma[name]))
-                      for name, values in self.values.items()}  # fmt: skip
+        self.apart = {
+            name: np.abs(self._apart(values, self.sigma[name]))
+            for name, values in self.values.items()
+        }
         # views that determine nothing: weak without values
-        self._void = np.array([
-            row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept
-        ], bool)  # fmt: skip
+        self._void = np.array(
+            [row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept], bool
+        )
         self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept)))
 
     def __len__(self) -> int:
@@ -116,8 +118,11 @@ class Population:
         """Status, remark and outlying parameters, in words; empty: not outlying."""
         said = [] if self.fit[i] else [self.status[i]]
         said += [self.remark[i]] if self.remark[i] else []
-        said += [f"{name} {significant(far[i], 2)} robust σ from the median"
-                 for name, far in self.apart.items() if far[i] > OUTLIER_LIMIT]  # fmt: skip
+        said += [
+            f"{name} {significant(far[i], 2)} robust σ from the median"
+            for name, far in self.apart.items()
+            if far[i] > OUTLIER_LIMIT
+        ]
         if self.fit[i] and self.rms_apart[i] > OUTLIER_LIMIT:
             said.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
         return "; ".join(said)
@@ -128,8 +133,15 @@ class Population:
         said = [(i, self.why_outlying(i)) for i in range(len(self))]
         far, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
         said = [(i, words) for i, words in said if words]
-        return sorted(said, key=lambda item: (bool(self.solved[item[0]]), bool(self.fit[item[0]]),
-                                              -far[item[0]], -rms[item[0]]))  # fmt: skip
+        return sorted(
+            said,
+            key=lambda item: (
+                bool(self.solved[item[0]]),
+                bool(self.fit[item[0]]),
+                -far[item[0]],
+                -rms[item[0]],
+            ),
+        )
 
     def histogram(self, values: np.ndarray) -> tuple[Float[np.ndarray, " edges"], np.ndarray]:
         """Edges and counts of classes over the population, the outer ones open if values lie
@@ -172,21 +184,26 @@ class Population:
             middle, deviation = self.spread(values)
             edges, counted = self.histogram(values)
             parameters[name] = {
-                "cameras": len(there), "median": middle, "robust_sigma": deviation,
-                "least": float(there.min()), "greatest": float(there.max()),
+                "cameras": len(there),
+                "median": middle,
+                "robust_sigma": deviation,
+                "least": float(there.min()),
+                "greatest": float(there.max()),
                 "histogram": {"edges": edges.tolist(), "numbers": counted.tolist()},
-            }  # fmt: skip
+            }
             if name in self.sigma:
                 parameters[name]["median_sigma"] = self.spread(self.sigma[name])[0]
         found = self.correlations(against or {})
         return {
-            "inputs": len(self), "status": dict(zip(names.tolist(), counts.tolist())),
-            "rms": parameters.pop("rms", None), "parameters": parameters,
+            "inputs": len(self),
+            "status": dict(zip(names.tolist(), counts.tolist())),
+            "rms": parameters.pop("rms", None),
+            "parameters": parameters,
             "outlying": [{"key": self.keys[i], "why": why} for i, why in self.outlying()],
             "correlations": [
                 vars(one) | {"significant": one.probability < LEVEL / len(found)} for one in found
             ],
-        }  # fmt: skip
+        }
 
     def table(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
         """One row per input: key, status, remark, the numbers, every parameter with its σ, the
@@ -221,8 +238,11 @@ def _of_network(row: Mapping) -> dict[str, dict]:
     for table, unknowns in (row.get("further_unknowns") or {}).items():
         for of, estimates in unknowns.items():
             if of not in row.get("images", {}):
-                found |= {f"{table} {of} {name}": one for name, one in estimates.items()
-                          if one["sigma"] != 0}  # fmt: skip
+                found |= {
+                    f"{table} {of} {name}": one
+                    for name, one in estimates.items()
+                    if one["sigma"] != 0
+                }
     return found
 
 
@@ -250,8 +270,10 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
     given: Columns = as_columns(table, name)
     others = [column for column in given.values if column != ID]
     if ID not in given.values or not others:
-        raise InputError(f"{name}: a column id and others are expected, but there are "
-                         f"{', '.join(given.values) or 'none'}")  # fmt: skip
+        raise InputError(
+            f"{name}: a column id and others are expected, but there are "
+            f"{', '.join(given.values) or 'none'}"
+        )
     rows: dict[str, int] = {}
     for row, id in enumerate(given.ids(ID)):
         if id in rows:

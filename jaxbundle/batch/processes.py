@@ -101,8 +101,11 @@ def _tell(waiting: str, name: str, words: str = "") -> None:
 def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
     """The reports of these processes, once all are there."""
     while True:
-        found = {name: Path(waiting, name).read_text("utf-8") for name in names
-                 if Path(waiting, name).exists()}  # fmt: skip
+        found = {
+            name: Path(waiting, name).read_text("utf-8")
+            for name in names
+            if Path(waiting, name).exists()
+        }
         if len(found) == len(names):
             return found
         time.sleep(PAUSE)
@@ -113,8 +116,11 @@ def add_parts(file: str | Path) -> None:
     joined processes.
 
     **Raises:** `InputError` while a run writes one of them."""
-    found = [(int(end[1]), path) for path in glob.glob(f"{glob.escape(str(file))}.part-*")
-             if (end := re.search(r"\.part-(\d+)-of-\d+$", path))]  # fmt: skip
+    found = [
+        (int(end[1]), path)
+        for path in glob.glob(f"{glob.escape(str(file))}.part-*")
+        if (end := re.search(r"\.part-(\d+)-of-\d+$", path))
+    ]
     waited = glob.glob(f"{glob.escape(str(file))}.joined-*")
     if not found and not waited:
         return

@@ -96,8 +96,9 @@ class BatchCalibration:
         remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
         lines = [
             f"camera {row}{f' and {count - 1} more' if count > 1 else ''}: {remark}"
-            for row, remark, count in sorted(zip(first, remarks, counts)) if remark
-        ]  # fmt: skip
+            for row, remark, count in sorted(zip(first, remarks, counts))
+            if remark
+        ]
         if len(lines) > MOST_REMARKS:
             lines[MOST_REMARKS:] = [f"and {len(lines) - MOST_REMARKS} more remarks, see `remark`"]
         return "\n".join(said + lines)
@@ -153,10 +154,14 @@ class BatchCalibration:
         """One row per camera: status, remark, rms and sigma0 (pixels), redundancy, iterations,
         views, points removed where there was data snooping, every parameter and its σ."""
         columns = {
-            "status": self.status, "remark": self.remark, "rms": self.rms, "sigma0": self.sigma0,
-            "redundancy": self.redundancy, "iterations": self.iterations,
+            "status": self.status,
+            "remark": self.remark,
+            "rms": self.rms,
+            "sigma0": self.sigma0,
+            "redundancy": self.redundancy,
+            "iterations": self.iterations,
             "views": self.views.sum(1),
-        }  # fmt: skip
+        }
         if self.removed is not None:
             columns["removed"] = self.removed.sum((1, 2))
         for k, name in enumerate(self.parameters):
@@ -175,9 +180,9 @@ class BatchCalibration:
         rows = np.argsort(self.converged, kind="stable")[:MOST_ROWS]
         cell = 'style="text-align:left;padding:2px 12px 2px 0"'
         shown = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
-        line = lambda tag, texts: "<tr>" + "".join(
-            f"<{tag} {cell}>{text}</{tag}>" for text in texts
-        ) + "</tr>"
+        line = lambda tag, texts: (
+            "<tr>" + "".join(f"<{tag} {cell}>{text}</{tag}>" for text in texts) + "</tr>"
+        )
         body = "".join(
             line("td", [row, *(shown(column[row]) for column in table.values())]) for row in rows
         )
@@ -185,5 +190,5 @@ class BatchCalibration:
         head = "<br>".join(map(escape, str(self).splitlines()))
         return (
             f'<div><b>{head}</b><table style="border-collapse:collapse;font-size:90%">'
-            f'{line("th", ["camera", *table])}{body}</table>{more}</div>'
+            f"{line('th', ['camera', *table])}{body}</table>{more}</div>"
         )

@@ -150,8 +150,11 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
     if settings.snooping is None:
         return result, excluded
     while result.converged and (bad := _contradicting(rig, result, settings)):
-        excluded |= {rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                     "not simultaneous?" for e, rms in bad.items()}  # fmt: skip
+        excluded |= {
+            rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
+            "not simultaneous?"
+            for e, rms in bad.items()
+        }
         xy = rig.xy.copy()
         xy[:, list(bad)] = np.nan
         rig = dataclasses.replace(rig, xy=xy)
@@ -161,13 +164,15 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
         except (InputError, NotSolvedError, ValueError) as error:
             left_out = "; ".join(f"epoch {epoch} {why}" for epoch, why in excluded.items())
             raise NotSolvedError(f"{left_out}; without these: {error}") from None
-    return adjust(network, max_iterations=settings.max_iterations, snooping=settings.snooping,
-                  significance=settings.significance), excluded  # fmt: skip
+    return adjust(
+        network,
+        max_iterations=settings.max_iterations,
+        snooping=settings.snooping,
+        significance=settings.significance,
+    ), excluded
 
 
-def _contradicting(
-    rig: Rig, result: Adjustment, settings: RigSettings
-) -> dict[int, float]:
+def _contradicting(rig: Rig, result: Adjustment, settings: RigSettings) -> dict[int, float]:
     """Epochs that contradict the mounting, and their RMS, pixels."""
     place = {id: e for of in rig.images for e, id in enumerate(of)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
@@ -179,9 +184,7 @@ def _contradicting(
     return {int(e): float(rms[e]) for e in contradicting(rms, number > 0, shared)}
 
 
-def _residual_lengths(
-    result: Adjustment | None, settings: RigSettings
-) -> Float[np.ndarray, " n"]:
+def _residual_lengths(result: Adjustment | None, settings: RigSettings) -> Float[np.ndarray, " n"]:
     """Residual lengths of the image points used, pixels."""
     if result is None:
         return np.zeros(0)
@@ -222,10 +225,17 @@ def declare_rig(rig: Rig, firsts: Sequence[FirstCamera | None], settings: RigSet
         parameters = parameters_of(
             first, rig.xy[c][seen], rig.sizes[c], model, settings.free, size_of_pixel
         )
-        cameras.append(Camera(
-            name, key_of(model), parameters, settings.free, prior, image_size=rig.sizes[c],
-            pixel_size=size_of_pixel,
-        ))  # fmt: skip
+        cameras.append(
+            Camera(
+                name,
+                key_of(model),
+                parameters,
+                settings.free,
+                prior,
+                image_size=rig.sizes[c],
+                pixel_size=size_of_pixel,
+            )
+        )
         xy = in_model_units(rig.xy[c], model, rig.sizes[c], size_of_pixel)
         for e in np.flatnonzero(seen.any(1)):
             images.append((c, int(e), *first.position[e], *first.angles[e]))
@@ -260,8 +270,16 @@ def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -
         {"id": ids, "camera": names}
         | dict(zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), pose.T)),
         {"id": points, "role": ["fixed"] * len(points), "X": X, "Y": Y, "Z": Z},
-        {"image": ids[image], "point": points[point], "x": rays[:, 2], "y": rays[:, 3],
-         "sx": np.full(len(rays), sigma[0]), "sy": np.full(len(rays), sigma[1])},
-        residuals="measured", image_unit=settings.model.unit,
-        sigma_origin=UNIT if settings.sigma_image is None else STATED, **further,
-    )  # fmt: skip
+        {
+            "image": ids[image],
+            "point": points[point],
+            "x": rays[:, 2],
+            "y": rays[:, 3],
+            "sx": np.full(len(rays), sigma[0]),
+            "sy": np.full(len(rays), sigma[1]),
+        },
+        residuals="measured",
+        image_unit=settings.model.unit,
+        sigma_origin=UNIT if settings.sigma_image is None else STATED,
+        **further,
+    )

@@ -104,8 +104,11 @@ def run_batch(
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
         lines = JsonLines(file)
-        again = [key for work, share in zip(works, ours)
-                 for key in _again(work, share, lines, retry, renew)]  # fmt: skip
+        again = [
+            key
+            for work, share in zip(works, ours)
+            for key in _again(work, share, lines, retry, renew)
+        ]
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0

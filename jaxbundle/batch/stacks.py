@@ -171,9 +171,10 @@ def _check_size(stream: BinaryIO) -> None:
     """Refuse an archive whose arrays unpack to implausible sizes."""
     with zipfile.ZipFile(stream) as archive:
         unpacked = sum(
-            member.file_size for member in archive.infolist()
+            member.file_size
+            for member in archive.infolist()
             if member.filename.removesuffix(".npy") in KNOWN_ARRAYS
-        )  # fmt: skip
+        )
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     if unpacked > largest_unpacked_size(size):

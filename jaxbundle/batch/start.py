@@ -62,8 +62,10 @@ def start_values(model, flat, known, seen: Sightings, interior, size):
     a = [(c[0] / fx, c[1] / fy, c[2]) for c in columns]
     axes, shift = (_pose_of_flat if flat else _pose_of_solid)(a)
     # rows of M, a view each
-    M = [[jnp.where(usable, s * axes[j][i], s * (i == j)) for j in range(3)]
-         for i, s in enumerate(FLIP)]  # fmt: skip
+    M = [
+        [jnp.where(usable, s * axes[j][i], s * (i == j)) for j in range(3)]
+        for i, s in enumerate(FLIP)
+    ]
     far = (0.0, 0.0, -1.0)
     t = jnp.stack([jnp.where(usable, s * c, f) for s, c, f in zip(FLIP, shift, far)], 1)
     return seen, Calibration(interior, _quaternions(M), t)
@@ -91,8 +93,10 @@ def _fit(seen, x, y, axes, least_points):
     h = [*solution, jnp.ones_like(mx)]
     # [(X − X̄)/size, 1] in the units of the object, then x = k·x̃ + mx
     columns = [[c / size for c in h[i :: axes + 1]] for i in range(axes)]
-    last = [c - sum(column[j] * m for column, m in zip(columns, middle))
-            for j, c in enumerate(h[axes :: axes + 1])]  # fmt: skip
+    last = [
+        c - sum(column[j] * m for column, m in zip(columns, middle))
+        for j, c in enumerate(h[axes :: axes + 1])
+    ]
     columns = [(k * c[0] + mx * c[2], k * c[1] + my * c[2], c[2]) for c in (*columns, last)]
     return columns, usable & (jnp.sum(seen.weight, 1) >= least_points)
 

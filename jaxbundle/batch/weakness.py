@@ -74,10 +74,12 @@ def weak_geometry(
         extent = np.sqrt(((view[seen] - middle) ** 2).sum(1).mean())
         x, ones = (view[seen] - middle) / extent, np.ones((int(seen.sum()), 1))
         from_plane, zero = np.concatenate([X[seen], ones], 1), np.zeros((int(seen.sum()), 3))
-        A = np.concatenate([
-            np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
-            np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
-        ])  # fmt: skip
+        A = np.concatenate(
+            [
+                np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
+                np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
+            ]
+        )
         H = np.linalg.svd(A)[2][-1].reshape(3, 3)
         line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
         with np.errstate(all="ignore"):

@@ -82,9 +82,18 @@ class BatchSettings:
 
     @classmethod
     def of(
-        cls, model, free, board, rig, pixel_size, overrides, max_iterations, snooping, significance,
+        cls,
+        model,
+        free,
+        board,
+        rig,
+        pixel_size,
+        overrides,
+        max_iterations,
+        snooping,
+        significance,
         brief,
-    ) -> "BatchSettings":  # fmt: skip
+    ) -> "BatchSettings":
         """The settings from the arguments of `run_batch`.
 
         **Raises:** `InputError`."""
@@ -98,8 +107,17 @@ class BatchSettings:
         adjusting = {"max_iterations": integer("max_iterations", max_iterations)}
         if snooping is not None:
             adjusting |= dict(snooping=snooping, significance=significance)
-        return cls(any_model(model), str(model), free, board, rig, pixel_size, tuple(overrides),
-                   adjusting, brief)  # fmt: skip
+        return cls(
+            any_model(model),
+            str(model),
+            free,
+            board,
+            rig,
+            pixel_size,
+            tuple(overrides),
+            adjusting,
+            brief,
+        )
 
     def sections(self) -> dict[str, Any]:
         """The sections of rigs in the overrides, and `sigma_image`.
@@ -108,8 +126,10 @@ class BatchSettings:
         for override in self.overrides:
             if re.split(r"[.=]", override)[0].strip() not in (*SECTIONS, SIGMA_IMAGE):
                 known = ", ".join((SIGMA_IMAGE, *(f"{name}.KEY" for name in SECTIONS)))
-                raise InputError(f"--set {override}: of cameras and rigs {known} can be set; "
-                                 "parameters are estimated by --free")  # fmt: skip
+                raise InputError(
+                    f"--set {override}: of cameras and rigs {known} can be set; "
+                    "parameters are estimated by --free"
+                )
         document = apply_overrides({"project": {}, "camera": []}, self.overrides)
         document |= document["project"]
         return {name: document[name] for name in (*SECTIONS, SIGMA_IMAGE) if name in document}
@@ -118,8 +138,9 @@ class BatchSettings:
         """The settings of cameras and rigs that are adjusted as networks."""
         sections = self.sections()
         sigma = sections.pop(SIGMA_IMAGE, None)
-        return rig_settings(self.model, self.free, sections, self.pixel_size, sigma,
-                            **self.adjusting)  # fmt: skip
+        return rig_settings(
+            self.model, self.free, sections, self.pixel_size, sigma, **self.adjusting
+        )
 
     def are_plain(self) -> bool:
         """Whether single cameras are calibrated by `calibrate_batch`."""
@@ -172,9 +193,11 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
 
     def cameras(chosen, _):
         batch = calibrate_batch(
-            **stack.arguments(chosen), model=settings.model, free=settings.free,
+            **stack.arguments(chosen),
+            model=settings.model,
+            free=settings.free,
             **settings.adjusting,
-        )  # fmt: skip
+        )
         return [batch.row(i, brief) for i in range(len(chosen))]
 
     def rigs(chosen, tell):
@@ -191,8 +214,11 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
 
     def solve(chosen, tell):
         measured = found.measure(chosen, tell)
-        rows = {i: {"status": "bad input", "error": why}
-                for i, why in measured.items() if isinstance(why, str)}  # fmt: skip
+        rows = {
+            i: {"status": "bad input", "error": why}
+            for i, why in measured.items()
+            if isinstance(why, str)
+        }
         views = {i: one for i, one in measured.items() if not isinstance(one, str)}
         if settings.are_plain():
             for i, batch, place in calibrate_views(views, options):
@@ -215,8 +241,11 @@ def _photographed_rigs(found: RigFolders, keys: tuple[str, ...], settings: Batch
 
     def solve(chosen, tell):
         measured = found.measure(chosen, tell)
-        rows = {i: {"status": "bad input", "error": why}
-                for i, why in measured.items() if isinstance(why, str)}  # fmt: skip
+        rows = {
+            i: {"status": "bad input", "error": why}
+            for i, why in measured.items()
+            if isinstance(why, str)
+        }
         rigs = {i: one for i, one in measured.items() if not isinstance(one, str)}
         solved = solve_rigs([rig for rig, _ in rigs.values()], of_rigs)
         for (i, (_, told)), (row, _) in zip(rigs.items(), solved):
@@ -231,8 +260,10 @@ def shorten(row: dict, brief: bool) -> dict:
     """The row of a rig; `brief`: without images, their velocities, correlations."""
     if not brief or "images" not in row:
         return row
-    cameras = {id: {k: v for k, v in of.items() if k != "correlations"}
-               for id, of in row["cameras"].items()}  # fmt: skip
+    cameras = {
+        id: {k: v for k, v in of.items() if k != "correlations"}
+        for id, of in row["cameras"].items()
+    }
     further = {name: of for name, of in row["further_unknowns"].items() if name != "velocity"}
     row = row | {"cameras": cameras, "further_unknowns": further, "removed": len(row["removed"])}
     return {key: value for key, value in row.items() if key != "images"}

@@ -132,10 +132,17 @@ def adjust(
     determined, initially or after data snooping, elimination or variance components.
     """
     check_options(
-        method=method, reduction=reduction, max_iterations=max_iterations, robust=robust,
-        snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
-        estimate_components=estimate_components, progress=progress,
-    )  # fmt: skip
+        method=method,
+        reduction=reduction,
+        max_iterations=max_iterations,
+        robust=robust,
+        snooping=snooping,
+        significance=significance,
+        eliminate=eliminate,
+        critical_t=critical_t,
+        estimate_components=estimate_components,
+        progress=progress,
+    )
     given = require_network(network)
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     mirror = partial(name_mirrored, given, try_again=partial(_try_mirrored, reduction, options))
@@ -149,9 +156,11 @@ def adjust(
                     f"no start values found: {mirrored}", [*error.undetermined]
                 ) from None
             raise
-    told = options if progress is None else options | {
-        "progress": partial(_tell, progress, max_iterations)
-    }  # fmt: skip
+    told = (
+        options
+        if progress is None
+        else options | {"progress": partial(_tell, progress, max_iterations)}
+    )
     first = _First(reduction, also, oriented, told)
     problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **told)
@@ -352,19 +361,25 @@ class _Found:
             names = names or UNNAMED
         unnamed = not inspection and not names
         return Adjustment(
-            self.network, problem, minimum, undetermined=tuple(names),
-            check=check if len(check[0]) else None, method=self.method,
-            reduction=self.reduction, inspection=inspection,
+            self.network,
+            problem,
+            minimum,
+            undetermined=tuple(names),
+            check=check if len(check[0]) else None,
+            method=self.method,
+            reduction=self.reduction,
+            inspection=inspection,
             weakness=weakness_without_solution(problem, minimum) if unnamed else None,
-            findings=_likely_causes(problem, minimum, inspection), **self.said,
-        )  # fmt: skip
-
+            findings=_likely_causes(problem, minimum, inspection),
+            **self.said,
+        )
 
 
 def _tell(progress: Progress, total: int, step, cost, damping) -> None:
     """An evaluation as `progress(stage, done, total)`."""
     stage = f"adjusting: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}"
     progress(stage, int(step), total)
+
 
 def check_options(
     *,
@@ -419,7 +434,7 @@ def _likely_causes(
         "" if told or conventions else name_contradiction(network),
         "" if inspection else name_one_place(network),
         "" if inspection else name_inseparable(problem, minimum),
-    )  # fmt: skip
+    )
     return tuple(filter(None, causes))
 
 
@@ -429,10 +444,13 @@ def _name_conventions(
     """Units and conventions in which a badly fitting network would fit, in words."""
     network = problem.network
     causes = (
-        name_pixels(network), name_angle_unit(network), *name_lengths(network),
-        name_image_convention(network), name_image_extent(network),
+        name_pixels(network),
+        name_angle_unit(network),
+        *name_lengths(network),
+        name_image_convention(network),
+        name_image_extent(network),
         name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
-    )  # fmt: skip
+    )
     return tuple(filter(None, causes))
 
 
@@ -457,8 +475,9 @@ def _place(found: Oriented) -> Oriented:
     **Raises:** `NotSolvedError`."""
     network = found.network
     for thing, reasons, left in (
-        ("image", found.images, len(network.images)), ("point", found.points, len(network.points))
-    ):  # fmt: skip
+        ("image", found.images, len(network.images)),
+        ("point", found.points, len(network.points)),
+    ):
         if len(reasons) >= left:
             said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
             causes = filter(None, (name_pixels(network), name_image_extent(network)))

@@ -113,8 +113,19 @@ class AdjustmentComparison:
 
     def table(self) -> dict[str, np.ndarray]:
         """Columns by name, one row an unknown."""
-        names = ("kind", "id", "parameter", "unit", "a", "b", "difference", "sigma", "t",
-                 "probability", "differs")  # fmt: skip
+        names = (
+            "kind",
+            "id",
+            "parameter",
+            "unit",
+            "a",
+            "b",
+            "difference",
+            "sigma",
+            "t",
+            "probability",
+            "differs",
+        )
         return {name: getattr(self, name) for name in names}
 
     def to_pandas(self):
@@ -122,22 +133,30 @@ class AdjustmentComparison:
         return data_frame(self.table())
 
     def __repr__(self) -> str:
-        return (f"<AdjustmentComparison of {count(len(self), 'unknown')}, "
-                f"{int(self.differs.sum())} significantly different>")  # fmt: skip
+        return (
+            f"<AdjustmentComparison of {count(len(self), 'unknown')}, "
+            f"{int(self.differs.sum())} significantly different>"
+        )
 
     def __str__(self) -> str:
         """What was compared, the tests, and the largest differences in σ."""
         lines = [self._what()]
         if self.similarity is not None:
-            lines.append(f"a was moved by a similarity found on {count(len(self.held_by), 'point')}"
-                         f": scale {np.exp(self.similarity[6]):.8g}")  # fmt: skip
+            lines.append(
+                f"a was moved by a similarity found on {count(len(self.held_by), 'point')}"
+                f": scale {np.exp(self.similarity[6]):.8g}"
+            )
         if self.shared:
-            lines.append(f"{count(self.shared, 'image point')} of both are the same measurements: "
-                         "the σ of differences are too large; nothing is tested")  # fmt: skip
+            lines.append(
+                f"{count(self.shared, 'image point')} of both are the same measurements: "
+                "the σ of differences are too large; nothing is tested"
+            )
         lines += [f"{name}: {test}" for name, test in self.tests.items()]
         if not self.shared:
-            lines.append(f"{int(self.differs.sum())} of {len(self)} differ significantly "
-                         f"({self.significance:g} for all together)")  # fmt: skip
+            lines.append(
+                f"{int(self.differs.sum())} of {len(self)} differ significantly "
+                f"({self.significance:g} for all together)"
+            )
         sigma = np.where(self.sigma > 0, self.sigma, np.nan)
         ratio = np.abs(self.difference / sigma)
         rows = np.argsort(-ratio, kind="stable")[:SHOWN_ROWS]  # NaN last: σ is not known
@@ -150,8 +169,9 @@ class AdjustmentComparison:
                 f"{self.sigma[k]:11.3g}{in_sigma:>11}{' *' * bool(self.differs[k])}"
             )
         if len(self) > len(rows):
-            lines.append(f"and {count(len(self) - len(rows), 'unknown')} that differ by less of "
-                         "their σ")  # fmt: skip
+            lines.append(
+                f"and {count(len(self) - len(rows), 'unknown')} that differ by less of their σ"
+            )
         return "\n".join(lines)
 
     def _what(self) -> str:
@@ -186,8 +206,10 @@ def compare(
     """
     for name, one in (("a", a), ("b", b)):
         if not isinstance(one, Adjustment):
-            raise InputError(f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
-                             "or jaxbundle.load_adjustment gives one")  # fmt: skip
+            raise InputError(
+                f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
+                "or jaxbundle.load_adjustment gives one"
+            )
     if similarity not in (None, True, False):
         raise InputError(f"similarity must be True, False or None, but is {show(similarity)}")
     significance = number("significance", significance, "between 0 and 1", lambda x: 0 < x < 1)
@@ -224,11 +246,13 @@ def _common_rows(a: Adjustment, b: Adjustment) -> _Common:
         free = {*a.camera_cofactor(camera.id)[0], *b.camera_cofactor(camera.id)[0]}
         names = get_model(camera.model).parameters
         cameras += [(camera.id, name) for name in names if name in free]
-    there = lambda r: {id for id, X in zip(r.problem.network.points.id, r.point_values)
-                       if np.isfinite(X).all()}  # fmt: skip
+    there = lambda r: {
+        id for id, X in zip(r.problem.network.points.id, r.point_values) if np.isfinite(X).all()
+    }
     images, points = set(second.images.id), there(a) & there(b)
     found = _Common(
-        cameras, [id for id in first.images.id if id in images],
+        cameras,
+        [id for id in first.images.id if id in images],
         [id for id in first.points.id if id in points],
     )
     if not (found.cameras or found.images or found.points):
@@ -240,8 +264,10 @@ def _require_units(a: Adjustment, b: Adjustment) -> None:
     for name in ("object_unit", "image_unit"):
         units = [getattr(r.network if name == "object_unit" else r, name) for r in (a, b)]
         if units[0] != units[1]:
-            raise InputError(f"a and b differ in their {name}: {units[0]!r} and {units[1]!r}; "
-                             "compare networks in the same unit")  # fmt: skip
+            raise InputError(
+                f"a and b differ in their {name}: {units[0]!r} and {units[1]!r}; "
+                "compare networks in the same unit"
+            )
 
 
 def _held(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
@@ -252,8 +278,10 @@ def _held(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
         raise InputError(f"held_by: points {list_some(missing)} are not in both adjustments")
     held = tuple(map(str, wanted)) or tuple(points)
     if len(held) < 3:
-        raise InputError(f"a similarity needs three points in common, but there are {len(held)}; "
-                         "similarity=False compares coordinates as they are")  # fmt: skip
+        raise InputError(
+            f"a similarity needs three points in common, but there are {len(held)}; "
+            "similarity=False compares coordinates as they are"
+        )
     return held
 
 
@@ -342,15 +370,18 @@ class _In:
 
     def choose_rows(self, rows: _Common, angles) -> _Chosen:
         network = self.problem.network
-        of = lambda ids, table: np.array([{id: k for k, id in enumerate(table)}[id] for id in ids],
-                                         int)  # fmt: skip
+        of = lambda ids, table: np.array(
+            [{id: k for k, id in enumerate(table)}[id] for id in ids], int
+        )
         camera = {c.id: (k, get_model(c.model).parameters) for k, c in enumerate(network.cameras)}
         cameras = [(camera[id][0], camera[id][1].index(name)) for id, name in rows.cameras]
         return _Chosen(
             jnp.asarray(np.array(cameras, int).reshape(-1, 2)),
             jnp.asarray(of(rows.images, network.images.id)),
-            jnp.asarray(of(rows.points, network.points.id)), jnp.asarray(angles),
-            jnp.asarray(self.problem.origin - self.like.origin), self.frame,
+            jnp.asarray(of(rows.points, network.points.id)),
+            jnp.asarray(angles),
+            jnp.asarray(self.problem.origin - self.like.origin),
+            self.frame,
         )
 
     def estimate(self, rows: _Common, angles) -> tuple[np.ndarray, np.ndarray]:
@@ -365,9 +396,15 @@ def _call(chosen, values):
 
 
 def _compare(
-    a: Adjustment, b: Adjustment, one: _In, other: _In, rows: _Common, tau, held,
+    a: Adjustment,
+    b: Adjustment,
+    one: _In,
+    other: _In,
+    rows: _Common,
+    tau,
+    held,
     significance: float,
-) -> AdjustmentComparison:  # fmt: skip
+) -> AdjustmentComparison:
     place = {id: k for k, id in enumerate(b.problem.network.images.id)}
     near = b.image_values[[place[id] for id in rows.images], 3:].reshape(-1, 3)
     kept = len(rows.cameras) + 6 * len(rows.images)
@@ -401,16 +438,25 @@ def _compare(
         q = np.where(table["sigma"] > 0, v_a / (v_a + v_b), np.nan)
     p = np.full(len(t), np.nan)
     if not shared:
-        p = np.array([
-            np.nan if np.isnan(x) else f_tail(x * x, 1, _freedom(y, (a.redundancy, b.redundancy)))
-            for x, y in zip(t, q)
-        ])
+        p = np.array(
+            [
+                np.nan
+                if np.isnan(x)
+                else f_tail(x * x, 1, _freedom(y, (a.redundancy, b.redundancy)))
+                for x, y in zip(t, q)
+            ]
+        )
     return AdjustmentComparison(
-        **table, t=np.full(len(t), np.nan) if shared else t, probability=p,
-        differs=np.nan_to_num(p, nan=1.0) < level, similarity=tau, held_by=held,
+        **table,
+        t=np.full(len(t), np.nan) if shared else t,
+        probability=p,
+        differs=np.nan_to_num(p, nan=1.0) < level,
+        similarity=tau,
+        held_by=held,
         tests={name: test for name, test in tests.items() if test is not None},
-        shared=shared, significance=significance,
-    )  # fmt: skip
+        shared=shared,
+        significance=significance,
+    )
 
 
 def _portions(rows: _Common) -> list[_Common]:
@@ -418,8 +464,10 @@ def _portions(rows: _Common) -> list[_Common]:
     there may be."""
     step = MOST_TOGETHER // 3
     parts = [rows.points[k : k + step] for k in range(0, len(rows.points), step)] or [[]]
-    return [dataclasses.replace(rows, points=parts[0]),
-            *(_Common([], [], part) for part in parts[1:])]  # fmt: skip
+    return [
+        dataclasses.replace(rows, points=parts[0]),
+        *(_Common([], [], part) for part in parts[1:]),
+    ]
 
 
 def _rows_of(a: Adjustment, b: Adjustment, rows: _Common, x_a, x_b, v_a, v_b) -> dict:
@@ -436,16 +484,18 @@ def _rows_of(a: Adjustment, b: Adjustment, rows: _Common, x_a, x_b, v_a, v_b) ->
     origin = np.zeros(len(kind))
     cameras = len(rows.cameras)
     pose = np.concatenate([b.problem.origin, np.zeros(3)])
-    origin[cameras:] = np.concatenate(
-        [np.tile(pose, images), np.tile(b.problem.origin, points)]
-    )  # fmt: skip
+    origin[cameras:] = np.concatenate([np.tile(pose, images), np.tile(b.problem.origin, points)])
     column = lambda values: np.array(values, dtype=object)
     return {
-        "kind": column(kind), "id": column(id + np.repeat(rows.points, 3).tolist()),
-        "parameter": column(name), "unit": column(unit), "a": (x_a + origin) * scale,
-        "b": (x_b + origin) * scale, "difference": (x_b - x_a) * scale,
+        "kind": column(kind),
+        "id": column(id + np.repeat(rows.points, 3).tolist()),
+        "parameter": column(name),
+        "unit": column(unit),
+        "a": (x_a + origin) * scale,
+        "b": (x_b + origin) * scale,
+        "difference": (x_b - x_a) * scale,
         "sigma": np.sqrt(v_a + v_b) * scale,
-    }  # fmt: skip
+    }
 
 
 def _congruency(d, C_a, C_b, at, freedom, lost: int = 0) -> Congruency | None:

@@ -68,15 +68,19 @@ class Undetermined:
     def spares_most_of(self, network: Network) -> bool:
         """Whether more than half of the tie points and of the images are determined; otherwise the
         network has no depth, or σ says nothing, and nothing should be left out."""
-        number = {thing: sum(len(n.names) for n in self.notes if n.thing == thing)
-                  for thing in ("tie point", "image")}  # fmt: skip
+        number = {
+            thing: sum(len(n.names) for n in self.notes if n.thing == thing)
+            for thing in ("tie point", "image")
+        }
         ties = int(network.points.has_role("tie").sum())
         return 2 * number["tie point"] < max(ties, 1) and 2 * number["image"] < len(network.images)
 
     def leave_out(self, network: Network) -> Network:
         """The network without them, with notes."""
-        gone = {thing: {name for note in self.notes if note.thing == thing for name in note.names}
-                for thing in ("tie point", "image")}  # fmt: skip
+        gone = {
+            thing: {name for note in self.notes if note.thing == thing for name in note.names}
+            for thing in ("tie point", "image")
+        }
         keep = lambda ids, names: np.array([id not in names for id in ids], bool)
         network = keep_points(network, keep(network.points.id, gone["tie point"]))
         network = keep_images(network, keep(network.images.id, gone["image"]))
@@ -123,8 +127,10 @@ def _parallax_at_usual_distance(problem: Problem, values: Values) -> Float[np.nd
     order = np.lexsort((s, image))
     seen, first, number = np.unique(image[order], return_index=True, return_counts=True)
     usual[seen] = s[order][first + number // 2]
-    mean = lambda v: np.stack([np.bincount(point, c, n) for c in v.T], 1) / np.maximum(
-        np.bincount(point, minlength=n), 1)[:, None]  # fmt: skip
+    mean = lambda v: (
+        np.stack([np.bincount(point, c, n) for c in v.T], 1)
+        / np.maximum(np.bincount(point, minlength=n), 1)[:, None]
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         u = mean(to_point / s[:, None])
         u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -181,9 +187,7 @@ def _width_of_points(problem: Problem, values: Values) -> Float[np.ndarray, " im
     away = np.linalg.norm(X - np.asarray(values.position)[image], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.nan_to_num(1 / away, posinf=0.0)
-    total = lambda v: np.stack(
-        [np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1
-    )
+    total = lambda v: np.stack([np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1)
     weight = np.maximum(np.bincount(image, root**2, n), 1e-300)[:, None]
     scaled = root[:, None] * (X - (total(root[:, None] ** 2 * X) / weight)[image])
     C = np.nan_to_num(total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3))
@@ -199,10 +203,11 @@ def _adjusted_model(problem: Problem, values: Values, network: Network, seen: Si
         for own, place in (
             (table, {id: k for k, id in enumerate(whole.id)})
             for table, whole in (
-                (problem.network.images, network.images), (problem.network.points, network.points)
+                (problem.network.images, network.images),
+                (problem.network.points, network.points),
             )
         )
-    )  # fmt: skip
+    )
     M = many.matrices_of_quaternions(np.asarray(values.rotation))
     model.place(images, np.asarray(values.position) + problem.origin, M)
     X = np.asarray(values.point) + problem.origin
@@ -233,9 +238,10 @@ def take_back(
     used = _are_among(given, current)
     off = misclosures(seen, model) > COMES_BACK.miss * seen.tolerance[seen.image]
     wrong = off & ~used[seen.row]
-    kept = dataclasses.replace(seen, **{
-        name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")
-    })  # fmt: skip
+    kept = dataclasses.replace(
+        seen,
+        **{name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")},
+    )
     ties = given.points.has_role("tie") & ~before
     line, one_place = have_one_line(kept, model, ties, factor)
     images, points = given.images, given.points
@@ -256,10 +262,8 @@ def take_back(
     network = given.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
-        observations=given.observations.take(
-            np.setdiff1d(np.arange(len(used)), seen.row[wrong])
-        ),
-    )  # fmt: skip
+        observations=given.observations.take(np.setdiff1d(np.arange(len(used)), seen.row[wrong])),
+    )
     network = keep_points(keep_images(network, model.placed), known & ~line)
     after = "that the adjusted orientation does not determine either"
     network = note_missing(network, "image", missing_images, after)
@@ -273,10 +277,13 @@ def take_back(
 
 def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
     """Which image points of a network are in a part of it."""
-    key = lambda network, ids: np.array([
-        ids[0][network.images.id[i]] * len(given.points) + ids[1][network.points.id[p]]
-        for i, p in zip(network.observations.image, network.observations.point)
-    ], np.int64)  # fmt: skip
+    key = lambda network, ids: np.array(
+        [
+            ids[0][network.images.id[i]] * len(given.points) + ids[1][network.points.id[p]]
+            for i, p in zip(network.observations.image, network.observations.point)
+        ],
+        np.int64,
+    )
     places = [{id: k for k, id in enumerate(table.id)} for table in (given.images, given.points)]
     return np.isin(key(given, places), key(current, places))
 
@@ -305,4 +312,4 @@ def carry(problem: Problem, before: Problem, values: Values) -> Values:
         position=taken(start.position, images[0], values.position, images[1], shift),
         rotation=taken(start.rotation, images[0], values.rotation, images[1]),
         point=taken(start.point, points[0], values.point, points[1], shift),
-    )  # fmt: skip
+    )

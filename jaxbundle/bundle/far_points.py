@@ -106,10 +106,15 @@ def minimise_with_infinity(
 def noise_of_rays(problem: Problem) -> float:
     """The median a priori σ of an image coordinate, in principal distances."""
     network = problem.network
-    c = np.array([
-        min((camera.parameters[n] for n in get_model(camera.model).principal_distance), default=1.0)
-        for camera in network.cameras
-    ])  # fmt: skip
+    c = np.array(
+        [
+            min(
+                (camera.parameters[n] for n in get_model(camera.model).principal_distance),
+                default=1.0,
+            )
+            for camera in network.cameras
+        ]
+    )
     return float(np.median(network.observations.sigma.max(1) / np.abs(c[problem.camera])))
 
 
@@ -216,13 +221,11 @@ def join_legs(legs: Sequence[Minimum]) -> Minimum:
     if len(legs) == 1:
         return legs[0]
     rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]
-    column = lambda name: jax.device_put(np.concatenate(
-        [np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)]
-    ))  # fmt: skip
-    history = History(column("cost"), column("damping"), column("accepted"))
-    return dataclasses.replace(
-        legs[-1], iterations=np.asarray(len(history.cost)), history=history
+    column = lambda name: jax.device_put(
+        np.concatenate([np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)])
     )
+    history = History(column("cost"), column("damping"), column("accepted"))
+    return dataclasses.replace(legs[-1], iterations=np.asarray(len(history.cost)), history=history)
 
 
 def _unit_vectors(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

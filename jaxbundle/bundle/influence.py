@@ -62,8 +62,9 @@ class Influence:
         for result in self.results:
             rows = list(zip(*(c[:MOST_ROWS] for c in self.table(result.name).values())))
             text = [(*map(str, row[:4]), f"{row[4]:.4f}", significant(row[5])) for row in rows]
-            lines = table(("kind", "image", "point", "axis", "effect in σ", "derivative"), text,
-                          "llllrr")  # fmt: skip
+            lines = table(
+                ("kind", "image", "point", "axis", "effect in σ", "derivative"), text, "llllrr"
+            )
             blocks.append("\n".join([f"Influence on {result.words}", *lines]))
         return "\n\n".join(blocks)
 
@@ -89,8 +90,9 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     inspection, sigma0, _ = inspection_of(given)
     results = ask(inspection, of)
     if any(not _is_single(one) for one in results.asked):
-        raise InputError("influence: name single results, such as point:7:Z; a mean over all has "
-                         "no derivative")  # fmt: skip
+        raise InputError(
+            "influence: name single results, such as point:7:Z; a mean over all has no derivative"
+        )
     found, problem = inspection.solution, inspection.problem
     by_set = pull_back(found, found.slopes(inspection.of_tables(results.function)))
     of_result = [
@@ -99,10 +101,13 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     ]
     parts = list(observations(problem, *of_result))
     weight = np.concatenate([np.ravel(weight) for *_, weight in (part[:5] for part in parts)])
-    effects = np.stack([
-        np.concatenate([np.ravel(part[5 + r]) for part in parts])
-        for r in range(len(results.asked))
-    ], 1)  # fmt: skip
+    effects = np.stack(
+        [
+            np.concatenate([np.ravel(part[5 + r]) for part in parts])
+            for r in range(len(results.asked))
+        ],
+        1,
+    )
     used = weight > 0
     columns = {
         name: np.concatenate([column(*part[:4]) for part in parts])[used]
@@ -110,9 +115,12 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     }
     size = np.maximum(results.sigma, 1e-300)
     return Influence(
-        results.asked, sigma0 * results.sigma, columns, (effects / size)[used],
+        results.asked,
+        sigma0 * results.sigma,
+        columns,
+        (effects / size)[used],
         (effects * weight[:, None])[used],
-    )  # fmt: skip
+    )
 
 
 def _is_single(one: Asked) -> bool:

@@ -47,8 +47,10 @@ def load_adjustment(
         raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
     missing = sorted(set(found.own_models) - {model.name for model in models})
     if missing:
-        raise InputError(f"{path}: the camera models {list_some(missing)} are not built in; give "
-                         "them as models=[…]")  # fmt: skip
+        raise InputError(
+            f"{path}: the camera models {list_some(missing)} are not built in; give "
+            "them as models=[…]"
+        )
     found = dataclasses.replace(found, network=with_own_models(found.network, models))
     try:
         result = _restore(found, _problem(found, also, path))
@@ -75,8 +77,10 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
     kinds = tuple(o.kind.name for o in problem.system.observations)
     if (tables, kinds) != (state.tables, state.kinds):
         other = set(state.tables + state.kinds) ^ set(tables + kinds)
-        raise InputError(f"{path}: was adjusted with other user-defined tables and observations "
-                         f"({list_some(sorted(other))}); give the same as also=[…]")  # fmt: skip
+        raise InputError(
+            f"{path}: was adjusted with other user-defined tables and observations "
+            f"({list_some(sorted(other))}); give the same as also=[…]"
+        )
     start = _tree(problem.data.start, state.start)
     problem = problem.with_data(dataclasses.replace(problem.data, start=start))
     for table, free in zip(problem.system.tables, state.free):
@@ -93,9 +97,7 @@ def _restore(found: Stored, problem: Problem) -> Adjustment:
     history = History(*(jax.device_put(column) for column in state.history))
     values = _tree(problem.data.start, state.values)
     termination, iterations = map(np.int64, (state.termination, state.iterations))
-    minimum = Minimum(
-        values, jax.device_put(termination), jax.device_put(iterations), history
-    )
+    minimum = Minimum(values, jax.device_put(termination), jax.device_put(iterations), history)
     result = Adjustment(problem.network, problem, minimum, check=found.check, **found.notes)
     result.weights, result.robust_scale = found.image_weights, found.robust_scale
     return result

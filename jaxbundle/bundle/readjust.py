@@ -39,7 +39,10 @@ def snoop_network(
     problem, whole, doubt = found.problem, found.solution, None
     repeat = _Repeat(problem, again, "after data snooping", minimum)
     solution, removed = snoop(
-        whole, repeat, test=test, significance=significance,
+        whole,
+        repeat,
+        test=test,
+        significance=significance,
         doubtful=image_points_removed(problem, doubtful),
     )
     removed = [name_removed(problem, r) for r in removed]
@@ -132,9 +135,10 @@ def eliminate_parameters(problem, minimum, again, critical_t):
     while True:
         result = Adjustment(problem.network, problem, minimum)
         weak = [
-            name for _, name in result.insignificant(critical_t)
+            name
+            for _, name in result.insignificant(critical_t)
             if name.parameter not in models[name.id].core
-        ]  # fmt: skip
+        ]
         if not weak:
             return problem, minimum, names
         names.append(weak[0])

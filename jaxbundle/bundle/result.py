@@ -155,9 +155,12 @@ class Adjustment:
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
         lines = (
-            *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns,
+            *self.problem.network.warnings,
+            *self.findings,
+            *self.weakness.lines,
+            *turns,
             *self.doubts,
-        )  # fmt: skip
+        )
         return tuple(dict.fromkeys(lines))
 
     @property
@@ -299,7 +302,7 @@ class Adjustment:
             raise NotSolvedError(
                 f"the reduced system of {self.problem.system.reduced_size} unknowns was solved "
                 "by iteration and its factor does not fit into memory: only coordinates, σ0 "
-                            "and covariances of single unknowns (`covariance`) are available"
+                "and covariances of single unknowns (`covariance`) are available"
             )
         return self.inspection
 
@@ -490,8 +493,11 @@ class Adjustment:
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table by name: images, points, residuals, cameras (one row per parameter), checks or
         far_points."""
-        made = {"cameras": result_tables.parameters, "checks": result_tables.checks,
-                "far_points": result_tables.far_points}  # fmt: skip
+        made = {
+            "cameras": result_tables.parameters,
+            "checks": result_tables.checks,
+            "far_points": result_tables.far_points,
+        }
         if name in made:
             return made[name](self)
         if name not in ("images", "points", "residuals"):

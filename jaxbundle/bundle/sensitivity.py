@@ -73,8 +73,9 @@ class Budget:
             for c, cause in enumerate(self.causes):
                 own = np.nan if cause.sigma is None else cause.sigma
                 own *= self.angle_scale if cause.angle else 1.0
-                rows.append((result.name, cause.name, own, self.effects[c, r] * unit,
-                             shares[c + 1, r]))  # fmt: skip
+                rows.append(
+                    (result.name, cause.name, own, self.effects[c, r] * unit, shares[c + 1, r])
+                )
             rows.append((result.name, TOTAL, np.nan, total[r] * unit, 1.0))
         names = ("result", "cause", "sigma", "effect", "share")
         columns = dict(zip(names, zip(*rows)))
@@ -134,10 +135,12 @@ def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = 
     ]
     effects = np.concatenate(parts)
     ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])
-    by_cause = np.array([
-        [root_sum_of_squares(asked.of(effects[a:b])) for asked in results.asked]
-        for a, b in zip(ends, ends[1:])
-    ])  # fmt: skip
+    by_cause = np.array(
+        [
+            [root_sum_of_squares(asked.of(effects[a:b])) for asked in results.asked]
+            for a, b in zip(ends, ends[1:])
+        ]
+    )
     return Budget(results.asked, tuple(causes), sigma0 * results.sigma, by_cause, unit)
 
 
@@ -159,8 +162,6 @@ def inspection_of(given: Any) -> tuple[Inspection, float, float]:
         return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
     if not isinstance(given, Adjustment):
         raise InputError(
-            f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not "
-            f"{show(given)}"
+            f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not {show(given)}"
         )
     return given.cofactors, given.sigma0, given.angle_scale
-

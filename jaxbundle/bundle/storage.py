@@ -31,8 +31,16 @@ from jaxbundle.network.tables import (
 from jaxbundle.statistics.blunders import Removed, Suspect
 
 NETWORK = (
-    Network, LeftOut, Camera, Images, Points, Observations, Distances, Source, *KINDS.values()
-)  # fmt: skip
+    Network,
+    LeftOut,
+    Camera,
+    Images,
+    Points,
+    Observations,
+    Distances,
+    Source,
+    *KINDS.values(),
+)
 FORMAT = "jaxbundle adjustment 1"
 """Its number changes when older files cannot be read any more."""
 
@@ -108,15 +116,30 @@ def store(adjustment: Any, path: str | Path) -> None:
     problem, minimum = adjustment.problem, adjustment.minimum
     network = problem.network
     own = {get_model(c.model).name for c in network.cameras if is_own(get_model(c.model))}
-    named = ("removed", "eliminated", "method", "reduction", "sigma_factors", "robust", "suspects",
-             "findings")  # fmt: skip
+    named = (
+        "removed",
+        "eliminated",
+        "method",
+        "reduction",
+        "sigma_factors",
+        "robust",
+        "suspects",
+        "findings",
+    )
     notes = {name: getattr(adjustment, name) for name in named}
     found = Stored(
-        FORMAT, __version__, adjustment.fingerprint, adjustment.sigma0,
-        with_named_models(network), adjustment.check, tuple(sorted(own)),
-        _state(problem, minimum), notes | {"doubts": adjustment.given_doubts},
-        adjustment.weights, adjustment.robust_scale,
-    )  # fmt: skip
+        FORMAT,
+        __version__,
+        adjustment.fingerprint,
+        adjustment.sigma0,
+        with_named_models(network),
+        adjustment.check,
+        tuple(sorted(own)),
+        _state(problem, minimum),
+        notes | {"doubts": adjustment.given_doubts},
+        adjustment.weights,
+        adjustment.robust_scale,
+    )
     write_tree(path, found, CLASSES)
 
 
@@ -127,12 +150,15 @@ def _state(problem: Problem, minimum: Any) -> State:
     return State(
         tables=tuple(t.name for t in system.tables),
         kinds=tuple(o.kind.name for o in system.observations),
-        reduction=problem.reduction, lengths=problem.layout.lengths,
+        reduction=problem.reduction,
+        lengths=problem.layout.lengths,
         free=tuple(np.asarray(t.free) for t in system.tables),
         weights=leaves([system.data.weight[o.name] for o in system.observations]),
-        start=leaves(problem.data.start), values=leaves(minimum.values),
-        termination=int(minimum.termination), iterations=steps,
+        start=leaves(problem.data.start),
+        values=leaves(minimum.values),
+        termination=int(minimum.termination),
+        iterations=steps,
         history=tuple(
             np.asarray(x)[:steps] for x in (history.cost, history.damping, history.accepted)
         ),
-    )  # fmt: skip
+    )

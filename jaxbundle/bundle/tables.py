@@ -41,7 +41,8 @@ def cameras(adjustment) -> dict[str, dict]:
                     "sigma": float(sigma[name]) if name in sigma else None,
                     "free": name in sigma,
                     "t": _significance(value - default.get(name, 0.0), sigma[name])
-                    if name in sigma else None,
+                    if name in sigma
+                    else None,
                     "total_correlation": float(total[name]) if name in sigma else None,
                 }
                 for name, value in values.items()
@@ -135,10 +136,12 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     first, in the given order."""
     found = adjustment.reliability
     parts = observations(adjustment.problem, *found)
-    return concatenate([
-        residual_rows(adjustment, kind, image, point, axes, weight, Tested(*tested))
-        for kind, image, point, axes, weight, *tested in parts
-    ])  # fmt: skip
+    return concatenate(
+        [
+            residual_rows(adjustment, kind, image, point, axes, weight, Tested(*tested))
+            for kind, image, point, axes, weight, *tested in parts
+        ]
+    )
 
 
 def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
@@ -175,9 +178,13 @@ def _further(problem: Problem, found: Sequence[Rows]):
         axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))
         blank = np.full(given.number, "", dtype=object)
         yield (
-            given.kind.name, blank, np.array(touched, dtype=object), axes, weight,
+            given.kind.name,
+            blank,
+            np.array(touched, dtype=object),
+            axes,
+            weight,
             *(one.other[k] for one in found),
-        )  # fmt: skip
+        )
 
 
 def further_unknowns(adjustment) -> dict[str, dict]:

@@ -45,8 +45,9 @@ def advice(
     found = [
         f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "
         "determine the principal distance; they need varied tilts and distances"
-        for name in model.principal_distance if t.get(name, np.inf) < VAGUE_RATIO
-    ]  # fmt: skip
+        for name in model.principal_distance
+        if t.get(name, np.inf) < VAGUE_RATIO
+    ]
     found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
     if rms > LARGEST_RMS:
         found.append(

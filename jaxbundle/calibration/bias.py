@@ -107,8 +107,10 @@ class Bias:
         if not self.found:
             return "no bias is found at a level of 1 %"
         smooth = [name for name in self.found if name != "cells"]
-        remedy = {"camera": "another camera model (--models)", "board": "estimate the points of "
-                  "the board (--board-free)"}  # fmt: skip
+        remedy = {
+            "camera": "another camera model (--models)",
+            "board": "estimate the points of the board (--board-free)",
+        }
         what = f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
         part = f", {100 * self.ratio:.0f} % of the residual variance" if self.ratio > 0 else ""
         return f"the residuals contain a bias{part}, {what}"
@@ -185,10 +187,14 @@ def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
     XY = problem.network.points.position[problem.point, :2]
     plane, height = _powers(XY, 0, DEGREES["plane"]), _powers(XY, 2, DEGREES["heights"])
     of = found.slopes["point"]
-    return np.concatenate([
-        of[:, :, :1] * plane[:, None], of[:, :, 1:2] * plane[:, None],
-        of[:, :, 2:] * height[:, None],
-    ], 2)  # fmt: skip
+    return np.concatenate(
+        [
+            of[:, :, :1] * plane[:, None],
+            of[:, :, 1:2] * plane[:, None],
+            of[:, :, 2:] * height[:, None],
+        ],
+        2,
+    )
 
 
 def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:

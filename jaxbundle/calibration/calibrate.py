@@ -105,21 +105,34 @@ def calibrate(
     columns, rows = views.image_size
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
-        camera, model, start.parameters, free, prior, image_size=(int(columns), int(rows)),
+        camera,
+        model,
+        start.parameters,
+        free,
+        prior,
+        image_size=(int(columns), int(rows)),
         pixel_size=pixel_size,
-    )  # fmt: skip
+    )
     network = board_network(
-        start, made, sigma_image, board_sigma=board_sigma, board_free=board_free,
+        start,
+        made,
+        sigma_image,
+        board_sigma=board_sigma,
+        board_free=board_free,
         object_unit=object_unit,
-    )  # fmt: skip
+    )
     result = adjust(network, **options)
     if board.diameter is not None and board.kind != "chessboard" and result.converged:
         for _ in range(ECCENTRICITY_ROUNDS):
             centred = _without_eccentricity(start, result, made)
             network = board_network(
-                dataclasses.replace(start, views=centred), made, sigma_image,
-                board_sigma=board_sigma, board_free=board_free, object_unit=object_unit,
-            )  # fmt: skip
+                dataclasses.replace(start, views=centred),
+                made,
+                sigma_image,
+                board_sigma=board_sigma,
+                board_free=board_free,
+                object_unit=object_unit,
+            )
             result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
     return Calibration(start.views, result, cross_validation)
@@ -168,13 +181,22 @@ def board_network(
         {"id": names, "camera": [camera.id] * len(names)}
         | dict(zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), exterior.T)),
         points,
-        {"image": names[view], "point": ids[point], "x": xy[:, 0], "y": xy[:, 1],
-         "sx": np.full(len(xy), sx), "sy": np.full(len(xy), sy)},
+        {
+            "image": names[view],
+            "point": ids[point],
+            "x": xy[:, 0],
+            "y": xy[:, 1],
+            "sx": np.full(len(xy), sx),
+            "sy": np.full(len(xy), sy),
+        },
         sigma_origin=UNIT if sigma_image is None else STATED,
-        datum="inner" if board_free else "control", residuals="measured",
-        angle_unit="deg", image_unit=model.unit, object_unit=object_unit,
+        datum="inner" if board_free else "control",
+        residuals="measured",
+        angle_unit="deg",
+        image_unit=model.unit,
+        object_unit=object_unit,
         name=f"Calibration of {camera.id}",
-    )  # fmt: skip
+    )
     for warning in views.warnings:
         network = network.warn(warning)
     if start.behind:
@@ -201,9 +223,7 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
     radius = present(views.board.diameter) / 2
     shift = _shifts(model, p, poses, views.board.points, radius)
     xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
-    return dataclasses.replace(
-        views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size)
-    )
+    return dataclasses.replace(views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size))
 
 
 @partial(compile_once, static=0)

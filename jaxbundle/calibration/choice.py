@@ -235,9 +235,7 @@ def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
 
 def _ids(network: Network) -> list[tuple[str, str]]:
     rays = network.observations
-    return [
-        (network.images.id[i], network.points.id[p]) for i, p in zip(rays.image, rays.point)
-    ]
+    return [(network.images.id[i], network.points.id[p]) for i, p in zip(rays.image, rays.point)]
 
 
 def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
@@ -265,10 +263,17 @@ def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
     k = n - redundancy
     sums, counts = (np.bincount(network.observations.image, w) for w in (squares, None))
     return Candidate(
-        name, calibration, len(camera.free), k, float(np.sqrt(S / redundancy)),
-        float(np.sqrt(_squares(again, camera).mean())), float(np.sqrt(squares.mean())),
-        sums / counts, n * np.log(S / n) + 2 * k, n * np.log(S / n) + k * np.log(n),
-    )  # fmt: skip
+        name,
+        calibration,
+        len(camera.free),
+        k,
+        float(np.sqrt(S / redundancy)),
+        float(np.sqrt(_squares(again, camera).mean())),
+        float(np.sqrt(squares.mean())),
+        sums / counts,
+        n * np.log(S / n) + 2 * k,
+        n * np.log(S / n) + k * np.log(n),
+    )
 
 
 def _faint(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
@@ -296,6 +301,9 @@ def _difference(best: Candidate, one: Candidate) -> Difference | None:
     sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
     ratio = comparison.length / sigma
     return Difference(
-        comparison, C, comparison.rms / size, comparison.largest / size,
+        comparison,
+        C,
+        comparison.rms / size,
+        comparison.largest / size,
         float(np.sqrt(np.nanmean(ratio**2))),
-    )  # fmt: skip
+    )

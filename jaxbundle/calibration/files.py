@@ -56,9 +56,11 @@ COMPARED = ["models.txt", "models.json", "difference_*.png"]
 """Files of a comparison of models."""
 RIG, CONVERSIONS = "rig", "conversions.txt"
 RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "kalibr": ("camchain.yaml", ()), "mrcal": ("mrcal", MRCAL_FILES),
-    "opencv-stereo": ("stereo.yaml", ()), "ros-stereo": ("camera_info", ROS_FILES),
-}  # fmt: skip
+    "kalibr": ("camchain.yaml", ()),
+    "mrcal": ("mrcal", MRCAL_FILES),
+    "opencv-stereo": ("stereo.yaml", ()),
+    "ros-stereo": ("camera_info", ROS_FILES),
+}
 """Files and folders of a rig for other programs, by their format; the last two of pairs."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
@@ -81,17 +83,30 @@ def files_of(names: Sequence[str]) -> list[str]:
     found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
-        found += [f"{place}{file}" for file in (
-            REPORT, PAGE, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
-            *(f"{ADJUSTED}/{file}" for file in NETWORK_FILES),
-            *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
-        )]  # fmt: skip
+        found += [
+            f"{place}{file}"
+            for file in (
+                REPORT,
+                PAGE,
+                RESULT,
+                f"{name}.toml",
+                f"{name}.yaml",
+                *OWN_FIGURES,
+                *FIGURES,
+                *(f"{ADJUSTED}/{file}" for file in NETWORK_FILES),
+                *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
+            )
+        ]
         found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
     if len(names) > 1:
-        found += [f"{RIG}/{file}" for file in (
-            CONVERSIONS, *(name for name, _ in RIG_FILES.values()),
-            *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
-        )]  # fmt: skip
+        found += [
+            f"{RIG}/{file}"
+            for file in (
+                CONVERSIONS,
+                *(name for name, _ in RIG_FILES.values()),
+                *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
+            )
+        ]
     return found
 
 
@@ -112,9 +127,13 @@ def write_calibration(
 
 
 def _fill(
-    calibration, folder: Path, plots: bool, origin: Origin, choice=None,
+    calibration,
+    folder: Path,
+    plots: bool,
+    origin: Origin,
+    choice=None,
     progress: Progress | None = None,
-) -> None:  # fmt: skip
+) -> None:
     name = file_name(calibration.name)
     folder.mkdir(exist_ok=True)
     write_text(folder / REPORT, head_line(origin) + calibration.report())
@@ -147,9 +166,7 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     return remark
 
 
-def write_calibrations(
-    found, folder: str | Path, plots: bool = True, force: bool = False
-) -> None:
+def write_calibrations(found, folder: str | Path, plots: bool = True, force: bool = False) -> None:
     """Write one calibration into a folder, several into separate subfolders.
 
     Several have a common report.txt, report.html and result.json; a rig adds its
@@ -163,9 +180,13 @@ def write_calibrations(
 
 
 def fill_calibrations(
-    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None,
+    found,
+    folder: Path,
+    plots: bool,
+    origin: Origin = UNKNOWN,
+    choice=None,
     progress: Progress | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
     the page."""
     if len(found.cameras) == 1:
@@ -224,18 +245,24 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     return document
 
 
-def fill_comparison(
-    choice, folder: Path, plots: bool, progress: Progress | None = None
-) -> None:
+def fill_comparison(choice, folder: Path, plots: bool, progress: Progress | None = None) -> None:
     """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
     if plots:
-        write_figures(folder, {
-            f"difference_{file_name(model)}": (
-                (7.5, 6), None, partial(choice.plot_difference, model))
-            for model, apart in choice.differences.items() if apart is not None
-        }, progress)  # fmt: skip
+        write_figures(
+            folder,
+            {
+                f"difference_{file_name(model)}": (
+                    (7.5, 6),
+                    None,
+                    partial(choice.plot_difference, model),
+                )
+                for model, apart in choice.differences.items()
+                if apart is not None
+            },
+            progress,
+        )
 
 
 def save_plots(calibration, folder: Path, progress: Progress | None = None) -> None:

@@ -72,13 +72,18 @@ def _describe_one(calibration, choice=None) -> Addition:
         return Addition("", overview=overview, sections=(*sections, *_list_failed(views)))
     sections += [
         _quality(calibration.coverage, calibration.reported_maps, _unit(calibration)),
-        _validation(calibration), *_list_failed(views),
-    ]  # fmt: skip
+        _validation(calibration),
+        *_list_failed(views),
+    ]
     overview += list_messages("Advice", calibration.suggestions)
     return Addition(
-        "", tuple(find_own(calibration)), WITHOUT, tuple(calibration.shortcomings), overview,
+        "",
+        tuple(find_own(calibration)),
+        WITHOUT,
+        tuple(calibration.shortcomings),
+        overview,
         tuple(sections),
-    )  # fmt: skip
+    )
 
 
 def _unit(calibration) -> str:
@@ -90,8 +95,10 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
     counts = np.where(covered.counts > 0, covered.counts, np.nan)
     caption = f"Measured points by cell: {coverage_in_words(covered)}"
     parts = [figure(draw_field(counts, 0), caption)]
-    parts += ["<h3>Uncertainty of a projected point (σ, pixels)</h3>\n",
-              grid(MAPS_HEADER, map_rows(maps, unit))]  # fmt: skip
+    parts += [
+        "<h3>Uncertainty of a projected point (σ, pixels)</h3>\n",
+        grid(MAPS_HEADER, map_rows(maps, unit)),
+    ]
     parts.append('<div class="maps">\n')
     for one, (held, *_) in zip(maps, map_rows(maps, unit)):
         caption = f"σ over the image from corner to corner, pixels; point held in {held}"
@@ -106,20 +113,30 @@ def _validation(calibration) -> Section:
     """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
     # σ is 0 everywhere if the measurements fit exactly, and no number without a ray
-    known = [(name, np.log10(distances[s > 0]), np.log10(s[s > 0]), kind) for name, s, kind in (
-        ("middle of the image", middle, "first"), ("worst corner", corners, "second")
-    )]  # fmt: skip
+    known = [
+        (name, np.log10(distances[s > 0]), np.log10(s[s > 0]), kind)
+        for name, s, kind in (
+            ("middle of the image", middle, "first"),
+            ("worst corner", corners, "second"),
+        )
+    ]
     curves = [Curve(name, x, y, kind=kind) for name, x, y, kind in known if len(x)]
     unit = _unit(calibration)
     if curves:
-        drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
-                              (float(np.log10(reported[0, 0])), "median distance of the board"))
+        drawing = draw_curves(
+            curves,
+            f"distance [{unit}]",
+            "σ of a projected point [px]",
+            "xy",
+            (float(np.log10(reported[0, 0])), "median distance of the board"),
+        )
         shown = figure(drawing, "Uncertainty against the distance of the point, in the scene")
     else:
         shown = paragraph("The measurements fit exactly: σ of a projected point is 0.")
     parts = [shown, "<h3>Cross-validation</h3>\n"]
-    parts += [paragraph(words[:1].upper() + words[1:])
-              for words in cross_validation_in_words(calibration)]  # fmt: skip
+    parts += [
+        paragraph(words[:1].upper() + words[1:]) for words in cross_validation_in_words(calibration)
+    ]
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
 
 
@@ -131,11 +148,16 @@ def _list_failed(views) -> list[Section]:
 
 
 def _models(choice) -> Section:
-    parts = [paragraph(choice.sentence), grid(MODELS_HEADER, model_rows(choice)),
-             paragraph(models_legend(choice))]  # fmt: skip
+    parts = [
+        paragraph(choice.sentence),
+        grid(MODELS_HEADER, model_rows(choice)),
+        paragraph(models_legend(choice)),
+    ]
     if choice.failed:
-        parts += ["<h3>Not compared</h3>\n",
-                  grid(("model", "reason"), choice.failed.items(), "words")]  # fmt: skip
+        parts += [
+            "<h3>Not compared</h3>\n",
+            grid(("model", "reason"), choice.failed.items(), "words"),
+        ]
     return Section("models", "Camera models compared", "".join(parts), "Models")
 
 
@@ -166,11 +188,15 @@ def _describe_several(found, origin: Origin) -> Page:
 def _rig(rig, unit: str) -> Section:
     parts = [facts(rig_facts(rig, unit))]
     for name, m in rig.mountings.items():
-        parts += [f"<h3>{text(mounting_title(rig, name))}</h3>\n",
-                  grid(("", "value", "σ", "unit"), mounting_rows(m, unit))]  # fmt: skip
+        parts += [
+            f"<h3>{text(mounting_title(rig, name))}</h3>\n",
+            grid(("", "value", "σ", "unit"), mounting_rows(m, unit)),
+        ]
     for name in rig.names:
-        parts += [f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",
-                  grid(("parameter", "value", "σ"), rig_parameter_rows(rig, name))]  # fmt: skip
+        parts += [
+            f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",
+            grid(("parameter", "value", "σ"), rig_parameter_rows(rig, name)),
+        ]
     return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig")
 
 
@@ -178,14 +204,20 @@ def _table_of_cameras(found) -> Listing:
     """One row per parameter of every separately calibrated camera."""
     rows = [
         (name, one.camera.model, parameter, value, one.sigma.get(parameter))
-        for name, one in found.cameras.items() if one.converged
+        for name, one in found.cameras.items()
+        if one.converged
         for parameter, value in one.parameters.items()
-    ]  # fmt: skip
+    ]
     camera, model, parameter, value, sigma = zip(*rows) if rows else ((),) * 5
     words = lambda values: np.array(values, dtype=object)
-    return Listing("Cameras, calibrated separately", {
-        "camera": Column(words(camera), "camera"), "model": Column(words(model), "model"),
-        "parameter": Column(words(parameter), "parameter"),
-        "value": estimates(numbers(value), numbers(sigma), "value"),
-        "sigma": Column(numbers(sigma), "σ"),
-    }, "result.json")  # fmt: skip
+    return Listing(
+        "Cameras, calibrated separately",
+        {
+            "camera": Column(words(camera), "camera"),
+            "model": Column(words(model), "model"),
+            "parameter": Column(words(parameter), "parameter"),
+            "value": estimates(numbers(value), numbers(sigma), "value"),
+            "sigma": Column(numbers(sigma), "σ"),
+        },
+        "result.json",
+    )

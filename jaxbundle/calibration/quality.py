@@ -55,12 +55,19 @@ class UncertaintyMap:
         """σ and covariance over u and v (pixels), as an `xarray.Dataset` (extra `grids`)."""
         axes = np.array(["u", "v"])
         return data_set(
-            {"sigma": (("v", "u"), self.sigma, "px"),
-             "covariance": (("v", "u", "axis", "other_axis"), self.covariance, "px²")},
-            {"v": (self.uv[:, 0, 1], "px"), "u": (self.uv[0, :, 0], "px"),
-             "axis": (axes, ""), "other_axis": (axes, "")},
-            frame=self.frame, distance=self.distance,
-        )  # fmt: skip
+            {
+                "sigma": (("v", "u"), self.sigma, "px"),
+                "covariance": (("v", "u", "axis", "other_axis"), self.covariance, "px²"),
+            },
+            {
+                "v": (self.uv[:, 0, 1], "px"),
+                "u": (self.uv[0, :, 0], "px"),
+                "axis": (axes, ""),
+                "other_axis": (axes, ""),
+            },
+            frame=self.frame,
+            distance=self.distance,
+        )
 
     @property
     def middle(self) -> float:
@@ -142,10 +149,12 @@ def over_distance(
     variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
     t = 1 / np.asarray(distances, float)
-    weight = np.array([
-        np.prod([(t - other) / (own - other) for other in near if other != own], axis=0)
-        for own in near
-    ])
+    weight = np.array(
+        [
+            np.prod([(t - other) / (own - other) for other in near if other != own], axis=0)
+            for own in near
+        ]
+    )
     of = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
     return of(middle), np.fmax.reduce(of(variance.T))
 
@@ -178,14 +187,17 @@ def coverage(uv: Float[np.ndarray, "n 2"], image_size, cells=CELLS) -> Coverage:
     )
     top, left = max(rows // 4, 1), max(columns // 6, 1)
     corners = {
-        "upper left": counts[:top, :left], "upper right": counts[:top, -left:],
-        "lower left": counts[-top:, :left], "lower right": counts[-top:, -left:],
-    }  # fmt: skip
+        "upper left": counts[:top, :left],
+        "upper right": counts[:top, -left:],
+        "lower left": counts[-top:, :left],
+        "lower right": counts[-top:, -left:],
+    }
     away = np.linalg.norm(uv - (np.array(image_size) - 1) / 2, axis=1)
     return Coverage(
-        counts.astype(int), {name: bool((c > 0).any()) for name, c in corners.items()},
+        counts.astype(int),
+        {name: bool((c > 0).any()) for name, c in corners.items()},
         float(away.max(initial=0.0) / (np.hypot(w, h) / 2)),
-    )  # fmt: skip
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,9 +260,13 @@ def cross_validation(result) -> CrossValidation | None:
     test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
     rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
     return CrossValidation(
-        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, (own[0], own[1]),
+        rms(halves),
+        rms(held),
+        dict(zip(names, (d / scale).tolist())),
+        test,
+        (own[0], own[1]),
         _compare(network.cameras[0], own),
-    )  # fmt: skip
+    )
 
 
 def _compare(camera: Camera, halves) -> Comparison | None:
@@ -258,8 +274,9 @@ def _compare(camera: Camera, halves) -> Comparison | None:
     try:
         return compare_cameras(
             *((model, parameters) for parameters in halves),
-            image_size=camera.image_size, pixel_size=camera.pixel_size,
-        )  # fmt: skip
+            image_size=camera.image_size,
+            pixel_size=camera.pixel_size,
+        )
     except ValueError:
         return None
 
@@ -273,10 +290,12 @@ def at_result(network: Network, result, keep=None) -> Network:
     return network.replace(
         cameras=(dataclasses.replace(camera, parameters=parameters),),
         images=dataclasses.replace(
-            network.images, position=exterior[:, :3], angles=exterior[:, 3:]),
+            network.images, position=exterior[:, :3], angles=exterior[:, 3:]
+        ),
         observations=network.observations.take(kept_rays(result) if keep is None else keep),
-        warnings=(), notes=(),
-    )  # fmt: skip
+        warnings=(),
+        notes=(),
+    )
 
 
 def part(network: Network, keep) -> Network:
@@ -287,12 +306,16 @@ def part(network: Network, keep) -> Network:
     chosen = np.flatnonzero(keep)
     return network.replace(
         images=dataclasses.replace(
-            images, id=tuple(images.id[i] for i in chosen), camera=images.camera[chosen],
-            position=images.position[chosen], angles=images.angles[chosen],
-            sigma=images.sigma[chosen], source=images.source.take(chosen),
+            images,
+            id=tuple(images.id[i] for i in chosen),
+            camera=images.camera[chosen],
+            position=images.position[chosen],
+            angles=images.angles[chosen],
+            sigma=images.sigma[chosen],
+            source=images.source.take(chosen),
         ),
         observations=dataclasses.replace(rays, image=index[rays.image]),
-    )  # fmt: skip
+    )
 
 
 def _held(network: Network, parameters) -> Network:

@@ -79,10 +79,12 @@ def _camera(calibration):
 def _quality(calibration):
     lines = heading("Quality")
     away, unit = calibration.distances, clean(calibration.adjustment.network.object_unit)
-    lines += facts([
-        ("Coverage", coverage_in_words(calibration.coverage)),
-        ("Distances", f"{away.min():.4g} to {away.max():.4g} {unit}"),
-    ])  # fmt: skip
+    lines += facts(
+        [
+            ("Coverage", coverage_in_words(calibration.coverage)),
+            ("Distances", f"{away.min():.4g} to {away.max():.4g} {unit}"),
+        ]
+    )
     lines += ["", "Uncertainty of a projected point (σ, pixels)"]
     lines += table(MAPS_HEADER, map_rows(calibration.reported_maps, unit), "lrr")
     lines += ["", *paragraph(mapping_error_in_words(calibration.mapping_error))]
@@ -146,11 +148,15 @@ def as_dict(calibration, brief: bool = False) -> dict:
     views, adjustment = calibration.views, calibration.adjustment
     about = {
         "camera": calibration.name,
-        "board": {"kind": views.board.kind, "columns": views.board.columns,
-                  "rows": views.board.rows, "square": views.board.square},
+        "board": {
+            "kind": views.board.kind,
+            "columns": views.board.columns,
+            "rows": views.board.rows,
+            "square": views.board.square,
+        },
         "image_size": list(views.image_size),
         "photographs": {"used": list(views.names), "failed": dict(views.failed)},
-    }  # fmt: skip
+    }
     if calibration.converged:
         about |= _quality_dict(calibration)
     found = {"calibration": about, **result_dict(adjustment, brief)}
@@ -167,42 +173,58 @@ def _quality_dict(calibration) -> dict:
         "coverage": _coverage_dict(covered),
         "uncertainty": _maps_dict(calibration.reported_maps),
         "mapping_error": _mapping_error_dict(calibration.mapping_error),
-        "bias": None if bias is None else {
-            "cells": bias.cells, "corner_sigma": bias.corner_sigma,
-            "residual_sigma": bias.residual_sigma, "ratio": bias.ratio, "found": list(bias.found),
-            "tests": {name: {"F": test.F, "degrees": list(test.degrees),
-                             "probability": test.probability}
-                      for name, test in bias.tests.items()},
+        "bias": None
+        if bias is None
+        else {
+            "cells": bias.cells,
+            "corner_sigma": bias.corner_sigma,
+            "residual_sigma": bias.residual_sigma,
+            "ratio": bias.ratio,
+            "found": list(bias.found),
+            "tests": {
+                name: {"F": test.F, "degrees": list(test.degrees), "probability": test.probability}
+                for name, test in bias.tests.items()
+            },
         },
-        "cross_validation": None if checked is None else {
-            "rms_own": checked.rms_own, "rms_other": checked.rms_other, "test": checked.test,
-            "difference": checked.difference, "halves": list(checked.halves),
-            "images": None if checked.comparison is None else {
-                "rms": checked.comparison.rms, "largest": checked.comparison.largest,
+        "cross_validation": None
+        if checked is None
+        else {
+            "rms_own": checked.rms_own,
+            "rms_other": checked.rms_other,
+            "test": checked.test,
+            "difference": checked.difference,
+            "halves": list(checked.halves),
+            "images": None
+            if checked.comparison is None
+            else {
+                "rms": checked.comparison.rms,
+                "largest": checked.comparison.largest,
                 "unit": checked.comparison.unit,
             },
         },
         "advice": calibration.advice,
-    }  # fmt: skip
-
+    }
 
 
 def choice_text(found) -> str:
     """The comparison of models (`choice.ModelComparison`)."""
     lines = ["Camera models compared", "=" * 100]
-    lines += facts([
-        ("Photographs", f"{len(found.views)}, in {found.folds} folds; "
-         f"{len(found.gross)} points that no model explains are left out"),
-    ])  # fmt: skip
+    lines += facts(
+        [
+            (
+                "Photographs",
+                f"{len(found.views)}, in {found.folds} folds; "
+                f"{len(found.gross)} points that no model explains are left out",
+            ),
+        ]
+    )
     lines += ["", *table(MODELS_HEADER, model_rows(found), "lrrrrrrrrr"), ""]
     lines += paragraph(models_legend(found))
     lines += [f"not compared: {clean(name)}: {clean(why)}" for name, why in found.failed.items()]
     return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(found.sentence)])
 
 
-MODELS_HEADER = (
-    "model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ"
-)  # fmt: skip
+MODELS_HEADER = ("model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ")
 
 
 def model_rows(found) -> list[tuple[str, ...]]:
@@ -211,13 +233,23 @@ def model_rows(found) -> list[tuple[str, ...]]:
     rows = []
     for one in found.candidates:
         apart = found.differences.get(one.model)
-        map_of = ("", "", "") if apart is None else (
-            fixed(apart.rms, 3), fixed(apart.largest, 3), fixed(apart.over_sigma, 1))  # fmt: skip
-        rows.append((
-            one.model, str(one.free), fixed(one.sigma0, 3), fixed(one.rms, 4),
-            fixed(one.left_out, 4), fixed(one.aic - low["aic"], 1),
-            fixed(one.bic - low["bic"], 1), *map_of,
-        ))  # fmt: skip
+        map_of = (
+            ("", "", "")
+            if apart is None
+            else (fixed(apart.rms, 3), fixed(apart.largest, 3), fixed(apart.over_sigma, 1))
+        )
+        rows.append(
+            (
+                one.model,
+                str(one.free),
+                fixed(one.sigma0, 3),
+                fixed(one.rms, 4),
+                fixed(one.left_out, 4),
+                fixed(one.aic - low["aic"], 1),
+                fixed(one.bic - low["bic"], 1),
+                *map_of,
+            )
+        )
     return rows
 
 
@@ -236,45 +268,76 @@ def choice_dict(found) -> dict:
     for one in found.candidates:
         apart = found.differences.get(one.model)
         candidates[one.model] = {
-            "free": one.free, "unknowns": one.unknowns, "sigma0": one.sigma0, "rms": one.rms,
-            "left_out": one.left_out, "aic": one.aic, "bic": one.bic,
-            "parameters": one.calibration.parameters, "sigma": one.calibration.sigma,
-            "difference": None if apart is None else {
-                "rms": apart.rms, "largest": apart.largest, "over_sigma": apart.over_sigma,
+            "free": one.free,
+            "unknowns": one.unknowns,
+            "sigma0": one.sigma0,
+            "rms": one.rms,
+            "left_out": one.left_out,
+            "aic": one.aic,
+            "bic": one.bic,
+            "parameters": one.calibration.parameters,
+            "sigma": one.calibration.sigma,
+            "difference": None
+            if apart is None
+            else {
+                "rms": apart.rms,
+                "largest": apart.largest,
+                "over_sigma": apart.over_sigma,
             },
-        }  # fmt: skip
+        }
     return {
-        "suffices": found.suffices.model, "best": found.best.model, "sentence": found.sentence,
-        "folds": found.folds, "photographs": list(found.views),
-        "gross": [list(pair) for pair in found.gross], "failed": found.failed,
+        "suffices": found.suffices.model,
+        "best": found.best.model,
+        "sentence": found.sentence,
+        "folds": found.folds,
+        "photographs": list(found.views),
+        "gross": [list(pair) for pair in found.gross],
+        "failed": found.failed,
         "models": candidates,
-    }  # fmt: skip
+    }
 
 
 def _coverage_dict(covered) -> dict:
-    return {"part": covered.part, "reach": covered.reach, "corners": covered.corners,
-            "counts": covered.counts.tolist()}  # fmt: skip
+    return {
+        "part": covered.part,
+        "reach": covered.reach,
+        "corners": covered.corners,
+        "counts": covered.counts.tolist(),
+    }
 
 
 def _maps_dict(maps) -> list[dict]:
     number = lambda x: float(x) if np.isfinite(x) else None
     return [
-        {"frame": m.frame, "distance": number(m.distance), "middle": number(m.middle),
-         "corners": number(m.corners)}
+        {
+            "frame": m.frame,
+            "distance": number(m.distance),
+            "middle": number(m.middle),
+            "corners": number(m.corners),
+        }
         for m in maps
-    ]  # fmt: skip
+    ]
 
 
 def _mapping_error_dict(error) -> dict | None:
-    return None if error is None else {
-        "expected": error.expected, "rms": error.rms, "quantile_95": error.quantile(),
-        "share": error.share, "measured": _mapping_error_dict(error.measured),
-    }  # fmt: skip
+    return (
+        None
+        if error is None
+        else {
+            "expected": error.expected,
+            "rms": error.rms,
+            "quantile_95": error.quantile(),
+            "share": error.share,
+            "measured": _mapping_error_dict(error.measured),
+        }
+    )
 
 
 def _rig_quality(rig, name: str) -> dict:
-    return {"coverage": _coverage_dict(rig.coverage(name)),
-            "uncertainty": _maps_dict(rig.reported_maps(name))}  # fmt: skip
+    return {
+        "coverage": _coverage_dict(rig.coverage(name)),
+        "uncertainty": _maps_dict(rig.reported_maps(name)),
+    }
 
 
 def several_text(found) -> str:
@@ -297,9 +360,10 @@ def rig_text(rig) -> str:
         lines += heading(f"Camera {clean(name)} in the rig")
         lines += table(("parameter", "value", "σ"), rig_parameter_rows(rig, name), "lrr")
         said = coverage_in_words(rig.coverage(name))
-        lines += ["", *paragraph(
-            f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"
-        )]  # fmt: skip
+        lines += [
+            "",
+            *paragraph(f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"),
+        ]
         lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
     lines += observations.residuals(rig, LIMIT, "pope")
     lines += [*observations.redundancy(rig), *observations.removals(rig)]
@@ -313,10 +377,16 @@ def rig_facts(rig, unit: str) -> list[tuple[str, str]]:
         ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
         ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
         ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
-        ("Board", "its points estimated, inner constraints" if rig.rig.points_free else "exact"
-         if rig.rig.point_sigma is None else f"known with σ {rig.rig.point_sigma:g} {unit}"),
+        (
+            "Board",
+            "its points estimated, inner constraints"
+            if rig.rig.points_free
+            else "exact"
+            if rig.rig.point_sigma is None
+            else f"known with σ {rig.rig.point_sigma:g} {unit}",
+        ),
         *((clean(epoch), clean(why)) for epoch, why in odd),
-    ]  # fmt: skip
+    ]
 
 
 def mounting_title(rig, name: str) -> str:
@@ -359,17 +429,23 @@ def rig_dict(rig, brief: bool = False) -> dict:
         "rms": rig.rms,
         "mountings": {
             name: {
-                "base": m.base.tolist(), "sigma_base": m.sigma[:3].tolist(),
-                "angles": m.angles.tolist(), "sigma_angles": m.sigma[3:].tolist(),
-                "rotation": m.rotation.tolist(), "covariance": m.covariance.tolist(),
-                "length": m.length, "sigma_length": m.length_sigma,
+                "base": m.base.tolist(),
+                "sigma_base": m.sigma[:3].tolist(),
+                "angles": m.angles.tolist(),
+                "sigma_angles": m.sigma[3:].tolist(),
+                "rotation": m.rotation.tolist(),
+                "covariance": m.covariance.tolist(),
+                "length": m.length,
+                "sigma_length": m.length_sigma,
             }
             for name, m in rig.mountings.items()
         },
         "cameras": {
-            name: {n: {"value": value, "sigma": rig.sigma[name].get(n)}
-                   for n, value in rig.parameters[name].items()}
+            name: {
+                n: {"value": value, "sigma": rig.sigma[name].get(n)}
+                for n, value in rig.parameters[name].items()
+            }
             for name in rig.names
         },
         "quality": {name: _rig_quality(rig, name) for name in rig.names},
-    } | ({} if brief else {"residuals": residuals})  # fmt: skip
+    } | ({} if brief else {"residuals": residuals})

@@ -145,10 +145,16 @@ class Calibration:
     def shortcomings(self) -> list[str]:
         """Warnings in words."""
         found = advice(
-            self.position, self.rotation, self.views.board.points.mean(0), self._unit,
-            self.coverage, self.rms, self._significance, get_model(self.camera.model),
+            self.position,
+            self.rotation,
+            self.views.board.points.mean(0),
+            self._unit,
+            self.coverage,
+            self.rms,
+            self._significance,
+            get_model(self.camera.model),
             self.__dict__.get("cross_validation"),
-        )  # fmt: skip
+        )
         missed = left_out(self.adjustment)
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
@@ -173,8 +179,13 @@ class Calibration:
         """Near (the median distance of the board), at ten times that, at infinity; and without the
         scene."""
         near = float(np.median(self.distances))
-        chosen = (("scene", near), ("scene", 10 * near), ("scene", np.inf),
-                  ("rotation", np.inf), ("camera", np.inf))  # fmt: skip
+        chosen = (
+            ("scene", near),
+            ("scene", 10 * near),
+            ("scene", np.inf),
+            ("rotation", np.inf),
+            ("camera", np.inf),
+        )
         return [self.uncertainty(distance, frame) for frame, distance in chosen]
 
     def uncertainty_over_distance(self, distances: Float[np.ndarray, " n"]):

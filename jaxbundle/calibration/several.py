@@ -67,8 +67,10 @@ def calibrate_cameras(
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     found = {}
     for name, given in photographs.items():
-        tell = progress if progress is None or len(photographs) == 1 else partial(
-            _tell, progress, name
+        tell = (
+            progress
+            if progress is None or len(photographs) == 1
+            else partial(_tell, progress, name)
         )
         try:
             found[name] = calibrate(given, board, camera=name, progress=tell, **options)

@@ -42,8 +42,9 @@ def simulate_views(
         raise InputError(f"station {row + 1} stands behind the board, at Z ≤ 0")
     model, points = get_model(camera.model), board.points
     width, height = unit_size(model, camera.pixel_size)
-    network = simulate(stations, points, camera, noise=(noise * width, noise * height), seed=seed,
-                       min_rays=1)  # fmt: skip
+    network = simulate(
+        stations, points, camera, noise=(noise * width, noise * height), seed=seed, min_rays=1
+    )
     rays = network.observations
     xy = np.full((len(stations), len(points), 2), np.nan)
     number = np.array([int(id) - 1 for id in network.points.id])

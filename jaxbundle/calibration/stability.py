@@ -93,28 +93,40 @@ class Stability:
 
     def to_dict(self) -> dict:
         """The result as plain dicts and numbers, as in JSON."""
-        test = lambda one: {"chi2": one.chi2, "degrees": one.degrees,
-                            "probability": one.probability}  # fmt: skip
+        test = lambda one: {
+            "chi2": one.chi2,
+            "degrees": one.degrees,
+            "probability": one.probability,
+        }
         rows = {}
         for k, name in enumerate(self.names):
             rows[name] = {
-                "mean": float(self.mean[k]), "sigma": float(self.mean_sigma[k]),
-                "between": float(self.between[k]), "probability": float(self.probability[k]),
-                "epochs": self.values[:, k].tolist(), "sigma_epochs": self.sigma[:, k].tolist(),
+                "mean": float(self.mean[k]),
+                "sigma": float(self.mean_sigma[k]),
+                "between": float(self.between[k]),
+                "probability": float(self.probability[k]),
+                "epochs": self.values[:, k].tolist(),
+                "sigma_epochs": self.sigma[:, k].tolist(),
             }
             for key, value in {
-                "slope": self.slope, "sigma_slope": self.slope_sigma,
-                "probability_slope": self.slope_probability, "about_slope": self.about_slope,
-            }.items():  # fmt: skip
+                "slope": self.slope,
+                "sigma_slope": self.slope_sigma,
+                "probability_slope": self.slope_probability,
+                "about_slope": self.about_slope,
+            }.items():
                 if value is not None:
                     rows[name][key] = float(value[k])
         return {
-            "parameters": rows, "all_parameters": test(self.all_parameters),
+            "parameters": rows,
+            "all_parameters": test(self.all_parameters),
             "rotation_removed": test(self.rotation_removed),
-            "image": {"found": self.image_found, "expected": self.image_expected,
-                      "between": self.image_between},
+            "image": {
+                "found": self.image_found,
+                "expected": self.image_expected,
+                "between": self.image_between,
+            },
             "at": None if self.at is None else self.at.tolist(),
-        }  # fmt: skip
+        }
 
 
 def stability(
@@ -149,10 +161,21 @@ def stability(
         columns = [_line_of(p[:, k], sigma[:, k], x) for k in range(len(names))]
         trend = np.array([_trend(*column[:3], len(x)) for column in columns]).T
     return Stability(
-        names, p, sigma, mean, mean_sigma, tau, probability, _homogeneity(p, C),
-        _homogeneity(p @ F.T, F @ C @ F.T), np.sqrt(found), np.sqrt(expected),
-        float(np.sqrt(max(found - expected, 0.0))), x, *trend,
-    )  # fmt: skip
+        names,
+        p,
+        sigma,
+        mean,
+        mean_sigma,
+        tau,
+        probability,
+        _homogeneity(p, C),
+        _homogeneity(p @ F.T, F @ C @ F.T),
+        np.sqrt(found),
+        np.sqrt(expected),
+        float(np.sqrt(max(found - expected, 0.0))),
+        x,
+        *trend,
+    )
 
 
 def _check(calibrations, at) -> tuple[str, ...]:

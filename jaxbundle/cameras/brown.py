@@ -62,6 +62,10 @@ BROWN = CameraModel(
 )
 
 BROWN_PROJECTED = CameraModel(
-    "brown-projected", PARAMETERS, distort=distort, start=reduce, free=PARAMETERS[:8],
+    "brown-projected",
+    PARAMETERS,
+    distort=distort,
+    start=reduce,
+    free=PARAMETERS[:8],
     never_free=("r0",),
-)  # fmt: skip
+)

@@ -37,12 +37,29 @@ from jaxbundle.choices import MODEL_FAMILIES
 MODELS = {
     model.name: model
     for model in (
-        BROWN, BROWN_PROJECTED, USGS, BINGO, OPENCV, SNAVELY, DIVISION, KANNALA_BRANDT,
-        KANNALA_BRANDT_TANGENTIAL, THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE, FOV, EUCM,
-        DOUBLE_SPHERE, MEI, SCARAMUZZA, EQUIDISTANT, STEREOGRAPHIC, EQUISOLID, ORTHOGRAPHIC,
+        BROWN,
+        BROWN_PROJECTED,
+        USGS,
+        BINGO,
+        OPENCV,
+        SNAVELY,
+        DIVISION,
+        KANNALA_BRANDT,
+        KANNALA_BRANDT_TANGENTIAL,
+        THIN_PRISM_FISHEYE,
+        RAD_TAN_THIN_PRISM_FISHEYE,
+        FOV,
+        EUCM,
+        DOUBLE_SPHERE,
+        MEI,
+        SCARAMUZZA,
+        EQUIDISTANT,
+        STEREOGRAPHIC,
+        EQUISOLID,
+        ORTHOGRAPHIC,
         EQUIRECTANGULAR,
     )
-}  # fmt: skip
+}
 MODEL_NAMES: tuple[str, ...] = tuple(MODELS)
 
 _MAKERS: dict[str, Callable[..., CameraModel]] = {

@@ -68,11 +68,15 @@ class Comparison:
         `xarray.Dataset` (extra `grids`)."""
         dims, d = ("y", "x"), self.difference
         return data_set(
-            {"dx": (dims, d[..., 0], self.unit), "dy": (dims, d[..., 1], self.unit),
-             "length": (dims, self.length, self.unit)},
+            {
+                "dx": (dims, d[..., 0], self.unit),
+                "dy": (dims, d[..., 1], self.unit),
+                "length": (dims, self.length, self.unit),
+            },
             {"y": (self.y, self.unit), "x": (self.x, self.unit)},
-            rotation_removed=self.rotation, rms=self.rms,
-        )  # fmt: skip
+            rotation_removed=self.rotation,
+            rms=self.rms,
+        )
 
     def __str__(self) -> str:
         x, y = self.where
@@ -136,10 +140,16 @@ def compare_cameras(
     columns, rows = GRID
     grid = xy.reshape(rows, columns, 2)
     return Comparison(
-        source.unit, grid[0, :, 0], grid[:, 0, 1], difference.reshape(rows, columns, 2), rotation,
-        float(np.sqrt(np.mean(length[known] ** 2))), float(length[worst]),
-        tuple(xy[worst].tolist()), float(known.mean()),
-    )  # fmt: skip
+        source.unit,
+        grid[0, :, 0],
+        grid[:, 0, 1],
+        difference.reshape(rows, columns, 2),
+        rotation,
+        float(np.sqrt(np.mean(length[known] ** 2))),
+        float(length[worst]),
+        tuple(xy[worst].tolist()),
+        float(known.mean()),
+    )
 
 
 def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarray]:
@@ -164,10 +174,13 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     of = lambda function, v: np.array([function(v[ring == k]) for k in rings])
     length = np.hypot(*d.T)
     return {
-        "r": (rings + 1) * step, "radial": of(np.mean, radial),
-        "tangential": of(np.mean, tangential), "rms": of(lambda v: np.sqrt(np.mean(v**2)), length),
-        "largest": of(np.max, length), "points": of(len, length),
-    }  # fmt: skip
+        "r": (rings + 1) * step,
+        "radial": of(np.mean, radial),
+        "tangential": of(np.mean, tangential),
+        "rms": of(lambda v: np.sqrt(np.mean(v**2)), length),
+        "largest": of(np.max, length),
+        "points": of(len, length),
+    }
 
 
 def _are_one_to_one(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:

@@ -132,10 +132,16 @@ def convert_camera(
         )
     worst = int(np.argmax(length))
     return Conversion(
-        target.name, {name: float(v) for name, v in found.items()}, not reason,
-        float(length[worst]), float(np.sqrt(np.mean(length**2))), target.unit,
-        (float(wanted[worst, 0]), float(wanted[worst, 1])), float(there.mean()), reason,
-    )  # fmt: skip
+        target.name,
+        {name: float(v) for name, v in found.items()},
+        not reason,
+        float(length[worst]),
+        float(np.sqrt(np.mean(length**2))),
+        target.unit,
+        (float(wanted[worst, 0]), float(wanted[worst, 1])),
+        float(there.mean()),
+        reason,
+    )
 
 
 def _check_defaults(found, target, free) -> None:

@@ -93,8 +93,10 @@ def _as_brown(common: dict[str, float], r0: float) -> dict[str, float]:
     T = 1 + common["L"] + sum(common[f"K{i}"] * r0 ** (2 * i) for i in (1, 2, 3))
     divided = ("c", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
     return {name: common[name] / T for name in divided} | {
-        "x0": common["x0"], "y0": common["y0"], "r0": r0
-    }  # fmt: skip
+        "x0": common["x0"],
+        "y0": common["y0"],
+        "r0": r0,
+    }
 
 
 def distortion(source: CameraModel, values: Values, sizes: Sizes) -> dict[str, float]:
@@ -107,18 +109,26 @@ def distortion(source: CameraModel, values: Values, sizes: Sizes) -> dict[str, f
     origin, step = np.abs(pixel_frame(source, *sizes))
     if source.name == "snavely":
         return common | {
-            "fx": values["f"], "fy": values["f"], "cx": origin[0], "cy": origin[1],
-            "k1": values["k1"], "k2": values["k2"],
-        }  # fmt: skip
+            "fx": values["f"],
+            "fy": values["f"],
+            "cx": origin[0],
+            "cy": origin[1],
+            "k1": values["k1"],
+            "k2": values["k2"],
+        }
     c, r0 = values["c"], values["r0"]
     s = 1 - sum(values[f"K{i}"] * r0 ** (2 * i) for i in (1, 2, 3))
     return common | {
-        "fx": c * s * step[0], "fy": c * s * step[1],
-        "cx": origin[0] + values["x0"] * step[0], "cy": origin[1] - values["y0"] * step[1],
+        "fx": c * s * step[0],
+        "fy": c * s * step[1],
+        "cx": origin[0] + values["x0"] * step[0],
+        "cy": origin[1] - values["y0"] * step[1],
         **{f"k{i}": values[f"K{i}"] * c ** (2 * i) / s for i in (1, 2, 3)},
-        "p1": -c * values["P2"] / s, "p2": c * values["P1"] / s,
-        "b1": values["b1"] / s, "b2": values["b2"] / s,
-    }  # fmt: skip
+        "p1": -c * values["P2"] / s,
+        "p2": c * values["P1"] / s,
+        "b1": values["b1"] / s,
+        "b2": values["b2"] / s,
+    }
 
 
 def with_distortion(
@@ -147,11 +157,15 @@ def with_distortion(
     c = a / s
     return {
         "c": c,
-        "x0": (common["cx"] - origin[0]) / step[0], "y0": -(common["cy"] - origin[1]) / step[1],
+        "x0": (common["cx"] - origin[0]) / step[0],
+        "y0": -(common["cy"] - origin[1]) / step[1],
         **{f"K{i}": k[i - 1] * s / c ** (2 * i) for i in (1, 2, 3)},
-        "P1": common["p2"] * s / c, "P2": -common["p1"] * s / c,
-        "b1": common["b1"] * s, "b2": common["b2"] * s, "r0": r0,
-    }  # fmt: skip
+        "P1": common["p2"] * s / c,
+        "P2": -common["p1"] * s / c,
+        "b1": common["b1"] * s,
+        "b2": common["b2"] * s,
+        "r0": r0,
+    }
 
 
 def _balance(k: Numbers, rho: float) -> float:
@@ -189,7 +203,7 @@ def normalised_correction(values: Values) -> dict[str, float]:
 def invert_radial(q: Numbers) -> tuple[float, float, float]:
     """The first terms of the inverse of r·(1 + q1·r² + q2·r⁴ + q3·r⁶): a start, never the answer.
 
-        k1 = −q1     k2 = 3·q1² − q2     k3 = −12·q1³ + 8·q1·q2 − q3
+    k1 = −q1     k2 = 3·q1² − q2     k3 = −12·q1³ + 8·q1·q2 − q3
     """
     q1, q2, q3 = q
     return -q1, 3 * q1**2 - q2, -12 * q1**3 + 8 * q1 * q2 - q3

@@ -100,10 +100,16 @@ def fit_parameters(
         slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
         try:
             found = least_squares(
-                residuals, start[chosen], lambda q: slopes(q).reshape(-1, len(chosen)),
-                x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
+                residuals,
+                start[chosen],
+                lambda q: slopes(q).reshape(-1, len(chosen)),
+                x_scale="jac",
+                ftol=1e-15,
+                xtol=1e-15,
+                gtol=1e-15,
+                max_nfev=MOST_EVALUATIONS,
                 bounds=(low, high),
-            )  # fmt: skip
+            )
         except np.linalg.LinAlgError as error:
             raise ValueError(f"the fit failed: {error}") from None
     return dict(zip(model.parameters, complete(found.x).tolist()))

@@ -42,8 +42,9 @@ ANGLE: dict[str, dict[str, str]] = {
     "thin-prism-fisheye": _K | _P | {"sx1": "sx1", "sy1": "sy1"},
     "rad-tan-thin-prism-fisheye": {
         **{f"k{i}": f"k{i + 1}" for i in range(6)},
-        **{name: f"{name} at the distorted radius"
-           for name in ("p0", "p1", "s0", "s1", "s2", "s3")},
+        **{
+            name: f"{name} at the distorted radius" for name in ("p0", "p1", "s0", "s1", "s2", "s3")
+        },
     },
 }
 """The terms of a model by its names."""
@@ -111,13 +112,20 @@ def _by_division(source, values, target, _sizes, _r0):
         case "stereographic":
             return core if k == -0.25 else _refuse(f"stereographic is k = -0.25, not {k:.6g}")
         case "eucm":
-            return core | {"alpha": 0.5, "beta": -4 * k} if k < 0 else _refuse(
-                f"eucm is a division with k < 0, and it is {k:.6g}")  # fmt: skip
+            return (
+                core | {"alpha": 0.5, "beta": -4 * k}
+                if k < 0
+                else _refuse(f"eucm is a division with k < 0, and it is {k:.6g}")
+            )
     if core["fx"] != core["fy"]:
         _refuse("scaramuzza has one principal distance, and that of x is not that of y")
     return dict.fromkeys(target.parameters, 0.0) | {
-        "a0": f, "cx": core["cx"], "cy": core["cy"], "a2": k / f, "c": 1.0
-    }  # fmt: skip
+        "a0": f,
+        "cx": core["cx"],
+        "cy": core["cy"],
+        "a2": k / f,
+        "c": 1.0,
+    }
 
 
 def _need(values, model: str, **expected) -> None:
@@ -182,7 +190,7 @@ def _plain_family(model: CameraModel, family: str, plain: str) -> str:
 
 
 def _need_no_spline(source, values) -> None:
-    if "spline-" in source.name and any(values[name] for name in source.parameters[len(CORE):]):
+    if "spline-" in source.name and any(values[name] for name in source.parameters[len(CORE) :]):
         _refuse(f"the distortion of {source.name} is a spline")
 
 

@@ -40,6 +40,10 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 DIVISION = CameraModel(
-    "division", ("fx", "fy", "cx", "cy", "k"), project=project, unproject=unproject, unit="px",
+    "division",
+    ("fx", "fy", "cx", "cy", "k"),
+    project=project,
+    unproject=unproject,
+    unit="px",
     image="equidistant",
-)  # fmt: skip
+)

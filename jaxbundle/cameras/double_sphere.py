@@ -53,8 +53,13 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 DOUBLE_SPHERE = CameraModel(
-    "double-sphere", ("fx", "fy", "cx", "cy", "xi", "alpha"), project=project,
-    unproject=unproject, unit="px", image="equidistant",
-    magnification=lambda p: 1 / (1 + p[4]), defaults={"alpha": 0.5},
+    "double-sphere",
+    ("fx", "fy", "cx", "cy", "xi", "alpha"),
+    project=project,
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    magnification=lambda p: 1 / (1 + p[4]),
+    defaults={"alpha": 0.5},
     ranges={"xi": (-0.999, float("inf")), "alpha": (0.0, 1.0)},
-)  # fmt: skip
+)

@@ -41,6 +41,11 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 EQUIRECTANGULAR = CameraModel(
-    "equirectangular", ("fx", "fy", "cx", "cy"), project=project, unproject=unproject, unit="px",
-    image="equidistant", free=("fx", "fy", "cy"),
-)  # fmt: skip
+    "equirectangular",
+    ("fx", "fy", "cx", "cy"),
+    project=project,
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    free=("fx", "fy", "cy"),
+)

@@ -52,7 +52,12 @@ def reach(alpha: Scalar) -> Scalar:
 
 
 EUCM = CameraModel(
-    "eucm", ("fx", "fy", "cx", "cy", "alpha", "beta"), project=project, unproject=unproject,
-    unit="px", image="equidistant", defaults={"alpha": 0.5, "beta": 1.0},
+    "eucm",
+    ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    project=project,
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    defaults={"alpha": 0.5, "beta": 1.0},
     ranges={"alpha": (0.0, 1.0), "beta": (1e-6, float("inf"))},
-)  # fmt: skip
+)

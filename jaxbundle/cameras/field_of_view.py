@@ -57,8 +57,12 @@ def field_of_view_of_rays(
     """
     low, high = image_area(model, image_size, pixel_size)
     x, y = (low + high) / 2
-    ends = [((low[0], y), (high[0], y)), ((x, low[1]), (x, high[1])),
-            (low, high), ((low[0], high[1]), (high[0], low[1]))]  # fmt: skip
+    ends = [
+        ((low[0], y), (high[0], y)),
+        ((x, low[1]), (x, high[1])),
+        (low, high),
+        ((low[0], high[1]), (high[0], low[1])),
+    ]
     values = {**default_parameters(model), **parameters}
     rays = rays_of(model, values, np.array(ends).reshape(-1, 2)).reshape(4, 2, 3)
     a, b = rays[:, 0], rays[:, 1]

@@ -88,21 +88,30 @@ def _fisheye(
         return _ray(one, *undistort(p, (u - p[2]) / p[0], (v - p[3]) / p[1]))
 
     return CameraModel(
-        name, (*CORE, *distortion), project=project, unproject=unproject, unit="px",
+        name,
+        (*CORE, *distortion),
+        project=project,
+        unproject=unproject,
+        unit="px",
         image="equidistant",
-    )  # fmt: skip
+    )
 
 
 KANNALA_BRANDT_TANGENTIAL = _fisheye(
-    "kannala-brandt-tangential", ("k1", "k2", "k3", "k4", "p1", "p2"), tangential,
+    "kannala-brandt-tangential",
+    ("k1", "k2", "k3", "k4", "p1", "p2"),
+    tangential,
     lambda p: p[4:8],
-)  # fmt: skip
+)
 THIN_PRISM_FISHEYE = _fisheye(
-    "thin-prism-fisheye", ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), thin_prism,
+    "thin-prism-fisheye",
+    ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    thin_prism,
     lambda p: (*p[4:6], *p[8:10]),
-)  # fmt: skip
+)
 RAD_TAN_THIN_PRISM_FISHEYE = _fisheye(
     "rad-tan-thin-prism-fisheye",
-    ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"), rad_tan,
+    ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    rad_tan,
     lambda p: p[4:10],
-)  # fmt: skip
+)

@@ -41,7 +41,13 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 FOV = CameraModel(
-    "fov", ("fx", "fy", "cx", "cy", "omega"), project=project, unproject=unproject, unit="px",
-    image="equidistant", magnification=lambda p: 2 * jnp.tan(p[4] / 2) / p[4],
-    defaults={"omega": 0.9}, ranges={"omega": (1e-6, 3.14159)},
-)  # fmt: skip
+    "fov",
+    ("fx", "fy", "cx", "cy", "omega"),
+    project=project,
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    magnification=lambda p: 2 * jnp.tan(p[4] / 2) / p[4],
+    defaults={"omega": 0.9},
+    ranges={"omega": (1e-6, 3.14159)},
+)

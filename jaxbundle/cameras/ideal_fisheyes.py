@@ -23,9 +23,13 @@ def shift(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
 
 def _ideal(image: Image) -> CameraModel:
     return CameraModel(
-        image, ("fx", "fy", "cx", "cy"), distort=shift, inverse=opencv.reduce, unit="px",
+        image,
+        ("fx", "fy", "cx", "cy"),
+        distort=shift,
+        inverse=opencv.reduce,
+        unit="px",
         image=image,
-    )  # fmt: skip
+    )
 
 
 STEREOGRAPHIC = _ideal("stereographic")

@@ -76,9 +76,11 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
 
 
 def limit_region(
-    formula: Formula, inside: Callable[[Parameters, Scalar, Scalar], Scalar], start: Formula,
+    formula: Formula,
+    inside: Callable[[Parameters, Scalar, Scalar], Scalar],
+    start: Formula,
     iterations: int,
-) -> tuple[Formula, Formula]:  # fmt: skip
+) -> tuple[Formula, Formula]:
     """A formula and its inverse, NaN outside a region of (x, y).
 
     Newton's method goes by the formula without the limit: on its way to a point near the edge it

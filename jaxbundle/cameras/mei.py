@@ -67,8 +67,13 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 MEI = CameraModel(
-    "mei", ("fx", "fy", "cx", "cy", "xi", "k1", "k2", "p1", "p2"), project=project,
-    unproject=unproject, unit="px", image="equidistant",
-    magnification=lambda p: 1 / (1 + p[4]), defaults={"xi": 1.0},
+    "mei",
+    ("fx", "fy", "cx", "cy", "xi", "k1", "k2", "p1", "p2"),
+    project=project,
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    magnification=lambda p: 1 / (1 + p[4]),
+    defaults={"xi": 1.0},
     ranges={"xi": (0.0, float("inf"))},
-)  # fmt: skip
+)

@@ -24,9 +24,12 @@ from jaxbundle.cameras.perspective import perspective
 from jaxbundle.cameras.scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 IMAGES = {
-    "perspective": perspective, "equidistant": equidistant, "stereographic": stereographic,
-    "equisolid": equisolid, "orthographic": orthographic,
-}  # fmt: skip
+    "perspective": perspective,
+    "equidistant": equidistant,
+    "stereographic": stereographic,
+    "equisolid": equisolid,
+    "orthographic": orthographic,
+}
 NARROW_PROJECTIONS = ("perspective", "orthographic")
 """Ideal images of rays less than 90° from the axis."""
 FORMULAS = ("correct", "distort", "project", "unproject")
@@ -194,8 +197,11 @@ def _complete(model: CameraModel) -> dict:
     for name in (*given, "inverse", "start", "magnification"):
         if getattr(model, name) is not None and not callable(getattr(model, name)):
             raise ValueError(f"{where}{name} must be a function, not {getattr(model, name)!r:.60}.")
-    for name, choices in (("unit", ("mm", "px")), ("axes", ("up", "down", None)),
-                          ("image", tuple(IMAGES))):  # fmt: skip
+    for name, choices in (
+        ("unit", ("mm", "px")),
+        ("axes", ("up", "down", None)),
+        ("image", tuple(IMAGES)),
+    ):
         if getattr(model, name) not in choices:
             known = ", ".join(filter(None, choices))
             raise ValueError(f"{where}{name} is one of {known}, not {getattr(model, name)!r:.60}.")

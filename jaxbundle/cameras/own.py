@@ -70,8 +70,11 @@ def _check_form(model: CameraModel) -> None:
         except Exception as error:  # whatever a user's function raises
             text = " ".join(str(error).split())
             raise ValueError(f"{expected}; it raised {type(error).__name__}: {text:.160}") from None
-        shapes = [x.shape for x in out] if isinstance(out, tuple | list) and all(
-            hasattr(x, "shape") for x in out) else None  # fmt: skip
+        shapes = (
+            [x.shape for x in out]
+            if isinstance(out, tuple | list) and all(hasattr(x, "shape") for x in out)
+            else None
+        )
         if shapes != [given.shape] * number_of:
             raise ValueError(f"{expected}; for {given.shape or 'numbers'} it gave {out!r:.160}")
 

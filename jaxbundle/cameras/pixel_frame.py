@@ -14,7 +14,6 @@ A pixel (u, v) counts from the centre of the upper-left pixel, u right, v down. 
 with the image size (w, h) in pixels and the pixel size (p_x, p_y) in mm.
 """
 
-
 import numpy as np
 from jaxtyping import Float
 

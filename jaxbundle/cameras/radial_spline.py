@@ -64,5 +64,8 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
     return CameraModel(
         f"radial-spline-{number}-{degrees:g}",
         ("fx", "fy", "cx", "cy", *(f"s{i}" for i in range(1, number + 1))),
-        distort=distort, inverse=inverse, unit="px", image="equidistant",
-    )  # fmt: skip
+        distort=distort,
+        inverse=inverse,
+        unit="px",
+        image="equidistant",
+    )

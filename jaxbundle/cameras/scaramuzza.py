@@ -53,7 +53,14 @@ def _start(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
 
 
 SCARAMUZZA = CameraModel(
-    "scaramuzza", ("a0", "cx", "cy", "a2", "a3", "a4", "c", "d", "e"), unproject=unproject,
-    unit="px", image="equidistant", start=_start, iterations=14, principal_distance=("a0",),
-    defaults={"c": 1.0}, free=("a0", "cx", "cy", "a2", "a3", "a4", "c", "d"),
-)  # fmt: skip
+    "scaramuzza",
+    ("a0", "cx", "cy", "a2", "a3", "a4", "c", "d", "e"),
+    unproject=unproject,
+    unit="px",
+    image="equidistant",
+    start=_start,
+    iterations=14,
+    principal_distance=("a0",),
+    defaults={"c": 1.0},
+    free=("a0", "cx", "cy", "a2", "a3", "a4", "c", "d"),
+)

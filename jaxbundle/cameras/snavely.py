@@ -23,6 +23,11 @@ def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
 
 
 SNAVELY = CameraModel(
-    "snavely", ("f", "k1", "k2"), distort=distort, unit="px", axes="up",
-    start=lambda p, X, Y: (X, Y), iterations=8,
-)  # fmt: skip
+    "snavely",
+    ("f", "k1", "k2"),
+    distort=distort,
+    unit="px",
+    axes="up",
+    start=lambda p, X, Y: (X, Y),
+    iterations=8,
+)

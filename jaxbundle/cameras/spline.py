@@ -70,9 +70,7 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
     def bent(p: Parameters, grid, at: Pair, xi: Scalar, yi: Scalar) -> Pair:
         """By a grid of knots [..., rows, columns, 2] of which the first is at (0, 0)."""
         along, across = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
-        da, db = jnp.moveaxis(
-            jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0
-        )
+        da, db = jnp.moveaxis(jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0)
         return p[2] + xi + p[0] * da, p[3] + yi + p[1] * db
 
     def corner(p: Parameters, xi: Scalar, yi: Scalar):
@@ -85,8 +83,10 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
         j, i = corner(p, xi, yi)
         return tuple(
             len(CORE) + 2 * ((i + row) * columns + j + column) + k
-            for row in range(4) for column in range(4) for k in range(2)
-        )  # fmt: skip
+            for row in range(4)
+            for column in range(4)
+            for k in range(2)
+        )
 
     def by_seen(p: Parameters, which, knots, xi: Scalar, yi: Scalar) -> Pair:
         first = (which[0] - len(CORE)) // 2
@@ -98,8 +98,14 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
     distort, inverse = limit_region(grid_of_splines, inside, opencv.reduce, 12)
     knots = tuple(f"d{k}_{i}_{j}" for i in range(rows) for j in range(columns) for k in "xy")
     return CameraModel(
-        f"spline-{columns}x{rows}-{degrees:g}", (*CORE, *knots), distort=distort,
-        inverse=inverse, unit="px", image="stereographic", free=knots,
-        never_free=CORE, prior=dict.fromkeys(knots, PRIOR),
+        f"spline-{columns}x{rows}-{degrees:g}",
+        (*CORE, *knots),
+        distort=distort,
+        inverse=inverse,
+        unit="px",
+        image="stereographic",
+        free=knots,
+        never_free=CORE,
+        prior=dict.fromkeys(knots, PRIOR),
         local=LocalFormula(32, seen, by_seen),
-    )  # fmt: skip
+    )

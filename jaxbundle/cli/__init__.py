@@ -15,10 +15,24 @@ from collections.abc import Callable
 from jaxbundle.cli.app import run
 
 COMMANDS = (
-    "reconstruct", "orient", "adjust", "calibrate", "batch", "design", "plan", "camera",
-    "compare", "stability", "explore", "convert", "surface", "cloud", "pushbroom", "example",
+    "reconstruct",
+    "orient",
+    "adjust",
+    "calibrate",
+    "batch",
+    "design",
+    "plan",
+    "camera",
+    "compare",
+    "stability",
+    "explore",
+    "convert",
+    "surface",
+    "cloud",
+    "pushbroom",
+    "example",
     "completion",
-)  # fmt: skip
+)
 
 
 def main(prepare: Callable[[], object] | None = None) -> None:

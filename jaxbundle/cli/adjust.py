@@ -102,13 +102,29 @@ def adjust(
     print_report = json != "-" and not (quiet and is_in_file(json, out, html, save))
     if join or cluster:
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
-            raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
-                             "of the processes is reported on standard output")  # fmt: skip
+            raise InputError(
+                f"--json {json} with --join or --cluster: give a file; the connection "
+                "of the processes is reported on standard output"
+            )
         first = join_for_one_task(
-            join, cluster, quiet,
-            of_input(input), control and of_input(control), set, format, max_iterations, method,
-            reduction, robust, snooping, significance, eliminate, components, budget, check,
-        )  # fmt: skip
+            join,
+            cluster,
+            quiet,
+            of_input(input),
+            control and of_input(control),
+            set,
+            format,
+            max_iterations,
+            method,
+            reduction,
+            robust,
+            snooping,
+            significance,
+            eliminate,
+            components,
+            budget,
+            check,
+        )
         if not first:
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
@@ -119,12 +135,22 @@ def adjust(
     check_targets(input, network, json, out, control, force, html, save)
     origin = Origin(computed=in_words(now()))
     if html or out is not None:
-        origin = trace_origin(input, network, control, {
-            "--set": ", ".join(set or ()), "--check": ", ".join(check or ()),
-            "--max-iterations": max_iterations, "--robust": robust,
-            "--snooping": snooping, "--significance": significance, "--eliminate": eliminate,
-            "--components": components, "--budget": ", ".join(budget or ()),
-        })  # fmt: skip
+        origin = trace_origin(
+            input,
+            network,
+            control,
+            {
+                "--set": ", ".join(set or ()),
+                "--check": ", ".join(check or ()),
+                "--max-iterations": max_iterations,
+                "--robust": robust,
+                "--snooping": snooping,
+                "--significance": significance,
+                "--eliminate": eliminate,
+                "--components": components,
+                "--budget": ", ".join(budget or ()),
+            },
+        )
     try:
         with iterating(quiet or json == "-") as tell:
             result = jaxbundle.adjust(

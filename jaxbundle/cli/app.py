@@ -79,14 +79,24 @@ class Application(typer.Typer):
 
     def __init__(self, help: str, **options: Any):
         super().__init__(
-            cls=Group, help=help, short_help=help, rich_markup_mode=None, callback=_list_commands,
-            invoke_without_command=True, **options,
-        )  # fmt: skip
+            cls=Group,
+            help=help,
+            short_help=help,
+            rich_markup_mode=None,
+            callback=_list_commands,
+            invoke_without_command=True,
+            **options,
+        )
 
     def command(
-        self, name: str | None = None, *, example: str, computes: bool = True, once: bool = False,
+        self,
+        name: str | None = None,
+        *,
+        example: str,
+        computes: bool = True,
+        once: bool = False,
         **options: Any,
-    ):  # fmt: skip
+    ):
         """Like typer's, with --quiet and --verbose. `example`: the arguments of a line that calls
         it, for its help; `computes`: whether it works with JAX; `once`: whether its time depends on
         its input, so that programs of a small input are compiled quickly."""
@@ -134,9 +144,13 @@ Html = Annotated[str, typer.Option(help="write the result as one HTML page")]
 
 
 def choice(
-    words: Iterable[str], about: str = "", *names: str, forms: Mapping[str, str] | None = None,
-    listing: bool = True, argument: bool = False,
-) -> Any:  # fmt: skip
+    words: Iterable[str],
+    about: str = "",
+    *names: str,
+    forms: Mapping[str, str] | None = None,
+    listing: bool = True,
+    argument: bool = False,
+) -> Any:
     """An option, or an `argument`, with a fixed set of values, or one of `forms` (patterns by what
     they look like); others are refused with the closest match. `names`: of the option, if not that
     of the argument; `listing`: list the values in the help."""
@@ -205,8 +219,9 @@ def run(prepare: Callable[[], object] | None = None) -> None:
             raise
         _end(
             f"{error.object}: this system writes names of files in {error.encoding}, which has no "
-            f"{error.object[error.start]!r}; set PYTHONUTF8=1", BAD_INPUT,
-        )  # fmt: skip
+            f"{error.object[error.start]!r}; set PYTHONUTF8=1",
+            BAD_INPUT,
+        )
     except Exception as error:
         if is_memory_shortage(error):
             _end(_describe_shortage(error), BAD_INPUT)
@@ -224,9 +239,13 @@ def _describe_shortage(error: BaseException) -> str:
     said = " ".join(str(error).split()).partition(" in function")[0]
     if "not enough memory" in said:
         return said
-    return "not enough memory" + (f" ({said})" if said else "") + (
-        f", {free_memory() / 1e9:.1f} GB are free: raise the limit (ulimit -v, that of the "
-        "container), end other programs, or make the input smaller"
+    return (
+        "not enough memory"
+        + (f" ({said})" if said else "")
+        + (
+            f", {free_memory() / 1e9:.1f} GB are free: raise the limit (ulimit -v, that of the "
+            "container), end other programs, or make the input smaller"
+        )
     )
 
 

@@ -133,8 +133,9 @@ def batch(
     asked = {"--html": html, "--table": table, "--summary": summary}
     asked = [name for name, value in asked.items() if value]
     if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
-        raise InputError(f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} "
-                         "is no file")  # fmt: skip
+        raise InputError(
+            f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} is no file"
+        )
     columns = None if against is None else read_csv(against)
     if columns is not None:
         if not asked:
@@ -149,9 +150,25 @@ def batch(
             raise InputError("--part with --join or --cluster: each process computes its part")
         compute = run_joined
         first = join_for_one_task(
-            join, cluster, quiet, inputs, json_lines, model, free, max_iterations, snooping,
-            significance, board, square, kind, marker, dictionary, rig, pixel_size, set,
-        )  # fmt: skip
+            join,
+            cluster,
+            quiet,
+            inputs,
+            json_lines,
+            model,
+            free,
+            max_iterations,
+            snooping,
+            significance,
+            board,
+            square,
+            kind,
+            marker,
+            dictionary,
+            rig,
+            pixel_size,
+            set,
+        )
         if not first:
             html, table, summary, asked, quiet = "", None, None, [], True
     elif not part:
@@ -160,26 +177,46 @@ def batch(
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)
         counts = compute(
-            inputs, json_lines, model=model,
+            inputs,
+            json_lines,
+            model=model,
             free=[name.strip() for name in free.split(",")] if free else None,
             max_iterations=max_iterations,
-            snooping=None if snooping == "none" else snooping, significance=significance,
-            board=known, rig=rig, pixel_size=pixel_size, settings=set or (),
-            portion=portion, brief=brief, retry=retry, renew=renew,
+            snooping=None if snooping == "none" else snooping,
+            significance=significance,
+            board=known,
+            rig=rig,
+            pixel_size=pixel_size,
+            settings=set or (),
+            portion=portion,
+            brief=brief,
+            retry=retry,
+            renew=renew,
             progress=lambda _, done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
+        )
     if asked:
         found = Population(result_rows(inputs, json_lines))
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         write_outputs(found, beside, table, summary)
     if html:
-        origin = trace_files(inputs, {
-            "--model": model, "--free": free, "--max-iterations": max_iterations,
-            "--snooping": snooping, "--significance": significance, "--board": board,
-            "--square": square, "--kind": kind if board else "", "--rig": rig,
-            "--pixel-size": pixel_size, "--set": ", ".join(set or ()), "--part": part,
-            "--against": "" if against is None else str(against),
-        })  # fmt: skip
+        origin = trace_files(
+            inputs,
+            {
+                "--model": model,
+                "--free": free,
+                "--max-iterations": max_iterations,
+                "--snooping": snooping,
+                "--significance": significance,
+                "--board": board,
+                "--square": square,
+                "--kind": kind if board else "",
+                "--rig": rig,
+                "--pixel-size": pixel_size,
+                "--set": ", ".join(set or ()),
+                "--part": part,
+                "--against": "" if against is None else str(against),
+            },
+        )
         write_text(Path(html), compose_batch(found, origin, beside))
     skipped = counts.pop("skipped", 0)
     said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
@@ -194,8 +231,11 @@ def batch(
     if first and total and not solved:
         raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")
     if first and quiet and solved < total:
-        print(f"jaxbundle: {json_lines}: {total - solved} of {count(total, 'input')} without a "
-              f"result: {said}", file=sys.stderr)  # fmt: skip
+        print(
+            f"jaxbundle: {json_lines}: {total - solved} of {count(total, 'input')} without a "
+            f"result: {said}",
+            file=sys.stderr,
+        )
 
 
 def _reason(row: dict) -> str:

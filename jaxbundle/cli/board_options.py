@@ -8,9 +8,13 @@ from jaxbundle.measure.boards import Board
 
 
 def board_given(
-    board: str, square: float | None, kind: str, diameter: float | None, marker: float | None,
+    board: str,
+    square: float | None,
+    kind: str,
+    diameter: float | None,
+    marker: float | None,
     dictionary: str,
-):  # fmt: skip
+):
     """The board, or the target, that the options name."""
     if board.endswith((".yaml", ".yml")):
         if square is not None:
@@ -23,8 +27,9 @@ def board_given(
         raise InputError("--square is missing: the side of a square, or the spacing of circles")
     circles = ("circles", "asymmetric-circles")
     for value, option, kinds in (
-        (diameter, "--diameter", circles), (marker, "--marker", ("charuco", "aprilgrid")),
-    ):  # fmt: skip
+        (diameter, "--diameter", circles),
+        (marker, "--marker", ("charuco", "aprilgrid")),
+    ):
         if value is not None and kind not in kinds:
             raise InputError(f"{option} is not for --kind {kind}, but for {' and '.join(kinds)}")
     return Board(columns, rows, square, kind, diameter, marker, dictionary)

@@ -55,8 +55,10 @@ def calibrate(
     ] = False,
     sigma_image: Annotated[
         float | None,
-        typer.Option(help="a priori σ of an image coordinate, pixels; default: 0.1 as a unit "
-                     "of weight, without a χ² test"),
+        typer.Option(
+            help="a priori σ of an image coordinate, pixels; default: 0.1 as a unit "
+            "of weight, without a χ² test"
+        ),
     ] = None,
     snooping: Annotated[
         str, choice((*TESTS, "none"), "removal of gross errors and of rig epochs")
@@ -124,12 +126,23 @@ def calibrate(
     check_writable(json, out, COMMAND, names, files, force, html)
     origin = UNKNOWN
     if html or out is not None:
-        origin = trace_files(files, {
-            "--board": board, "--square": square, "--kind": kind, "--model": models or model,
-            "--free": free, "--given": ", ".join(given or ()), "--board-sigma": board_sigma,
-            "--board-free": board_free, "--sigma-image": sigma_image, "--snooping": snooping,
-            "--significance": significance, "--robust": robust,
-        })  # fmt: skip
+        origin = trace_files(
+            files,
+            {
+                "--board": board,
+                "--square": square,
+                "--kind": kind,
+                "--model": models or model,
+                "--free": free,
+                "--given": ", ".join(given or ()),
+                "--board-sigma": board_sigma,
+                "--board-free": board_free,
+                "--sigma-image": sigma_image,
+                "--snooping": snooping,
+                "--significance": significance,
+                "--robust": robust,
+            },
+        )
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
@@ -139,25 +152,41 @@ def calibrate(
                 bar.update(task, description="adjusting")
 
         options: dict[str, Any] = dict(
-            pixel_size=pixel_size, sigma_image=sigma_image, board_sigma=board_sigma,
-            board_free=board_free, snooping=test, significance=significance, robust=robust,
+            pixel_size=pixel_size,
+            sigma_image=sigma_image,
+            board_sigma=board_sigma,
+            board_free=board_free,
+            snooping=test,
+            significance=significance,
+            robust=robust,
             object_unit=unit,
-        )  # fmt: skip
+        )
         choice = None
         try:
             if compared:
                 ((name, photographed),) = cameras.items()
                 choice = compare_models(
-                    photographed, known, models=compared, folds=folds, camera=name,
-                    progress=tell, **options,
-                )  # fmt: skip
+                    photographed,
+                    known,
+                    models=compared,
+                    folds=folds,
+                    camera=name,
+                    progress=tell,
+                    **options,
+                )
                 found = Calibrations({name: choice.suffices.calibration})
             else:
                 found = calibrate_cameras(
-                    cameras, known, rig=rig, model=model, free=_words(free) or None,
-                    given=_values(given), cross_validation=cross_validation, progress=tell,
+                    cameras,
+                    known,
+                    rig=rig,
+                    model=model,
+                    free=_words(free) or None,
+                    given=_values(given),
+                    cross_validation=cross_validation,
+                    progress=tell,
                     **options,
-                )  # fmt: skip
+                )
         except NotSolvedError as error:
             place = out if name_inside(json, out) or name_inside(html, out) else None
             page = partial(compose_failure, error, origin, KIND)

@@ -57,8 +57,10 @@ def print_camera(given: Camera, extent, size, pitch, table) -> None:
         angles = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)
         print(f"{'field of view':22}{angles} (horizontal, vertical, diagonal), {name}")
     print(f"{'':22}{angle_class(views['2·atan(d/2c)'].diagonal)}")
-    print(f"{'35 mm equivalent':22}{equivalent_35mm(focal, extent):.2f} mm by the diagonal, "
-          f"{equivalent_35mm(focal, extent, 'width'):.2f} mm by the width")  # fmt: skip
+    print(
+        f"{'35 mm equivalent':22}{equivalent_35mm(focal, extent):.2f} mm by the diagonal, "
+        f"{equivalent_35mm(focal, extent, 'width'):.2f} mm by the width"
+    )
     print(f"{'r':>12}{'radial':>12}{'decentring':>12}  [{model.unit}], measured − ideal")
     for row in zip(*table.values()):
         print("".join(f"{value:12.5g}" for value in row))

@@ -34,7 +34,7 @@ def cloud(
     ] = None,
     plane: Annotated[bool, typer.Option("--plane", help="RMS to the best plane")] = False,
     json: Annotated[str, typer.Option(help="figures as JSON; - for standard output")] = "",
-) -> None:  # fmt: skip
+) -> None:
     """Filter, thin, convert and compare point clouds; accuracy and DSM."""
     from jaxbundle.cli.outputs import check_json
     from jaxbundle.io.results.result_json import without_nan

@@ -21,7 +21,8 @@ PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/came
 @app.command(example=PAIR)
 def compare(
     a: Annotated[
-        str, typer.Argument(
+        str,
+        typer.Argument(
             help="camera: a file of cameras or a network, or FILE#ID; or an adjustment saved by "
             "jaxbundle adjust --save"
         ),

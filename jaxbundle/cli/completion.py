@@ -71,7 +71,7 @@ def for_bash(places: list[Place], zsh: bool = False) -> str:
         "  local way=jaxbundle words= k",
         "  for ((k = 1; k < COMP_CWORD; k++)); do",
         '    case "$way ${COMP_WORDS[k]}" in',
-        f"      {'|'.join(map(_quoted, ways))}) way=\"$way ${{COMP_WORDS[k]}}\" ;;",
+        f'      {"|".join(map(_quoted, ways))}) way="$way ${{COMP_WORDS[k]}}" ;;',
         "    esac",
         "  done",
         '  case "$way:$before" in',
@@ -92,9 +92,12 @@ def for_bash(places: list[Place], zsh: bool = False) -> str:
             below = _quoted(" ".join(place.below))
             lines.append(f"        {_quoted(f'{way}:')}*) words={below} ;;")
     lines += [
-        "      esac ;;", "  esac", '  COMPREPLY=($(compgen -W "$words" -- "$current"))', "}",
+        "      esac ;;",
+        "  esac",
+        '  COMPREPLY=($(compgen -W "$words" -- "$current"))',
+        "}",
         "complete -o default -F _jaxbundle jaxbundle",
-    ]  # fmt: skip
+    ]
     return "\n".join(lines) + "\n"
 
 

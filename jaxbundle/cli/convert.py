@@ -45,10 +45,19 @@ def convert(
     if size is not None and not all(number.is_integer() for number in size):
         raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
     done = convert_file(
-        input, output, to=to, model=model, camera=camera, format=format, overrides=overrides,
-        measured=measured, image_size=size and tuple(map(int, size)),
-        pixel_size=pair("--pixel-size", pixel_size), force=force, control=control,
-    )  # fmt: skip
+        input,
+        output,
+        to=to,
+        model=model,
+        camera=camera,
+        format=format,
+        overrides=overrides,
+        measured=measured,
+        image_size=size and tuple(map(int, size)),
+        pixel_size=pair("--pixel-size", pixel_size),
+        force=force,
+        control=control,
+    )
     if not quiet:
         print(str(done).split("\n", 1)[0])
         for line in str(done).splitlines()[1:]:

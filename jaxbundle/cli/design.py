@@ -19,8 +19,10 @@ def design(
     aim: Annotated[str, choice(AIMS, "quantity to minimise")] = "mean",
     of: Annotated[
         list[str] | None,
-        typer.Option(help="σ of points, cameras, or of an unknown KIND:ID:NAME, such as "
-                     "camera:cam:c; repeatable"),
+        typer.Option(
+            help="σ of points, cameras, or of an unknown KIND:ID:NAME, such as "
+            "camera:cam:c; repeatable"
+        ),
     ] = None,
     order: Annotated[
         str, choice(ORDERS, "datum, configuration, weights or densification")
@@ -63,7 +65,7 @@ def design(
     plots: Annotated[bool, typer.Option(help="write figures to --out")] = True,
     force: Force = False,
     quiet: Quiet = False,
-) -> None:  # fmt: skip
+) -> None:
     """Design a network: optimal stations, or a selection of photographs."""
     import numpy as np
 
@@ -83,18 +85,28 @@ def design(
     check_writable(json, out, "design", FILES, network_files(project, network), force)
     conditions = Conditions(
         room=box_of("--room", room),
-        distance=pair("--distance", distance), focus=pair("--focus", focus), edge=edge,
+        distance=pair("--distance", distance),
+        focus=pair("--focus", focus),
+        edge=edge,
         incidence=None if incidence is None else np.radians(incidence),
-        normals=normals_of(normals, network), apart=apart,
+        normals=normals_of(normals, network),
+        apart=apart,
         obstacles=tuple(present(box_of("--obstacle", text)) for text in obstacle or ()),
         targets=box_of("--targets", targets),
-    )  # fmt: skip
+    )
     designed = design_network(
-        network, Aim(aim, parse_aim(of)), order=order, conditions=conditions, free=words_of(free),
-        stations=words_of(stations) if stations else None, photographs=photographs,
+        network,
+        Aim(aim, parse_aim(of)),
+        order=order,
+        conditions=conditions,
+        free=words_of(free),
+        stations=words_of(stations) if stations else None,
+        photographs=photographs,
         sigma_image=sigma_of(project, network) if sigma_image is None else sigma_image,
-        starts=starts, max_iterations=iterations, seed=seed,
-    )  # fmt: skip
+        starts=starts,
+        max_iterations=iterations,
+        seed=seed,
+    )
     proof = designed.prove(draws, seed) if draws else None
     report = f"{designed}\n" + (f"proof: {proof}\n" if proof else "")
     text = design_text(designed, proof)

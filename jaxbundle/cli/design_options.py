@@ -39,8 +39,10 @@ def parse_aim(given: list[str] | None):
         kind, _, rest = text.partition(":")
         id, mark, name = rest.rpartition(":")
         if not mark:
-            raise InputError(f"--of {text!r}: points, cameras, or KIND:ID:NAME is expected, such "
-                             "as camera:cam:c or point:7:Z")  # fmt: skip
+            raise InputError(
+                f"--of {text!r}: points, cameras, or KIND:ID:NAME is expected, such "
+                "as camera:cam:c or point:7:Z"
+            )
         names.append((kind, id, name))
     return tuple(names)
 
@@ -86,15 +88,18 @@ def normals_of(text: str, network: Network):
     table: Columns = read_csv(Path(text))
     columns = ("id", "NX", "NY", "NZ")
     if set(table.values) != set(columns):
-        raise InputError(f"{text}: the columns {', '.join(columns)} are expected, but there are "
-                         f"{', '.join(table.values)}")  # fmt: skip
+        raise InputError(
+            f"{text}: the columns {', '.join(columns)} are expected, but there are "
+            f"{', '.join(table.values)}"
+        )
     rows = dict(zip(table.values["id"], zip(*(table.values[name] for name in columns[1:]))))
     points = network.points
     used = [id for id, role in zip(points.id, points.role) if role != "check"]
     missing = [id for id in used if id not in rows]
     if missing:
-        raise InputError(f"{text}: there is no row for point {missing[0]!r}; give the normal of "
-                         "every target")  # fmt: skip
+        raise InputError(
+            f"{text}: there is no row for point {missing[0]!r}; give the normal of every target"
+        )
     try:
         return np.array([[float(x) for x in rows[id]] for id in used])
     except ValueError as error:

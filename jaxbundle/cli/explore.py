@@ -43,9 +43,16 @@ def explore(
     from jaxbundle.explore.server import Server
 
     view = open_view(
-        input, kind, photo=photo, sizes=(image_size, pixel_size), truth=truth, settings=set or (),
-        format=format, control=control, quiet=quiet,
-    )  # fmt: skip
+        input,
+        kind,
+        photo=photo,
+        sizes=(image_size, pixel_size),
+        truth=truth,
+        settings=set or (),
+        format=format,
+        control=control,
+        quiet=quiet,
+    )
     tell = lambda line: typer.echo(f"jaxbundle: {line}", err=True)
     server = Server(view, port, tell)
     print(server.address, flush=True)

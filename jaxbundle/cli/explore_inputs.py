@@ -74,10 +74,17 @@ def is_of_calibrate(folder: Path) -> bool:
 
 
 def open_view(
-    input: str, kind: str | None, *, photo: Path | None, sizes: tuple[str, str],
-    truth: Path | None, settings: Sequence[str], format: str | None, control: Path | None,
+    input: str,
+    kind: str | None,
+    *,
+    photo: Path | None,
+    sizes: tuple[str, str],
+    truth: Path | None,
+    settings: Sequence[str],
+    format: str | None,
+    control: Path | None,
     quiet: bool,
-) -> View:  # fmt: skip
+) -> View:
     """The view of an input; options that are for another kind are refused.
 
     **Raises:** `InputError`, `NotSolvedError`."""
@@ -90,8 +97,10 @@ def open_view(
     for other, named in options.items():
         for option, value in named.items():
             if value and other != found:
-                raise InputError(f"{option}: is for a {other}, but {input} is a {found}"
-                                 + ("" if kind else "; change this with --as"))  # fmt: skip
+                raise InputError(
+                    f"{option}: is for a {other}, but {input} is a {found}"
+                    + ("" if kind else "; change this with --as")
+                )
     if found == NETWORK:
         return open_network(Path(input), settings, format, control, quiet)
     if found == CAMERA:

@@ -44,9 +44,14 @@ TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
 BUDGET = "budget"
 """The table of an error budget, and its entry in the JSON."""
 FILES = (
-    REPORT, PAGE, RESULT, *(f"{name}.csv" for name in (*TABLES, BUDGET)),
-    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), f"{ADJUSTED}/{PRECISION}", *FIGURES,
-)  # fmt: skip
+    REPORT,
+    PAGE,
+    RESULT,
+    *(f"{name}.csv" for name in (*TABLES, BUDGET)),
+    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES),
+    f"{ADJUSTED}/{PRECISION}",
+    *FIGURES,
+)
 """The files of a folder, figures as patterns."""
 
 NOTHING: Mapping = MappingProxyType({})
@@ -158,9 +163,15 @@ def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, w
 
 
 def check_targets(
-    input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
-    force: bool = False, html: str = "", save: str = "",
-) -> None:  # fmt: skip
+    input: Path,
+    network: Network,
+    json: str,
+    out: Path | None,
+    control: Path | None = None,
+    force: bool = False,
+    html: str = "",
+    save: str = "",
+) -> None:
     """Check the output files of `adjust` before computing (`check_writable`)."""
     inputs = network_files(input, network, control)
     check_writable(json, out, "adjust", FILES, inputs, force, html)
@@ -181,9 +192,15 @@ def name_inside(file: str, out: Path | None) -> str | None:
 
 @contextmanager
 def write_result(
-    json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
-    force: bool, html: str = "", page: Callable[[], Iterable[str]] | None = None,
-) -> Iterator[Path | None]:  # fmt: skip
+    json: str,
+    text: str | Iterable[str],
+    out: Path | None,
+    by: str,
+    names: Iterable[str],
+    force: bool,
+    html: str = "",
+    page: Callable[[], Iterable[str]] | None = None,
+) -> Iterator[Path | None]:
     """Write the JSON of a result (`-`: standard output) and its `page`, and yield the folder to
     fill, which becomes --out, or None. The folder always contains the page.
 
@@ -215,10 +232,17 @@ def write_result(
 
 
 def write_targets(
-    result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
-    force: bool = False, html: str = "", origin: Origin = UNKNOWN, budget: Budget | None = None,
+    result: Adjustment | NotSolvedError,
+    json: str,
+    out: Path | None,
+    brief: bool,
+    plots: bool,
+    force: bool = False,
+    html: str = "",
+    origin: Origin = UNKNOWN,
+    budget: Budget | None = None,
     progress: Progress | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write JSON (`-`: standard output), page and folder of a result with its error `budget`, or
     the reason for a failure."""
     solved = isinstance(result, Adjustment)
@@ -245,10 +269,16 @@ def write_targets(
 
 
 def fill_results(
-    result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING,
-    budget: Budget | None = None, progress: Progress | None = None, date: str = "",
+    result: Adjustment,
+    folder: Path,
+    plots: bool,
+    note: str = "",
+    also: Mapping = NOTHING,
+    budget: Budget | None = None,
+    progress: Progress | None = None,
+    date: str = "",
     verdict: Verdict | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
     `note`: text before the report; `also`: further JSON entries; `budget`: the error budget;

@@ -50,9 +50,17 @@ def plan(
         check_folder(out, "plan", FILES, force=force)
     image_format, extent = _require_pair("--image", image), _require_pair("--area", area)
     design = design_block(
-        c, image_format, extent, sigma_image, height=height, scale_number=scale,
-        pixel_on_ground=ground_pixel, pixel=pixel, forward_overlap=forward, side_overlap=side,
-    )  # fmt: skip
+        c,
+        image_format,
+        extent,
+        sigma_image,
+        height=height,
+        scale_number=scale,
+        pixel_on_ground=ground_pixel,
+        pixel=pixel,
+        forward_overlap=forward,
+        side_overlap=side,
+    )
     view = field_of_view(c, image_format)
     degrees = ", ".join(f"{np.degrees(angle):.2f}°" for angle in view)
     relief = relief_displacement(image_format[1] / 2, 0.01 * design.height, design.height)
@@ -65,11 +73,14 @@ def plan(
         ("footprint", f"{design.footprint[0]:.6g} × {design.footprint[1]:.6g} m"),
         ("relief displacement", f"{relief:.4g} mm at the edge for 1 % of the flying height"),
         ("base", f"{design.base:.6g} m  b/H {design.base_to_height:.3f}"),
-        ("strips", f"{design.strips}, {design.spacing:.6g} m apart "
-                   f"(side overlap {100 * design.side_overlap:.1f} %)"),
+        (
+            "strips",
+            f"{design.strips}, {design.spacing:.6g} m apart "
+            f"(side overlap {100 * design.side_overlap:.1f} %)",
+        ),
         ("photographs", f"{design.photographs_per_strip} per strip, {design.photographs} in all"),
         ("σX, σH by formula", f"{design.sigma_plan:.4g} m, {design.sigma_height:.4g} m"),
-    ]  # fmt: skip
+    ]
     if network and design.photographs > MOST_PHOTOGRAPHS:
         raise InputError(
             f"{design.photographs} photographs: too many for a covariance; give "

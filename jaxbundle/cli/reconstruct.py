@@ -27,8 +27,10 @@ def reconstruct_command(
     ] = None,
     control_sigma: Annotated[
         str | None,
-        typer.Option(metavar="SIGMA[,HEIGHT]", help="σ of control points without their own, "
-                     "metres; default: estimated"),
+        typer.Option(
+            metavar="SIGMA[,HEIGHT]",
+            help="σ of control points without their own, metres; default: estimated",
+        ),
     ] = None,
     check: Check = None,
     name: Annotated[str, typer.Option(help="name of the job; default: the folder")] = "",
@@ -96,11 +98,19 @@ def reconstruct_command(
     advise(f"run the same command again to resume; matches are kept in {store}")
     with staging(quiet or json == "-") as tell:
         result = reconstruct(photos, given, settings, store, tell, known, bars, name)
-    origin = trace_files([*files, *(p.path for p in found)], {
-        "--camera": camera, "--control-sigma": control_sigma, "--check": ", ".join(check or ()),
-        "--targets": targets, "--features": features, "--pairs": pairs,
-        "--points": points, "--no-square-pixels": True if not square_pixels else None,
-    })  # fmt: skip
+    origin = trace_files(
+        [*files, *(p.path for p in found)],
+        {
+            "--camera": camera,
+            "--control-sigma": control_sigma,
+            "--check": ", ".join(check or ()),
+            "--targets": targets,
+            "--features": features,
+            "--pairs": pairs,
+            "--points": points,
+            "--no-square-pixels": True if not square_pixels else None,
+        },
+    )
     with staging(quiet or json == "-") as show:
         write_reconstruction(result, json, out, brief, plots, force, html, origin, show)
     if not quiet and json != "-":

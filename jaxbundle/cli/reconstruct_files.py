@@ -40,13 +40,19 @@ def make_store(out: Path, force: bool) -> Path:
 
 
 def write_reconstruction(
-    found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool,
-    html: str = "", origin: Origin = UNKNOWN, progress: Progress | None = None,
-) -> None:  # fmt: skip
+    found: Reconstruction,
+    json: str,
+    out: Path,
+    brief: bool,
+    plots: bool,
+    force: bool,
+    html: str = "",
+    origin: Origin = UNKNOWN,
+    progress: Progress | None = None,
+) -> None:
     """Write JSON and page, and the folder with each part, its pairs and figures."""
     first, plots = found.parts[0], plots and can_plot()
-    also = {"reconstruction": _summary(found),
-            "verdict": verdict_dict(conclude_part(found, first))}  # fmt: skip
+    also = {"reconstruction": _summary(found), "verdict": verdict_dict(conclude_part(found, first))}
     text = result_text(first.adjustment, brief, also)
     page = partial(compose_part, found, first, origin)
     with write_result(json, text, out, BY, FILES, force, html, page) as new:
@@ -58,8 +64,9 @@ def write_reconstruction(
         for number, part in enumerate(found.parts[1:], 2):
             folder = new / f"part_{number}"
             folder.mkdir()
-            own = (f"warning: {said}" for said in found.warnings
-                   if said.startswith(f"{part.name}:"))  # fmt: skip
+            own = (
+                f"warning: {said}" for said in found.warnings if said.startswith(f"{part.name}:")
+            )
             verdict = conclude_part(found, part)
             note = "\n".join([verdict.words, *own, describe_part(found, part)])
             more = {"verdict": verdict_dict(verdict)}
@@ -71,11 +78,25 @@ def write_reconstruction(
 
 
 def _write_part(
-    found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also,
-    progress: Progress | None, date: str,
-) -> None:  # fmt: skip
-    fill_results(part.adjustment, folder, plots, note, also, progress=progress, date=date,
-                 verdict=conclude_part(found, part))  # fmt: skip
+    found: Reconstruction,
+    part: Part,
+    folder: Path,
+    plots: bool,
+    note: str,
+    also,
+    progress: Progress | None,
+    date: str,
+) -> None:
+    fill_results(
+        part.adjustment,
+        folder,
+        plots,
+        note,
+        also,
+        progress=progress,
+        date=date,
+        verdict=conclude_part(found, part),
+    )
     _write_tables(part, folder)
     if plots:
         read = lambda name: _thumbnail(found.photographs[name])
@@ -92,10 +113,24 @@ def _write_tables(part: Part, folder: Path) -> None:
     """Control and check points, and camera positions, as tables."""
     if part.control is not None:
         axes = [f"{kind}{a}" for kind in ("", "s", "d") for a in "XYZ"]
-        write_csv(folder / CONTROL, ["id", "role", "used", "rays", *axes, "px", "verdict"], (
-            (p.id, p.role, p.used, p.rays, *p.given, *p.sigma, *p.residual, p.image_residual,
-             p.verdict) for p in part.control.points
-        ))  # fmt: skip
+        write_csv(
+            folder / CONTROL,
+            ["id", "role", "used", "rays", *axes, "px", "verdict"],
+            (
+                (
+                    p.id,
+                    p.role,
+                    p.used,
+                    p.rays,
+                    *p.given,
+                    *p.sigma,
+                    *p.residual,
+                    p.image_residual,
+                    p.verdict,
+                )
+                for p in part.control.points
+            ),
+        )
     positions = part.block.positions
     if positions is not None:
         rows = ((id, *d) for id, d in positions.difference.items())
@@ -116,15 +151,21 @@ def _summary(found: Reconstruction) -> dict:
     return {
         "name": found.name,
         "parts": [
-            {"name": part.name, "images": list(part.adjustment.network.images.id),
-             "sigma0": part.adjustment.sigma0, "sigma_factors": dict(part.factors),
-             "removed": len(part.adjustment.removed),
-             "global_test_passed": part.adjustment.global_test()["passed"],
-             "block": part.block.as_dict(),
-             "control": None if part.control is None else part.control.as_dict(),
-             "control_not_used": part.no_control}
+            {
+                "name": part.name,
+                "images": list(part.adjustment.network.images.id),
+                "sigma0": part.adjustment.sigma0,
+                "sigma_factors": dict(part.factors),
+                "removed": len(part.adjustment.removed),
+                "global_test_passed": part.adjustment.global_test()["passed"],
+                "block": part.block.as_dict(),
+                "control": None if part.control is None else part.control.as_dict(),
+                "control_not_used": part.no_control,
+            }
             for part in found.parts
         ],
-        "warnings": list(found.warnings), "left_out": dict(found.left_out),
-        "notes": list(found.notes), "pairs": len(found.pairs),
-    }  # fmt: skip
+        "warnings": list(found.warnings),
+        "left_out": dict(found.left_out),
+        "notes": list(found.notes),
+        "pairs": len(found.pairs),
+    }

@@ -48,13 +48,22 @@ def stability(
         write_bytes(Path(json), text.encode())
     rows = []
     for k, name in enumerate(found.names):
-        row = [name, *(f"{x:.6g}" for x in (found.mean[k], found.mean_sigma[k], found.between[k])),
-               f"{found.probability[k]:.2g}"]  # fmt: skip
+        row = [
+            name,
+            *(f"{x:.6g}" for x in (found.mean[k], found.mean_sigma[k], found.between[k])),
+            f"{found.probability[k]:.2g}",
+        ]
         if found.slope is not None:
-            row += [f"{x[k]:.{digits}g}" for x, digits in (
-                (found.slope, 4), (found.slope_sigma, 2), (found.slope_probability, 2),
-                (found.about_slope, 2),
-            ) if x is not None]  # fmt: skip
+            row += [
+                f"{x[k]:.{digits}g}"
+                for x, digits in (
+                    (found.slope, 4),
+                    (found.slope_sigma, 2),
+                    (found.slope_probability, 2),
+                    (found.about_slope, 2),
+                )
+                if x is not None
+            ]
         rows.append(row)
     head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope", "p", "about it"]
     head = head[: len(rows[0])]

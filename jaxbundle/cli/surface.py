@@ -11,8 +11,15 @@ from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.terminals import write_json
 
-FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm_sigma.tif",
-         "orthophoto.tif")  # fmt: skip
+FILES = (
+    "cloud.csv",
+    "cloud.ply",
+    "surface.json",
+    "report.txt",
+    "dsm.tif",
+    "dsm_sigma.tif",
+    "orthophoto.tif",
+)
 
 
 EXAMPLE = (
@@ -58,13 +65,15 @@ def surface(
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option(help="coordinate system of cloud and DSM; for scanner and RPC images "
-        "the default is the UTM zone"),
+        typer.Option(
+            help="coordinate system of cloud and DSM; for scanner and RPC images "
+            "the default is the UTM zone"
+        ),
     ] = None,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
     force: Force = False,
     quiet: Quiet = False,
-) -> None:  # fmt: skip
+) -> None:
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import numpy as np
 

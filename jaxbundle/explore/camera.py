@@ -60,22 +60,28 @@ class CameraView:
     """
 
     def __init__(
-        self, camera: Camera, sigma: Mapping[str, float] | None = None,
-        photograph: UInt8[np.ndarray, "rows columns 3"] | None = None, origin: Origin = UNKNOWN,
-    ):  # fmt: skip
+        self,
+        camera: Camera,
+        sigma: Mapping[str, float] | None = None,
+        photograph: UInt8[np.ndarray, "rows columns 3"] | None = None,
+        origin: Origin = UNKNOWN,
+    ):
         self.camera, self.sigma, self.origin = camera, dict(sigma or {}), origin
         self.model, self.photograph = get_model(camera.model), photograph
         self.values = {
-            **dict.fromkeys(self.model.parameters, 0.0), **default_parameters(self.model),
+            **dict.fromkeys(self.model.parameters, 0.0),
+            **default_parameters(self.model),
             **{name: float(value) for name, value in camera.parameters.items()},
-        }  # fmt: skip
+        }
         if camera.image_size is None:
             raise InputError(f"camera {camera.id!r} has no image_size; see --image-size")
         self.size = camera.image_size
         if photograph is not None and photograph.shape[1::-1] != tuple(self.size):
             columns, rows = photograph.shape[1::-1]
-            raise InputError(f"the photograph has {columns} × {rows} pixels, camera {camera.id!r} "
-                             f"{self.size[0]} × {self.size[1]}")  # fmt: skip
+            raise InputError(
+                f"the photograph has {columns} × {rows} pixels, camera {camera.id!r} "
+                f"{self.size[0]} × {self.size[1]}"
+            )
         try:
             self.low, self.high = image_area(self.model, camera.image_size, camera.pixel_size)
             self.origin_of_pixels, self.step = pixel_frame(
@@ -142,10 +148,14 @@ class CameraView:
         if self.photograph is not None:
             parts["photo"] = self._draw_photograph(self.photograph, values)
         return {
-            "parts": parts, "radius": radius.tolist(), "radial": now[0].tolist(),
-            "decentring": now[1].tolist(), "grid": lattice.tolist(), "rms": rms,
+            "parts": parts,
+            "radius": radius.tolist(),
+            "radial": now[0].tolist(),
+            "decentring": now[1].tolist(),
+            "grid": lattice.tolist(),
+            "rms": rms,
             "largest": largest,
-        }  # fmt: skip
+        }
 
     def export(self, name: str, given: Given) -> File:
         """`camera.toml`: the camera with these parameters.
@@ -161,21 +171,40 @@ class CameraView:
         values = self.parameters(given)
         controls = [c._replace(value=values[c.key]) for c in self._controls]
         sections = [
-            Section("parameters", "Parameters", "".join([
-                paragraph(f"Camera {clean(self.camera.id)}, model {self.model.name}, "
-                          f"{self.size[0]} × {self.size[1]} pixels."),
-                items(equations(self.model)), draw_controls(controls, live),
-                draw_tools(live, {"Camera file": "camera.toml"}), place("numbers"),
-            ])),
+            Section(
+                "parameters",
+                "Parameters",
+                "".join(
+                    [
+                        paragraph(
+                            f"Camera {clean(self.camera.id)}, model {self.model.name}, "
+                            f"{self.size[0]} × {self.size[1]} pixels."
+                        ),
+                        items(equations(self.model)),
+                        draw_controls(controls, live),
+                        draw_tools(live, {"Camera file": "camera.toml"}),
+                        place("numbers"),
+                    ]
+                ),
+            ),
             Section("distortion", "Distortion", place("curve"), "Distortion"),
             Section("grid-section", "Grid", place("grid"), "Grid"),
-        ]  # fmt: skip
+        ]
         if self.photograph is not None:
-            sections.append(Section("photo-section", "Undistorted photograph", place("photo"),
-                                    "Photograph"))  # fmt: skip
+            sections.append(
+                Section("photo-section", "Undistorted photograph", place("photo"), "Photograph")
+            )
         title = f"camera {clean(self.camera.id)}: explorer"
-        return make_page(title, sections, self.origin, live, "camera", self.answer(given),
-                         [("model", self.model.name)], given=values)  # fmt: skip
+        return make_page(
+            title,
+            sections,
+            self.origin,
+            live,
+            "camera",
+            self.answer(given),
+            [("model", self.model.name)],
+            given=values,
+        )
 
     # --- drawings ---------------------------------------------------------------------------
 
@@ -196,28 +225,37 @@ class CameraView:
 
     def _draw_curve(self, radius, now, before) -> str:
         scale, unit = micrometres(self.model.unit)
-        curves = [Curve("as given", radius, scale * before[0], None, "second"),
-                  Curve("symmetric radial", radius, scale * now[0])]  # fmt: skip
+        curves = [
+            Curve("as given", radius, scale * before[0], None, "second"),
+            Curve("symmetric radial", radius, scale * now[0]),
+        ]
         return figure(
-            draw_curves(curves, f"distance from the principal point [{self.model.unit}]",
-                        f"measured − ideal [{unit}]"),
+            draw_curves(
+                curves,
+                f"distance from the principal point [{self.model.unit}]",
+                f"measured − ideal [{unit}]",
+            ),
             "Symmetric radial distortion, to the half diagonal of the image",
-        )  # fmt: skip
+        )
 
     def _draw_grid(self, straight, lattice, rms: float, largest: float) -> str:
         scale, unit = micrometres(self.model.unit)
         lines = []
-        for places, label, kind in ((straight, "without distortion, as given", "given"),
-                                    (lattice, "with these parameters", "first")):  # fmt: skip
+        for places, label, kind in (
+            (straight, "without distortion, as given", "given"),
+            (lattice, "with these parameters", "first"),
+        ):
             for part in (places, places.swapaxes(0, 1)):
                 lines += [Curve(label, line[:, 0], line[:, 1], None, kind) for line in part]
         unit_of_axes = self.model.unit
-        drawing = draw_plan(lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]",
-                            down=self.model.axes == "down")  # fmt: skip
+        drawing = draw_plan(
+            lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]", down=self.model.axes == "down"
+        )
         return figure(
-            drawing, f"Image displacement relative to the original camera: RMS "
+            drawing,
+            f"Image displacement relative to the original camera: RMS "
             f"{significant(scale * rms)} {unit}, at most {significant(scale * largest)} {unit}",
-        )  # fmt: skip
+        )
 
     def _list(self, values, radius, now, before) -> str:
         rows = []
@@ -236,24 +274,42 @@ class CameraView:
             (f"{radius[k]:.4g}", *(significant(scale * x[k]) for x in (before[0], now[0], now[1])))
             for k in chosen
         ]
-        header = (f"radius [{self.model.unit}]", f"radial as given [{unit}]", f"radial [{unit}]",
-                  f"decentring [{unit}]")  # fmt: skip
-        return "".join([
-            table, paragraph(f"Field of view {degrees} (horizontal, vertical, diagonal)."),
-            grid(header, rows),
-        ])
+        header = (
+            f"radius [{self.model.unit}]",
+            f"radial as given [{unit}]",
+            f"radial [{unit}]",
+            f"decentring [{unit}]",
+        )
+        return "".join(
+            [
+                table,
+                paragraph(f"Field of view {degrees} (horizontal, vertical, diagonal)."),
+                grid(header, rows),
+            ]
+        )
 
     def _draw_photograph(self, photograph: UInt8[np.ndarray, "r c 3"], values) -> str:
         cv2 = need_opencv()
         u, v = (x.astype(np.float32) for x in self._lookup(photograph.shape[:2], values))
-        picture = cv2.remap(photograph, u, v, cv2.INTER_LINEAR,
-                            borderMode=cv2.BORDER_CONSTANT, borderValue=(255, 255, 255))
+        picture = cv2.remap(
+            photograph,
+            u,
+            v,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(255, 255, 255),
+        )
         options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _, coded = cv2.imencode(".jpg", picture[..., ::-1], options)
         data = base64.b64encode(coded.tobytes()).decode("ascii")
-        return (f'<img alt="undistorted photograph" src="data:image/jpeg;base64,{data}">\n'
-                + paragraph("In perspective, with the principal distance and point on the "
-                            "sliders; white outside the photograph.", "hint"))
+        return (
+            f'<img alt="undistorted photograph" src="data:image/jpeg;base64,{data}">\n'
+            + paragraph(
+                "In perspective, with the principal distance and point on the "
+                "sliders; white outside the photograph.",
+                "hint",
+            )
+        )
 
     def _lookup(self, shape: tuple[int, int], values):
         """Columns and rows in a photograph of the pixels of its undistorted picture."""

@@ -75,8 +75,10 @@ class NetworkView:
 
     def __init__(self, adjustment: Adjustment, origin: Origin = UNKNOWN):
         if not adjustment.converged:
-            raise InputError(f"the adjustment did not converge ({adjustment.termination}); "
-                             "jaxbundle adjust says why")  # fmt: skip
+            raise InputError(
+                f"the adjustment did not converge ({adjustment.termination}); "
+                "jaxbundle adjust says why"
+            )
         self.adjustment, self.origin = adjustment, origin
         self.problem = adjustment.problem
         self.ids = self.problem.network.images.id
@@ -97,8 +99,10 @@ class NetworkView:
         data: Data = dataclasses.replace(self.problem.data, start=start)
         found = jax.tree.map(np.asarray, self._sigma(data))
         if not np.isfinite(found.images).all():
-            raise InputError("the moved network does not determine all unknowns, or a camera has "
-                             "no image of one of its points")  # fmt: skip
+            raise InputError(
+                "the moved network does not determine all unknowns, or a camera has "
+                "no image of one of its points"
+            )
         return found
 
     @cached_property
@@ -121,12 +125,17 @@ class NetworkView:
     def _move(self, id: str, values: Any, aim: bool) -> Moved:
         if id not in self.ids:
             raise InputError(f"there is no image {id!r}{did_you_mean(id, self.ids)}")
-        if not isinstance(values, list) or len(values) != 6 or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v)
-            for v in values
-        ):  # fmt: skip
-            raise InputError(f"image {id!r}: six numbers {', '.join(EXTERIOR)} are expected, not "
-                             f"{show(values)}")  # fmt: skip
+        if (
+            not isinstance(values, list)
+            or len(values) != 6
+            or not all(
+                isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v)
+                for v in values
+            )
+        ):
+            raise InputError(
+                f"image {id!r}: six numbers {', '.join(EXTERIOR)} are expected, not {show(values)}"
+            )
         row = self.ids.index(id)
         pose = np.array(values, float) / self.units
         if not aim:
@@ -183,11 +192,14 @@ class NetworkView:
             "parts": {"moved": "".join(parts)},
             "stations": {self.ids[m.row]: self._describe(m) for m in moves},
             "sigma": {
-                when: {"points": p.points.tolist(), "cameras": p.cameras.tolist(),
-                       "images": (p.images * self.units).tolist()}
+                when: {
+                    "points": p.points.tolist(),
+                    "cameras": p.cameras.tolist(),
+                    "images": (p.images * self.units).tolist(),
+                }
                 for when, p in (("before", before), ("after", after))
             },
-        }  # fmt: skip
+        }
 
     def export(self, name: str, given: Given) -> File:
         """There is none: the report of `adjust` has the tables.
@@ -241,22 +253,30 @@ class NetworkView:
             outside = ~((xy >= low) & (xy <= high)).all(1) & known
             lost = int((behind | outside).sum())
             if lost:
-                lines.append(f"{lost} of {count(len(rays), 'image point')} of image "
-                             f"{clean(self.ids[moved.row])} would be outside the image or behind "
-                             "the camera; the σ below still include them")  # fmt: skip
+                lines.append(
+                    f"{lost} of {count(len(rays), 'image point')} of image "
+                    f"{clean(self.ids[moved.row])} would be outside the image or behind "
+                    "the camera; the σ below still include them"
+                )
             elif not known:
-                lines.append(f"the size of the images of camera {clean(camera.id)} is not known: "
-                             "whether all image points lie in them is not checked")  # fmt: skip
+                lines.append(
+                    f"the size of the images of camera {clean(camera.id)} is not known: "
+                    "whether all image points lie in them is not checked"
+                )
         return "".join(paragraph(f"{line}.", "hint") for line in lines)
 
     def _compare(self, moves: list[Moved], before: Precision, after: Precision) -> str:
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
         near = self.adjustment.located & (before.points > 0).any(1)
         root = lambda s: np.sqrt(np.mean(s[near] ** 2, 0))
-        rows = [
-            (f"σ{axis} of the points, RMS [{unit}]", a, b)
-            for axis, a, b in zip("XYZ", root(before.points), root(after.points))
-        ] if near.any() else []  # fmt: skip
+        rows = (
+            [
+                (f"σ{axis} of the points, RMS [{unit}]", a, b)
+                for axis, a, b in zip("XYZ", root(before.points), root(after.points))
+            ]
+            if near.any()
+            else []
+        )
         for c, camera in enumerate(network.cameras):
             names = get_model(camera.model).parameters
             rows += [
@@ -268,20 +288,30 @@ class NetworkView:
         for moved in moves:
             a, b = (p.images[moved.row] * self.units for p in (before, after))
             rows += [
-                (f"σ {MEANING.get(name, name)} of image {self.ids[moved.row]} [{units[name]}]",
-                 a[k], b[k])
-                for k, name in enumerate(EXTERIOR) if a[k] > 0
-            ]  # fmt: skip
+                (
+                    f"σ {MEANING.get(name, name)} of image {self.ids[moved.row]} [{units[name]}]",
+                    a[k],
+                    b[k],
+                )
+                for k, name in enumerate(EXTERIOR)
+                if a[k] > 0
+            ]
         header = ("", "as adjusted", "moved", "change")
         table = grid(header, [(name, *_pair(a, b)) for name, a, b in rows])
         ids = np.array(network.points.id, dtype=object)
         change = np.where(near, np.abs(np.log(_ratio(before.points, after.points))), -1)
         order = [p for p in np.argsort(-change)[:MOST_ROWS] if near[p]]
         points = [
-            (ids[p], *(significant(float(s)) for axis in range(3)
-                       for s in (before.points[p, axis], after.points[p, axis])))
+            (
+                ids[p],
+                *(
+                    significant(float(s))
+                    for axis in range(3)
+                    for s in (before.points[p, axis], after.points[p, axis])
+                ),
+            )
             for p in order
-        ]  # fmt: skip
+        ]
         header = ("point", *(f"σ{axis} {when}" for axis in "XYZ" for when in ("before", "after")))
         more = f"<h3>Points, the largest change first [{text(unit)}]</h3>\n" + grid(header, points)
         return table + more
@@ -295,14 +325,24 @@ class NetworkView:
             find(found), found.warnings, facts(row for row in summary(found) if row[0] != "Note")
         )
         sections = [
-            shown_first, network_section(), _selection(), self._move_section(given, live),
+            shown_first,
+            network_section(),
+            _selection(),
+            self._move_section(given, live),
             photographs(),
-        ]  # fmt: skip
+        ]
         state = {"moves": given.get("moves", {}), "aim": given.get("aim", True)}
         return make_page(
-            title, sections, self.origin, live, "network", answer, tables=collect_tables(found),
-            drawings=drawings, given=state,
-        )  # fmt: skip
+            title,
+            sections,
+            self.origin,
+            live,
+            "network",
+            answer,
+            tables=collect_tables(found),
+            drawings=drawings,
+            given=state,
+        )
 
     def _move_section(self, given: Given, live: bool) -> Section:
         dead = "" if live else " disabled"
@@ -317,27 +357,35 @@ class NetworkView:
             [Switch("aim", "turned to its points", given.get("aim", True) is True)], live
         )
         parts = [
-            paragraph("Where would a station be better? Same measurements, new geometry: σ to "
-                      "first order, times σ0, with image points as they would be seen from there. "
-                      "The error ellipsoids of the drawing are then the expected ones.", "hint"),
+            paragraph(
+                "Where would a station be better? Same measurements, new geometry: σ to "
+                "first order, times σ0, with image points as they would be seen from there. "
+                "The error ellipsoids of the drawing are then the expected ones.",
+                "hint",
+            ),
             '<div class="controls"><label><span>station</span><select id="move-station"></select>'
-            '</label></div>\n',
-            f'<div class="controls">\n{fields}</div>\n', aim,
+            "</label></div>\n",
+            f'<div class="controls">\n{fields}</div>\n',
+            aim,
             f'<div class="tools"><button type="button" id="move-back"{dead}>all as adjusted'
             "</button></div>\n",
-            draw_tools(live), place("moved"),
-        ]  # fmt: skip
+            draw_tools(live),
+            place("moved"),
+        ]
         return Section("move", "Move a station", "".join(parts), "Move a station")
 
 
 def _selection() -> Section:
     """The place for the clicked item."""
     parts = [
-        paragraph("Click a point, a station, a ray, or an image point in a photograph: its "
-                  "observations with σ a priori, redundancy number r, w, τ, the minimal detectable "
-                  "blunder and its effect.", "hint"),
+        paragraph(
+            "Click a point, a station, a ray, or an image point in a photograph: its "
+            "observations with σ a priori, redundancy number r, w, τ, the minimal detectable "
+            "blunder and its effect.",
+            "hint",
+        ),
         '<div id="chosen" class="scroll" aria-live="polite"></div>\n',
-    ]  # fmt: skip
+    ]
     return Section("chosen-section", "What is chosen", "".join(parts), "What is chosen")
 
 

@@ -87,7 +87,6 @@ POSITIVE = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
-
 class Chosen(NamedTuple):
     """An image with what was chosen, the ellipsoid (None in a local frame), the surface it is
     located on, and the image that is true."""
@@ -106,14 +105,20 @@ class ScannerView:
     """
 
     def __init__(
-        self, name: str, given: PushbroomImage | Flight, earth: Ellipsoid | None,
-        truth: PushbroomImage | None = None, origin: Origin = UNKNOWN,
-    ):  # fmt: skip
+        self,
+        name: str,
+        given: PushbroomImage | Flight,
+        earth: Ellipsoid | None,
+        truth: PushbroomImage | None = None,
+        origin: Origin = UNKNOWN,
+    ):
         self.name, self.earth, self.origin = name, earth, origin
         self.flight = given if isinstance(given, Flight) else None
         self.image = measured_image(given) if isinstance(given, Flight) else given
-        self.truth = truth if truth is not None else (
-            self.image if self.flight is None else true_image(self.flight)
+        self.truth = (
+            truth
+            if truth is not None
+            else (self.image if self.flight is None else true_image(self.flight))
         )
         self.known = truth is not None or self.flight is not None
         self.tracks = (
@@ -131,26 +136,39 @@ class ScannerView:
         turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
         found: list[Control] = []
         if self.tracks is not None:
-            found += [Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
-                      *track_controls(self.tracks)]  # fmt: skip
+            found += [
+                Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
+                *track_controls(self.tracks),
+            ]
         found += [
-            Choice("position_interpolation", "interpolation of the position", position.method,
-                   ways),
-            Choice("attitude_interpolation", "interpolation of the attitude",
-                   "slerp" if attitude.slerp else attitude.table.method, turns),
-        ]  # fmt: skip
-        found += [
-            Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES
+            Choice(
+                "position_interpolation", "interpolation of the position", position.method, ways
+            ),
+            Choice(
+                "attitude_interpolation",
+                "interpolation of the attitude",
+                "slerp" if attitude.slerp else attitude.table.method,
+                turns,
+            ),
         ]
+        found += [Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES]
         if self.flight is not None:
             found += [
                 Number("position_rate", "samples of the position", self.flight.position_rate, "Hz"),
                 Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
-                Number("attitude_white", "σ of every attitude row",
-                       _degrees(self.flight.noise.attitude_white), "°"),
-                Number("position_white", "σ of every position row",
-                       _one(self.flight.noise.position_white), "m"),
-            ]  # fmt: skip
+                Number(
+                    "attitude_white",
+                    "σ of every attitude row",
+                    _degrees(self.flight.noise.attitude_white),
+                    "°",
+                ),
+                Number(
+                    "position_white",
+                    "σ of every position row",
+                    _one(self.flight.noise.position_white),
+                    "m",
+                ),
+            ]
         if self.earth is not None or self.tracks is not None:
             found += [
                 Switch(name, name.replace("_", " "), on)
@@ -191,13 +209,18 @@ class ScannerView:
             _table_with(image.trajectory.position, values["position_interpolation"]),
             _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
         )
-        corrections = Corrections(*(
-            earth is not None and values.get(name, False) for name in Corrections._fields
-        ))  # fmt: skip
+        corrections = Corrections(
+            *(earth is not None and values.get(name, False) for name in Corrections._fields)
+        )
         image = make_image(
-            trajectory, image.times, image.optics, image.lines, image.pixels, image.mounting,
+            trajectory,
+            image.times,
+            image.optics,
+            image.lines,
+            image.pixels,
+            image.mounting,
             corrections,
-        )  # fmt: skip
+        )
         error = np.zeros(3)
         for name, k in ANGLES.items():
             error[k] = np.radians(values[name])
@@ -212,12 +235,18 @@ class ScannerView:
             # A σ for every axis stays as the file has it until it is changed.
             if values[name] != _control(self.controls, name).value:
                 noise = noise._replace(**{name: unit * values[name]})
-        names = ("position_interpolation", "attitude_interpolation", "position_rate",
-                 "attitude_rate")  # fmt: skip
+        names = (
+            "position_interpolation",
+            "attitude_interpolation",
+            "position_rate",
+            "attitude_rate",
+        )
         return dataclasses.replace(
-            flight, noise=noise, track=choose_track(tracks, values),
+            flight,
+            noise=noise,
+            track=choose_track(tracks, values),
             **{n: values[n] for n in names},
-        )  # fmt: skip
+        )
 
     # --- what the server asks ---------------------------------------------------------------
 
@@ -230,8 +259,10 @@ class ScannerView:
         errors = self._errors(chosen)
         length = np.hypot(*errors.T)
         if not np.isfinite(length).all():
-            raise InputError("not every image position has a point on the ground: check "
-                             "attitude, mounting and height")  # fmt: skip
+            raise InputError(
+                "not every image position has a point on the ground: check "
+                "attitude, mounting and height"
+            )
         expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
@@ -242,9 +273,11 @@ class ScannerView:
                 "errors": self._draw_errors(field, told),
                 "accuracy": self._list(told, errors, expected),
             },
-            **told, "errors": field.tolist(), "expected": expected,
+            **told,
+            "errors": field.tolist(),
+            "expected": expected,
             "idle": self._idle(values),
-        }  # fmt: skip
+        }
 
     def _idle(self, values: Mapping[str, Any]) -> list[str]:
         """The controls without effect: those of the other track, corrections without an Earth."""
@@ -265,8 +298,9 @@ class ScannerView:
             return File(name, "text/csv", self._csv(chosen).encode())
         if name == PICTURE_FILE:
             return File(name, "image/png", self._picture(chosen))
-        raise InputError(f"there is no file {name!r}; {FLIGHT_FILE}, {TABLE_FILE} and "
-                         f"{PICTURE_FILE} are")  # fmt: skip
+        raise InputError(
+            f"there is no file {name!r}; {FLIGHT_FILE}, {TABLE_FILE} and {PICTURE_FILE} are"
+        )
 
     def page(self, given: Given, live: bool) -> Page:
         """Controls, the ground, the error map, the table; a live page asks for them itself, since
@@ -278,22 +312,42 @@ class ScannerView:
             against = "the true trajectory of the flight"
         else:
             against = "the given truth" if self.known else "the image as its file has it"
-        exports = {"Flight file (zip)": FLIGHT_FILE, "Table (CSV)": TABLE_FILE,
-                   "Picture (PNG)": PICTURE_FILE}  # fmt: skip
+        exports = {
+            "Flight file (zip)": FLIGHT_FILE,
+            "Table (CSV)": TABLE_FILE,
+            "Picture (PNG)": PICTURE_FILE,
+        }
         sections = [
-            Section("choices", "Trajectory and attitude", "".join([
-                paragraph(f"{image.lines} lines of {image.pixels} pixels; errors are against "
-                          f"{against}."),
-                draw_controls(controls, live), draw_tools(live, exports),
-            ])),
+            Section(
+                "choices",
+                "Trajectory and attitude",
+                "".join(
+                    [
+                        paragraph(
+                            f"{image.lines} lines of {image.pixels} pixels; errors are against "
+                            f"{against}."
+                        ),
+                        draw_controls(controls, live),
+                        draw_tools(live, exports),
+                    ]
+                ),
+            ),
             Section("accuracy-section", "Accuracy", place("accuracy"), "Accuracy"),
             Section("errors-section", "Error map", place("errors"), "Error map"),
             Section("ground-section", "Ground track and footprint", place("ground"), "Ground"),
-        ]  # fmt: skip
+        ]
         title = f"{clean(self.name)}: explorer"
         rows = [(key.replace("_", " "), value) for key, value in values.items()]
-        return make_page(title, sections, self.origin, live, "scanner",
-                         {} if live else self.answer(given), rows, given=values)  # fmt: skip
+        return make_page(
+            title,
+            sections,
+            self.origin,
+            live,
+            "scanner",
+            {} if live else self.answer(given),
+            rows,
+            given=values,
+        )
 
     # --- numbers ----------------------------------------------------------------------------
 
@@ -318,10 +372,15 @@ class ScannerView:
             sigma = np.radians(level)
             exact = propagate_accuracy(image, surface, line, pixel, Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
-            rows.append({
-                "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,
-                "closed_rms": rms, "closed_ce90": circular_error(np.eye(2) * rms**2 / 2),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "sigma": level,
+                    "rms": exact.overall,
+                    "ce90": exact.overall_ce90,
+                    "closed_rms": rms,
+                    "closed_ce90": circular_error(np.eye(2) * rms**2 / 2),
+                }
+            )
         return rows
 
     def _draw_ground(self, chosen: Chosen) -> str:
@@ -351,8 +410,10 @@ class ScannerView:
             curves.append(curve("track, from above", P, "given"))
         elif earth.a == earth.b:
             curves.append(curve("ground track, below the platform", _below(earth, P), "given"))
-        return figure(draw_plan(curves, "east [km]", "north [km]"),
-                      "Relative to the image centre; both axes at one scale")  # fmt: skip
+        return figure(
+            draw_plan(curves, "east [km]", "north [km]"),
+            "Relative to the image centre; both axes at one scale",
+        )
 
     def _draw_errors(self, field, told) -> str:
         return figure(
@@ -364,19 +425,29 @@ class ScannerView:
     def _list(self, told, errors, expected) -> str:
         east, north = np.sqrt(np.mean(errors**2, 0))
         rows = [
-            ("RMS", told["rms"]), ("RMS east", east), ("RMS north", north),
-            ("CE90", told["ce90"]), ("largest", told["largest"]),
-        ]  # fmt: skip
+            ("RMS", told["rms"]),
+            ("RMS east", east),
+            ("RMS north", north),
+            ("CE90", told["ce90"]),
+            ("largest", told["largest"]),
+        ]
         first = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
-        header = ("σ of the attitude, each axis", "RMS [m]", "CE90 [m]", "RMS, level camera",
-                  "CE90, level camera")  # fmt: skip
+        header = (
+            "σ of the attitude, each axis",
+            "RMS [m]",
+            "CE90 [m]",
+            "RMS, level camera",
+            "CE90, level camera",
+        )
         names = ("rms", "ce90", "closed_rms", "closed_ce90")
         table = [
             (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names))
             for row in expected
         ]
-        return first + "<h3>Expected accuracy for a constant error over the image</h3>\n" + grid(
-            header, table
+        return (
+            first
+            + "<h3>Expected accuracy for a constant error over the image</h3>\n"
+            + grid(header, table)
         )
 
     # --- files ------------------------------------------------------------------------------
@@ -411,9 +482,13 @@ class ScannerView:
         length = np.hypot(*self._errors(chosen).T)
         told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
         try:
-            return png((7.5, 6), None, lambda ax: image_map(
-                lines, pixels, _rms_of_cells(length), "Error on the ground", "m", told, ax
-            ))  # fmt: skip
+            return png(
+                (7.5, 6),
+                None,
+                lambda ax: image_map(
+                    lines, pixels, _rms_of_cells(length), "Error on the ground", "m", told, ax
+                ),
+            )
         except ImportError as error:
             raise InputError(str(error)) from None
 
@@ -444,10 +519,14 @@ def _table_with(table: Table, method: str) -> Table:
     if method == table.method:
         return table
     return position_table(
-        np.asarray(table.times), np.asarray(table.values),
-        None if table.rates is None else np.asarray(table.rates), method=method, order=table.order,
-        gap=table.gap if np.isfinite(table.gap) else None, extrapolate=table.extrapolate,
-    )  # fmt: skip
+        np.asarray(table.times),
+        np.asarray(table.values),
+        None if table.rates is None else np.asarray(table.rates),
+        method=method,
+        order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None,
+        extrapolate=table.extrapolate,
+    )
 
 
 def _attitude_with(attitude: Attitude, method: str) -> Attitude:
@@ -456,10 +535,14 @@ def _attitude_with(attitude: Attitude, method: str) -> Attitude:
     if method == ("slerp" if attitude.slerp else table.method):
         return attitude
     return attitude_table(
-        np.asarray(table.times), np.asarray(table.values), method=method, order=table.order,
-        gap=table.gap if np.isfinite(table.gap) else None, extrapolate=table.extrapolate,
+        np.asarray(table.times),
+        np.asarray(table.values),
+        method=method,
+        order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None,
+        extrapolate=table.extrapolate,
         reference=attitude.reference,
-    )  # fmt: skip
+    )
 
 
 def _outline(image: PushbroomImage) -> tuple[np.ndarray, np.ndarray]:

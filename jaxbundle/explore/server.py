@@ -131,8 +131,10 @@ class Handler(BaseHTTPRequestHandler):
             if body is None:
                 raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body with its length is expected")
             if len(body) > MOST_BYTES:
-                raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                              f"a body of at most {MOST_BYTES} bytes is expected")  # fmt: skip
+                raise Refused(
+                    HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                    f"a body of at most {MOST_BYTES} bytes is expected",
+                )
             with self.server.computing:
                 file = act(action, body)
             status = HTTPStatus.OK
@@ -147,9 +149,11 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", file.type)
         self.send_header("Content-Length", str(len(file.content)))
         for name, value in (
-            ("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"),
-            ("Referrer-Policy", "no-referrer"), ("Allow", METHODS),
-        ):  # fmt: skip
+            ("Cache-Control", "no-store"),
+            ("X-Content-Type-Options", "nosniff"),
+            ("Referrer-Policy", "no-referrer"),
+            ("Allow", METHODS),
+        ):
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
@@ -168,8 +172,9 @@ class Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site may not ask")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
-            raise Refused(HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from "
-                          "the terminal")  # fmt: skip
+            raise Refused(
+                HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from the terminal"
+            )
         return "/".join(rest).rstrip("/")
 
     def _get(self, action: str, _: bytes) -> File:

@@ -15,11 +15,14 @@ from jaxbundle.pushbroom.image import PushbroomImage
 
 ORBIT, STRAIGHT = "orbit", "straight track"
 LABELS = {
-    "height": ("height of the orbit", "m"), "inclination": ("inclination", "°"),
-    "node": ("right ascension of the node", "°"), "argument": ("argument of latitude", "°"),
-    "altitude": ("altitude of the track", "m"), "speed": ("speed over ground", "m/s"),
+    "height": ("height of the orbit", "m"),
+    "inclination": ("inclination", "°"),
+    "node": ("right ascension of the node", "°"),
+    "argument": ("argument of latitude", "°"),
+    "altitude": ("altitude of the track", "m"),
+    "speed": ("speed over ground", "m/s"),
     "heading": ("heading, clockwise from y", "°"),
-}  # fmt: skip
+}
 """The parameters of an orbit and of a straight track: label and unit."""
 USUAL = {"height": 500e3, "inclination": 97.4, "node": 0.0, "argument": 0.0}
 
@@ -38,13 +41,18 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
     """The tracks of a flight; `image`: the one of its own track. A state vector has no controls."""
     if "start" in track:
         x, y, _ = velocity = np.asarray(track["velocity"], float)
-        straight = {"altitude": track["start"][2], "speed": np.linalg.norm(velocity),
-                    "heading": np.degrees(np.arctan2(x, y))}  # fmt: skip
+        straight = {
+            "altitude": track["start"][2],
+            "speed": np.linalg.norm(velocity),
+            "heading": np.degrees(np.arctan2(x, y)),
+        }
         known = {ORBIT: USUAL, STRAIGHT: {name: shorten_number(v) for name, v in straight.items()}}
         return Tracks(STRAIGHT, track, earth or WGS84, known)
     assert earth is not None and image.trajectory.position.rates is not None
-    P, V = (np.linalg.norm(np.asarray(rows)[0]) for rows in
-            (image.trajectory.position.values, image.trajectory.position.rates))  # fmt: skip
+    P, V = (
+        np.linalg.norm(np.asarray(rows)[0])
+        for rows in (image.trajectory.position.values, image.trajectory.position.rates)
+    )
     straight = {
         "altitude": shorten_number(P - earth.a, 3),
         "speed": shorten_number(V * earth.a / P, 3),

@@ -134,9 +134,13 @@ def convert(
 
 
 def _convert_network(
-    network: Network, output: Path, kind: str, model: str | CameraModel | None, measured: bool,
+    network: Network,
+    output: Path,
+    kind: str,
+    model: str | CameraModel | None,
+    measured: bool,
     force: bool,
-) -> Converted:  # fmt: skip
+) -> Converted:
     network, costs = _with_model(network, kind, model, measured)
     folder, files = _folder(output, kind), TARGETS[kind].files
     if folder is None:
@@ -166,12 +170,16 @@ def _add_sizes(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camer
     """The cameras, with sizes added if missing."""
     given = {"image_size": image_size, "pixel_size": pixel_size}
     made = tuple(
-        dataclasses.replace(camera, **{
-            name: tuple(size) for name, size in given.items()
-            if size is not None and getattr(camera, name) is None
-        })
+        dataclasses.replace(
+            camera,
+            **{
+                name: tuple(size)
+                for name, size in given.items()
+                if size is not None and getattr(camera, name) is None
+            },
+        )
         for camera in cameras
-    )  # fmt: skip
+    )
     for camera in made:
         check_camera(camera)
     return made
@@ -190,8 +198,13 @@ def _check_output(output: Path, kind: str) -> None:
 
 def _keep_input(input: Path, network: Network, output: Path, kind: str, control=None) -> None:
     """Refuse to replace the input."""
-    tables = (network.images, network.points, network.observations, network.distances,
-              *network.further)  # fmt: skip
+    tables = (
+        network.images,
+        network.points,
+        network.observations,
+        network.distances,
+        *network.further,
+    )
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
     folders = {os.path.realpath(Path(p).parent) for p in read}
     written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
@@ -223,8 +236,11 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
-    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST],
-              "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES]}  # fmt: skip
+    beside = {
+        "csv": [images_path(output)],
+        "bundler": [output.parent / LIST],
+        "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES],
+    }
     there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(
@@ -233,9 +249,7 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         )
 
 
-def _with_model(
-    network: Network, kind: str, model: str | CameraModel | None, measured: bool
-):
+def _with_model(network: Network, kind: str, model: str | CameraModel | None, measured: bool):
     """The network with camera models of the output, and the difference of each camera."""
     models = TARGETS[kind].models
     if model is not None:
@@ -262,9 +276,13 @@ def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, cost: Convers
 
 
 def _convert_cameras(
-    input: Path, cameras: Sequence[Camera], output: Path, kind: str,
-    model: str | CameraModel | None, id: str | None,
-) -> Converted:  # fmt: skip
+    input: Path,
+    cameras: Sequence[Camera],
+    output: Path,
+    kind: str,
+    model: str | CameraModel | None,
+    id: str | None,
+) -> Converted:
     if kind not in CAMERA_KINDS:
         raise InputError(
             f"{input}: contains only cameras; they can be written as "

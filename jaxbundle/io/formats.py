@@ -152,7 +152,9 @@ FORMATS: dict[str, Format] = {
     "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
     "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
     "photomodeler": Format(
-        is_photomodeler, read_photomodeler, 'a .txt file that begins with "Bundle Soln"',
+        is_photomodeler,
+        read_photomodeler,
+        'a .txt file that begins with "Bundle Soln"',
         adjusted=True,
     ),
     "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
@@ -189,8 +191,8 @@ def _ends(*suffixes: str) -> Callable[[Path], bool]:
 
 def _folder_of(*words: str) -> Callable[[Path], bool]:
     """A name without suffix that contains one of these words, or whose folder does."""
-    return lambda path: not path.suffix and any(
-        word in part.lower() for part in path.parts[-2:] for word in words
+    return lambda path: (
+        not path.suffix and any(word in part.lower() for part in path.parts[-2:] for word in words)
     )
 
 
@@ -218,51 +220,82 @@ TARGETS: dict[str, Target] = {
     "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
     "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
     "colmap": Target(
-        _folder_of("colmap", "sparse"), partial(fill_colmap, text=False),
-        "a folder with colmap or sparse in its name", COLMAP_MODELS, COLMAP_FILES,
+        _folder_of("colmap", "sparse"),
+        partial(fill_colmap, text=False),
+        "a folder with colmap or sparse in its name",
+        COLMAP_MODELS,
+        COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False, partial(fill_colmap, text=True), "by --to only", COLMAP_MODELS,
+        lambda path: False,
+        partial(fill_colmap, text=True),
+        "by --to only",
+        COLMAP_MODELS,
         COLMAP_FILES,
     ),
     "openmvg": Target(
-        _file_of("sfm_data", ".json"), write_openmvg, "NAME.json with sfm_data in its name",
+        _file_of("sfm_data", ".json"),
+        write_openmvg,
+        "NAME.json with sfm_data in its name",
         PIXEL_MODELS,
     ),
     "opensfm": Target(
-        _folder_of("opensfm"), fill_opensfm, "a folder with opensfm in its name", PIXEL_MODELS,
+        _folder_of("opensfm"),
+        fill_opensfm,
+        "a folder with opensfm in its name",
+        PIXEL_MODELS,
         OPENSFM_FILES,
     ),
     "transforms": Target(
-        _file_of("transforms", ".json"), write_transforms, "NAME.json with transforms in its name",
-        PIXEL_MODELS, alone=True,
+        _file_of("transforms", ".json"),
+        write_transforms,
+        "NAME.json with transforms in its name",
+        PIXEL_MODELS,
+        alone=True,
     ),
     "kalibr": Target(
-        _file_of("camchain", *YAML), write_kalibr, "NAME.yaml with camchain in its name",
-        KALIBR_MODELS, alone=True,
+        _file_of("camchain", *YAML),
+        write_kalibr,
+        "NAME.yaml with camchain in its name",
+        KALIBR_MODELS,
+        alone=True,
     ),
     "micmac": Target(
-        lambda path: path.name.startswith("Ori-"), fill_micmac, "a folder Ori-NAME",
-        MICMAC_MODELS, MICMAC_FILES,
+        lambda path: path.name.startswith("Ori-"),
+        fill_micmac,
+        "a folder Ori-NAME",
+        MICMAC_MODELS,
+        MICMAC_FILES,
     ),
     "jaicov": Target(_ends(".phc"), write_jaicov, "NAME.phc", ("brown-projected",)),
     "mrcal": Target(
-        _folder_of("mrcal"), fill_mrcal, "a folder with mrcal in its name", MRCAL_MODELS,
-        MRCAL_FILES, alone=True,
+        _folder_of("mrcal"),
+        fill_mrcal,
+        "a folder with mrcal in its name",
+        MRCAL_MODELS,
+        MRCAL_FILES,
+        alone=True,
     ),
     "opencv-stereo": Target(
-        _file_of("stereo", *OPENCV_SUFFIXES), write_opencv_stereo,
-        "NAME.yaml, .yml, .json with stereo in its name", PIXEL_MODELS,
+        _file_of("stereo", *OPENCV_SUFFIXES),
+        write_opencv_stereo,
+        "NAME.yaml, .yml, .json with stereo in its name",
+        PIXEL_MODELS,
     ),
     "ros-stereo": Target(
-        _folder_of("camera_info"), fill_ros_stereo, "a folder with camera_info in its name",
-        PIXEL_MODELS, ROS_FILES,
+        _folder_of("camera_info"),
+        fill_ros_stereo,
+        "a folder with camera_info in its name",
+        PIXEL_MODELS,
+        ROS_FILES,
     ),
     "project": Target(
-        lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME, _write_project,
-        "another folder", files=PROJECT_FILES,
+        lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,
+        _write_project,
+        "another folder",
+        files=PROJECT_FILES,
     ),
-}  # fmt: skip
+}
 CAMERA_KINDS: dict[str, CameraTarget] = {
     "colmap-cameras": CameraTarget(
         _is_named("cameras.txt"), write_colmap_cameras, "cameras.txt", COLMAP_MODELS
@@ -271,20 +304,33 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
         _is_named("camera_models.json"), write_opensfm_cameras, "camera_models.json", PIXEL_MODELS
     ),
     "ros": CameraTarget(
-        _file_of("camera_info", *YAML), _first(write_ros), "NAME.yaml with camera_info in its name",
-        PIXEL_MODELS, one=True,
+        _file_of("camera_info", *YAML),
+        _first(write_ros),
+        "NAME.yaml with camera_info in its name",
+        PIXEL_MODELS,
+        one=True,
     ),
     "cameramodel": CameraTarget(
-        _ends(".cameramodel"), _first(write_cameramodel), "NAME.cameramodel", MRCAL_MODELS,
+        _ends(".cameramodel"),
+        _first(write_cameramodel),
+        "NAME.cameramodel",
+        MRCAL_MODELS,
         one=True,
     ),
     "autocal": CameraTarget(
-        _file_of("autocal", ".xml"), _first(write_autocal), "NAME.xml with autocal in its name",
-        MICMAC_MODELS, one=True,
+        _file_of("autocal", ".xml"),
+        _first(write_autocal),
+        "NAME.xml with autocal in its name",
+        MICMAC_MODELS,
+        one=True,
     ),
     "opencv": CameraTarget(
-        _ends(*YAML, ".json"), _first(write_opencv), "NAME.yaml, .yml, .json", PIXEL_MODELS,
-        one=True, broad=True,
+        _ends(*YAML, ".json"),
+        _first(write_opencv),
+        "NAME.yaml, .yml, .json",
+        PIXEL_MODELS,
+        one=True,
+        broad=True,
     ),
     "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),
 }
@@ -300,8 +346,9 @@ def recognise_target(path: Path) -> str | None:
     """The kind of an output, from its name."""
     kinds = (
         *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
-        *TARGETS.items(), *CAMERA_KINDS.items(),
-    )  # fmt: skip
+        *TARGETS.items(),
+        *CAMERA_KINDS.items(),
+    )
     return next((name for name, kind in kinds if kind.recognises(path)), None)
 
 

@@ -1,11 +1,11 @@
 """`adjust`: from tables and observations to a result with statistics.
 
-    from jaxbundle import leastsquares as ls
+from jaxbundle import leastsquares as ls
 
-    height = ls.Table("height", start)                                                   # [n]
-    levelled = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
-    result = ls.adjust([height], [levelled(rows=(i, j), measured=dh, sigma=s)], datum="inner")
-    result.sigma0, result["height"].value, result["height"].sigma
+height = ls.Table("height", start)                                                   # [n]
+levelled = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
+result = ls.adjust([height], [levelled(rows=(i, j), measured=dh, sigma=s)], datum="inner")
+result.sigma0, result["height"].value, result["height"].sigma
 """
 
 import dataclasses
@@ -75,9 +75,13 @@ class Result:
     """
 
     def __init__(
-        self, problem: Problem, minimum: Minimum[Values], removed: Sequence[Removed] = (),
-        suspects: Sequence[Suspect] = (), factors: Mapping[str, float] | None = None,
-    ):  # fmt: skip
+        self,
+        problem: Problem,
+        minimum: Minimum[Values],
+        removed: Sequence[Removed] = (),
+        suspects: Sequence[Suspect] = (),
+        factors: Mapping[str, float] | None = None,
+    ):
         self.problem, self.minimum = problem, minimum
         self.removed, self.suspects = tuple(removed), tuple(suspects)
         self.sigma_factors = dict(factors or {})
@@ -162,10 +166,14 @@ class Result:
         w, gain = found.w[o], np.where(used, found.gain[o], 1.0)
         free = np.where(used, np.clip(1 - found.hat[o], 0, 1), 0.0)
         return {
-            "v": found.residual[o] * np.where(used, sigma, np.nan), "sigma": sigma,
-            "r": found.redundancy[o], "w": w, "tau": w / (self.sigma0 or np.nan),
-            "mdb": minimal_detectable(sigma / gain, free), "external": external_reliability(free),
-        }  # fmt: skip
+            "v": found.residual[o] * np.where(used, sigma, np.nan),
+            "sigma": sigma,
+            "r": found.redundancy[o],
+            "w": w,
+            "tau": w / (self.sigma0 or np.nan),
+            "mdb": minimal_detectable(sigma / gain, free),
+            "external": external_reliability(free),
+        }
 
     @functools.cached_property
     def components(self) -> dict[str, Component]:
@@ -194,13 +202,22 @@ class Result:
 
 
 def adjust(
-    tables: Sequence[Table], observations: Sequence[Observations], *,
-    datum: str | Mapping[str, Any] = "given", motions: Motions | None = None,
-    eliminate: str | None = "", reduction: str | None = None,
-    method: str = "levenberg-marquardt", max_iterations: int = 100, robust: str | None = None,
-    snooping: str | None = None, significance: float = 0.001, estimate_components: bool = False,
-    progress: Callable | None = None, **options,
-) -> Result:  # fmt: skip
+    tables: Sequence[Table],
+    observations: Sequence[Observations],
+    *,
+    datum: str | Mapping[str, Any] = "given",
+    motions: Motions | None = None,
+    eliminate: str | None = "",
+    reduction: str | None = None,
+    method: str = "levenberg-marquardt",
+    max_iterations: int = 100,
+    robust: str | None = None,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    estimate_components: bool = False,
+    progress: Callable | None = None,
+    **options,
+) -> Result:
     """Adjust your own problem by least squares.
 
     **Arguments:**
@@ -237,15 +254,26 @@ def adjust(
     tables = tuple(tables)
     eliminate = choose_eliminated(tables, observations) if eliminate == "" else eliminate
     problem = make_problem(
-        tables, observations, eliminate, motions=_motions(tables, datum, motions),
-        datum=functools.partial(_hold_datum, tables, datum), reduction=reduction, **options,
-    )  # fmt: skip
+        tables,
+        observations,
+        eliminate,
+        motions=_motions(tables, datum, motions),
+        datum=functools.partial(_hold_datum, tables, datum),
+        reduction=reduction,
+        **options,
+    )
     minima: list[Minimum[Values]] = []
 
     def again(problem: Problem, start: Values) -> Solution:
-        minima.append(find_minimum(
-            problem, start, search=SEARCHES[method], max_steps=steps, progress=progress,
-        ))  # fmt: skip
+        minima.append(
+            find_minimum(
+                problem,
+                start,
+                search=SEARCHES[method],
+                max_steps=steps,
+                progress=progress,
+            )
+        )
         found = Solution(problem, minima[-1].values)
         if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
             names = undetermined(problem, minima[-1].values)

@@ -152,9 +152,14 @@ class Kind:
     local: Local | None = None
 
     def __call__(
-        self, rows: Sequence[Int[np.ndarray, " n"]], measured: PyTree = (), *,
-        sigma: Any = None, covariance: Any = None, name: str = "",
-    ) -> "Observations":  # fmt: skip
+        self,
+        rows: Sequence[Int[np.ndarray, " n"]],
+        measured: PyTree = (),
+        *,
+        sigma: Any = None,
+        covariance: Any = None,
+        name: str = "",
+    ) -> "Observations":
         """Observations of this kind; see `Observations`."""
         return Observations(self, tuple(rows), measured, sigma, covariance, name)
 

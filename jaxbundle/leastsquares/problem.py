@@ -109,10 +109,15 @@ class Counts:
 
 
 def make_problem(
-    tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None = None,
-    *, motions: Motions | None = None, datum: Callable | None = None, retraction=None,
+    tables: Sequence[Table],
+    observations: Sequence[Observations],
+    eliminate: str | None = None,
+    *,
+    motions: Motions | None = None,
+    datum: Callable | None = None,
+    retraction=None,
     reduction: str | None = None,
-) -> Problem:  # fmt: skip
+) -> Problem:
     """Plan and arrays of declared tables and observations.
 
     `motions`: those that may be open. If some are, `datum(gauge)` is called with the combinations
@@ -131,8 +136,16 @@ def make_problem(
     ways = REDUCTIONS if reduction is None else (reduction,)
     planned = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
-    problem = Problem(tables, observations, declared, planned[0], data, *planned[1:],
-                      count(tables, data), (retraction or Retraction)(declared))  # fmt: skip
+    problem = Problem(
+        tables,
+        observations,
+        declared,
+        planned[0],
+        data,
+        *planned[1:],
+        count(tables, data),
+        (retraction or Retraction)(declared),
+    )
     problem = problem if motions is None else _with_datum(problem, datum)
     if sum(o.number for o in observations) > WORTH_RETURNING:
         return_freed_memory()
@@ -363,8 +376,9 @@ def without_filling(problem: Problem, values: Values) -> Values:
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(values))
     # On the host, where nothing is compiled for it.
     cut = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
-    return {t.name: jax.tree.map(lambda x, n=t.rows: cut(x, n), values[t.name])
-            for t in problem.tables}  # fmt: skip
+    return {
+        t.name: jax.tree.map(lambda x, n=t.rows: cut(x, n), values[t.name]) for t in problem.tables
+    }
 
 
 def _append_unused(x, n: int, mode: Literal["constant", "edge"]) -> Any:
@@ -402,9 +416,14 @@ def make_solver(
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
     rows = round_up(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
     return LeastSquares(
-        problem.declared, problem.plan, tolerance, problem.retraction, rows=rows,
-        max_steps=jax.device_put(np.int64(max_steps)), **options,
-    )  # fmt: skip
+        problem.declared,
+        problem.plan,
+        tolerance,
+        problem.retraction,
+        rows=rows,
+        max_steps=jax.device_put(np.int64(max_steps)),
+        **options,
+    )
 
 
 def _measured_squares(weight, measured) -> float:

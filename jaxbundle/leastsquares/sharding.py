@@ -156,9 +156,7 @@ def _cut(problem: Problem, parts: int):
     work = np.where(tied, 0.0, met * (met - 1) / 2 + OBSERVATION * met)
     middle = (np.cumsum(work) - work / 2) / max(work.sum(), 1.0)
     owner = np.where(tied, 0, np.minimum((parts * middle).astype(int), parts - 1))
-    owners = {
-        o.name: owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)
-    }
+    owners = {o.name: owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)}
     found = [{o: np.flatnonzero(of == d) for o, of in owners.items()} for d in range(parts)]
     return tuple(np.flatnonzero(stays | (owner == d)) for d in range(parts)), found
 
@@ -174,9 +172,7 @@ def _plan_part(problem: Problem, rows, seen):
     cut = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])
     tables = [cut(t) if t.name == e else t for t in problem.tables]
     rows_of = lambda o, at: [row[r[at]] if t == e else r[at] for t, r in zip(o.kind.of, o.rows)]
-    observations = [
-        o.kind(rows_of(o, seen[o.name]), name=o.name) for o in problem.observations
-    ]
+    observations = [o.kind(rows_of(o, seen[o.name]), name=o.name) for o in problem.observations]
     return make_plan(tables, observations, e, choices)[:2]
 
 

@@ -30,8 +30,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
 SMALLEST_SIDE = {
-    "chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3, "aprilgrid": 2
-}  # fmt: skip
+    "chessboard": 3,
+    "circles": 2,
+    "asymmetric-circles": 2,
+    "charuco": 3,
+    "aprilgrid": 2,
+}
 """Minimum columns and rows of a board."""
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
@@ -137,7 +141,5 @@ def require_board(board: Board) -> Board:
 
     **Raises:** `InputError`."""
     if not isinstance(board, Board):
-        raise InputError(
-            f"board must be a Board, such as Board(9, 6, 0.03), but is {show(board)}"
-        )
+        raise InputError(f"board must be a Board, such as Board(9, 6, 0.03), but is {show(board)}")
     return board

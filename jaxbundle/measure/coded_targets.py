@@ -134,9 +134,11 @@ def _markers(grey, dictionary, border) -> NamedPoints:
     names = np.array([[f"{id}-{k}" for k in range(1, 5)] for id in ids], dtype=object)
     good = found.why == ""
     return NamedPoints(
-        tuple(names[good]), found.xy[good], found.covariance[good],
+        tuple(names[good]),
+        found.xy[good],
+        found.covariance[good],
         tuple(zip(names[~good], found.why[~good])),
-    )  # fmt: skip
+    )
 
 
 def _charuco(grey, option):
@@ -150,8 +152,11 @@ def _charuco(grey, option):
         points = find_board_points(grey, board)
     except InputError:
         return []
-    return [(id, xy, covariance) for id, xy, covariance in
-            zip(board.ids, points.xy, points.covariance) if np.isfinite(xy).all()]  # fmt: skip
+    return [
+        (id, xy, covariance)
+        for id, xy, covariance in zip(board.ids, points.xy, points.covariance)
+        if np.isfinite(xy).all()
+    ]
 
 
 def _rings(grey, bits):

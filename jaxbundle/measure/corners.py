@@ -294,9 +294,10 @@ def _circles(cv2, grey, board):
         xy = _turn_upright(xy)
     targets = [centre_by_ellipse(grey, place) for place in xy.reshape(-1, 2)]
     centres = Saddles(
-        np.array([t.xy for t in targets]), np.array([t.covariance for t in targets]),
+        np.array([t.xy for t in targets]),
+        np.array([t.covariance for t in targets]),
         np.full(len(targets), "", dtype=object),
-    )  # fmt: skip
+    )
     return make_points(centres, np.arange(len(targets)), board)
 
 

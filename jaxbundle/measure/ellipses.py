@@ -63,8 +63,9 @@ def fit_ellipse(
     size = jnp.sqrt(p @ jnp.sum((xy - middle) ** 2, 1) / jnp.sum(p))
     x, y = ((xy - middle) / size).T
     square, linear = jnp.stack([x * x, x * y, y * y], 1), jnp.stack([x, y, jnp.ones_like(x)], 1)
-    S1, S2, S3 = (a.T @ (p[:, None] * b) for a, b in
-                  ((square, square), (square, linear), (linear, linear)))  # fmt: skip
+    S1, S2, S3 = (
+        a.T @ (p[:, None] * b) for a, b in ((square, square), (square, linear), (linear, linear))
+    )
     back = -jnp.linalg.solve(S3, S2.T)
     T = S1 + S2 @ back
     T = T + ROUNDING * jnp.trace(S1) * jnp.eye(3)

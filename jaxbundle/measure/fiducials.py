@@ -118,9 +118,13 @@ def fit_fiducials(
     redundancy = 2 * marks - unknowns
     variance = float(fit.vtpv) / redundancy if redundancy else float("nan")
     result = Transformation(
-        kind, parameters, variance * J @ np.asarray(fit.cofactor) @ J.T, np.zeros((marks, 2)),
-        variance**0.5, redundancy,
-    )  # fmt: skip
+        kind,
+        parameters,
+        variance * J @ np.asarray(fit.cofactor) @ J.T,
+        np.zeros((marks, 2)),
+        variance**0.5,
+        redundancy,
+    )
     return dataclasses.replace(result, residuals=result(source) - target)
 
 

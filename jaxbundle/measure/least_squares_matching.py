@@ -189,9 +189,10 @@ def _status(affine, start, shape, n, textured, known, moving):
         (moving, MatchingStatus.NOT_CONVERGED),
     )
     return jnp.select(
-        [holds for holds, _ in reasons], [int(status) for _, status in reasons],
+        [holds for holds, _ in reasons],
+        [int(status) for _, status in reasons],
         int(MatchingStatus.CONVERGED),
-    )  # fmt: skip
+    )
 
 
 def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, "rows columns"]:
@@ -215,9 +216,11 @@ def grey_value(coefficients: Float[AnyArray, "rows columns"], u, v) -> Float[Arr
 
 def _spline_weights(t):
     return (
-        (1 - t) ** 3 / 6, ((3 * t - 6) * t * t + 4) / 6,
-        (((3 - 3 * t) * t + 3) * t + 1) / 6, t**3 / 6,
-    )  # fmt: skip
+        (1 - t) ** 3 / 6,
+        ((3 * t - 6) * t * t + 4) / 6,
+        (((3 - 3 * t) * t + 3) * t + 1) / 6,
+        t**3 / 6,
+    )
 
 
 def _prefilter(n):
@@ -287,9 +290,7 @@ def _interpolated_noise(p, size, x, y):
 
 def _compute(p, image, x, y):
     """h0 + h1·g2 of one pixel of the window."""
-    return p[6] + p[7] * grey_value(
-        image, p[0] * x + p[1] * y + p[2], p[3] * x + p[4] * y + p[5]
-    )
+    return p[6] + p[7] * grey_value(image, p[0] * x + p[1] * y + p[2], p[3] * x + p[4] * y + p[5])
 
 
 def _window(n, dtype):

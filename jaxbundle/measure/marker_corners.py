@@ -158,10 +158,15 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     ends = np.zeros((len(start), 2))
     inside = Edges(
-        start, end, np.stack([start, -across], 1), np.stack([end, across], 1), ends + width[:,
-        None], ends + width[:, None], np.tile([-1.0, 1.0], (len(start), 1)), np.zeros((len(start),
-        1)),
-    )  # fmt: skip
+        start,
+        end,
+        np.stack([start, -across], 1),
+        np.stack([end, across], 1),
+        ends + width[:, None],
+        ends + width[:, None],
+        np.tile([-1.0, 1.0], (len(start), 1)),
+        np.zeros((len(start), 1)),
+    )
     for direction in (inside.before, inside.after):
         direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
     found = fit_edges(grey, inside, blur[marker], curvature)
@@ -210,15 +215,19 @@ def _inner_edges(marker, xy, light, H, bend):
         beyond, before = ((bend[1], bend[3]), (bend[2], bend[0]))[turn]
         along = (1 + p) / 2 * (beyond - mean) - (1 - p) / 2 * (before - mean)
         bent.append(s * (along * (1 - q**2) - mean * p * (p**2 + q**2 - 2)))
-    start, end = (
-        _image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end)
-    )
+    start, end = (_image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end))
     factor, bent = np.concatenate(factor), np.concatenate(bent)
     useful = factor > 0.5
     width = _narrowest(xy[marker]) / n
     number = int(useful.sum())
-    return (np.full(number, marker), start[useful], end[useful], factor[useful], bent[useful],
-            np.full(number, width))  # fmt: skip
+    return (
+        np.full(number, marker),
+        start[useful],
+        end[useful],
+        factor[useful],
+        bent[useful],
+        np.full(number, width),
+    )
 
 
 def _narrowest(four):
@@ -239,8 +248,9 @@ def _shifted(fits: EdgeFits, shift, sigma) -> EdgeFits:
 def _with_model_errors(edges: Edges, fits: EdgeFits) -> EdgeFits:
     """The fits with the σ of what the model neglects in narrow strips added to a."""
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
-    oblique = np.abs([np.einsum("ni,ni->n", near[:, 1], edges.along) for near in
-                      (edges.before, edges.after)]).max(0)  # fmt: skip
+    oblique = np.abs(
+        [np.einsum("ni,ni->n", near[:, 1], edges.along) for near in (edges.before, edges.after)]
+    ).max(0)
     neglected = fits.blur * (NARROW + NARROW_OBLIQUE * oblique) * np.exp(-(strip**2) / 2)
     covariance = fits.covariance.copy()
     covariance[:, 0, 0] += neglected**2
@@ -275,8 +285,10 @@ def _sides_of(xy, cells, border) -> Edges:
 
         def along_and_inside(t, depth, k=k, middle=middle, half=half):
             away = _image(H, _on_side(k, n, t, depth)) - middle[:, None]
-            return (np.einsum("mti,mi->mt", away, along[:, k]) / half,
-                    np.einsum("mti,mi->mt", away, inward[:, k]))  # fmt: skip
+            return (
+                np.einsum("mti,mi->mt", away, along[:, k]) / half,
+                np.einsum("mti,mi->mt", away, inward[:, k]),
+            )
 
         for widths, depth in ((inner, border), (outer, -1)):
             # a line of the marker is a line in the image: its distance from the side is linear in t
@@ -288,9 +300,15 @@ def _sides_of(xy, cells, border) -> Edges:
         level.append(turned[:, border].astype(float))
     flat = lambda x: np.stack(x, 1).reshape(4 * len(xy), -1)
     return Edges(
-        xy.reshape(-1, 2), following.reshape(-1, 2), before.reshape(-1, 2, 2),
-        after.reshape(-1, 2, 2), flat(inner), flat(outer), flat(far), flat(level),
-    )  # fmt: skip
+        xy.reshape(-1, 2),
+        following.reshape(-1, 2),
+        before.reshape(-1, 2, 2),
+        after.reshape(-1, 2, 2),
+        flat(inner),
+        flat(outer),
+        flat(far),
+        flat(level),
+    )
 
 
 def _on_side(k, n, t, depth):
@@ -331,10 +349,12 @@ def _fit_by_length(grey, edges: Edges, blur, curvature, coarse) -> EdgeFits:
         order.append(rows)
         parts.append(fit_edges(grey, take(edges, rows), blur[rows], curvature, coarse))
     back = np.argsort(np.concatenate(order))
-    return EdgeFits(*(
-        np.concatenate([getattr(part, field.name) for part in parts])[back]
-        for field in dataclasses.fields(EdgeFits)
-    ))  # fmt: skip
+    return EdgeFits(
+        *(
+            np.concatenate([getattr(part, field.name) for part in parts])[back]
+            for field in dataclasses.fields(EdgeFits)
+        )
+    )
 
 
 def _intersect(edges: Edges, fits: EdgeFits, number: int):
@@ -342,9 +362,9 @@ def _intersect(edges: Edges, fits: EdgeFits, number: int):
     of = np.arange(4 * number).reshape(number, 4)
     pair = np.stack([np.roll(of, 1, 1), of], 2)  # [markers, 4, 2 sides]
     middle, along, inward, half, curve, Q = (
-        x[pair] for x in (edges.middle, edges.along, edges.inward, edges.half, fits.curve,
-                          fits.covariance)
-    )  # fmt: skip
+        x[pair]
+        for x in (edges.middle, edges.along, edges.inward, edges.half, fits.curve, fits.covariance)
+    )
     xy = edges.start.reshape(number, 4, 2)
     for _ in range(4):  # Newton: the curvature is small
         away = xy[:, :, None] - middle

@@ -232,11 +232,20 @@ def _model(theta, place, strips):
     light = 1 + (away * theta[:, None, 7:]).sum(2)
     squares = M + D * X
     slope, of_blur = slope * (D * light)[..., None], of_blur * D * light
-    J = np.stack([
-        (slope * n).sum(2), -(slope * c).sum(2), -slope[..., 0] * t[..., 0],
-        -slope[..., 1] * t[..., 1], light, X * light, of_blur, squares * away[..., 0],
-        squares * away[..., 1],
-    ], 2)  # fmt: skip
+    J = np.stack(
+        [
+            (slope * n).sum(2),
+            -(slope * c).sum(2),
+            -slope[..., 0] * t[..., 0],
+            -slope[..., 1] * t[..., 1],
+            light,
+            X * light,
+            of_blur,
+            squares * away[..., 0],
+            squares * away[..., 1],
+        ],
+        2,
+    )
     return squares * light, J
 
 

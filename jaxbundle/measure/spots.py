@@ -92,8 +92,9 @@ def _nearest_spot(window, near):
 def _ends_inside(inside) -> bool:
     """Whether the spot, including its blurred edge, is within the window."""
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
-    free = min(rows[0], columns[0], inside.shape[0] - 1 - rows[-1],
-               inside.shape[1] - 1 - columns[-1])  # fmt: skip
+    free = min(
+        rows[0], columns[0], inside.shape[0] - 1 - rows[-1], inside.shape[1] - 1 - columns[-1]
+    )
     return free >= MARGIN
 
 
@@ -107,8 +108,10 @@ def _levels(grey, low, window, inside, threshold) -> Spot:
     window, inside = window[cut], inside[cut]
     bright = window[inside].mean() > window[~inside].mean()
     core = inside & ~scipy.ndimage.binary_dilation(~inside, iterations=2)
-    level = np.median(window[core]) if core.sum() >= LEAST_PIXELS else np.quantile(
-        window[inside], 0.9 if bright else 0.1
+    level = (
+        np.median(window[core])
+        if core.sum() >= LEAST_PIXELS
+        else np.quantile(window[inside], 0.9 if bright else 0.1)
     )
     around = scipy.ndimage.binary_dilation(inside, iterations=MARGIN + 2)
     around &= ~scipy.ndimage.binary_dilation(inside, iterations=MARGIN)
@@ -116,9 +119,14 @@ def _levels(grey, low, window, inside, threshold) -> Spot:
     around &= ~own
     background = np.median(window[around]) if around.any() else np.median(window[~inside])
     return Spot(
-        low + first, window, inside, float(background), float(level),
-        float(background + level) / 2, noise_of(window),
-    )  # fmt: skip
+        low + first,
+        window,
+        inside,
+        float(background),
+        float(level),
+        float(background + level) / 2,
+        noise_of(window),
+    )
 
 
 def otsu(grey) -> float:

@@ -195,8 +195,9 @@ class _Pixels:
         rows = int(np.ceil(reach * np.sqrt(1 + np.max(slope**2))))
         minor = np.rint(line)[:, :, None] + np.arange(-rows, rows + 1)
         major = np.broadcast_to(major[:, :, None], minor.shape)
-        place = np.where(flat[:, None, None, None], np.stack([major, minor], -1),
-                         np.stack([minor, major], -1)).reshape(len(k), -1, 2)  # fmt: skip
+        place = np.where(
+            flat[:, None, None, None], np.stack([major, minor], -1), np.stack([minor, major], -1)
+        ).reshape(len(k), -1, 2)
         height, width = grey.shape
         inside = np.all((place >= 0) & (place < [width, height]), axis=2)
         u, v = np.where(inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
@@ -219,9 +220,7 @@ class _Pixels:
             passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
             level = np.einsum("npc,nc->np", passed[:, :, :-1] - passed[:, :, 1:], edges.level)
         # single precision is faster, and exact to 1e-5 pixels
-        return cls(*(
-            x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)
-        ))
+        return cls(*(x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)))
 
 
 def _start(pixels, edges, blur, coarse):
@@ -279,10 +278,20 @@ def _model(theta, pixels):
     of_out = density(out)
     step = B - W
     shift = (-step * f + V * of_out) / tau
-    J = np.stack([
-        shift, t * shift, t * t * shift, 1 - F, t * (1 - F), F, t * F, beyond,
-        -step * zf + V * out * of_out,
-    ], 2)  # fmt: skip
+    J = np.stack(
+        [
+            shift,
+            t * shift,
+            t * t * shift,
+            1 - F,
+            t * (1 - F),
+            F,
+            t * F,
+            beyond,
+            -step * zf + V * out * of_out,
+        ],
+        2,
+    )
     return W + step * F + V * beyond, J
 
 

@@ -38,9 +38,7 @@ def get_dictionary(name: str) -> Any:
 
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
     if name not in names:
-        raise InputError(
-            f"there is no dictionary {name!r} of markers; known: {', '.join(names)}"
-        )
+        raise InputError(f"there is no dictionary {name!r} of markers; known: {', '.join(names)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
@@ -49,8 +47,9 @@ def find_tags(cv2, grey: Grey, board: Board) -> BoardPoints:
 
     **Raises:** `InputError` for fewer than four tags, or tags in one row.
     """
-    ids, seen = max((_read_tags(cv2, grey, board, bits) for bits in BORDERS),
-                    key=lambda found: len(found[0]))  # fmt: skip
+    ids, seen = max(
+        (_read_tags(cv2, grey, board, bits) for bits in BORDERS), key=lambda found: len(found[0])
+    )
     rows, columns = np.divmod(ids, board.columns)
     if len(ids) < FEWEST or not (np.ptp(rows) and np.ptp(columns)):
         raise InputError(

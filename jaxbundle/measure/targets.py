@@ -98,10 +98,15 @@ def centre_by_ellipse(grey, near) -> Target:
 
 def _target(spot, xy, covariance, axes, angle):
     return Target(
-        xy=xy + spot.corner, covariance=covariance, axes=np.asarray(axes), angle=float(angle),
-        bright=spot.contrast > 0, threshold=spot.threshold, contrast=abs(spot.contrast),
+        xy=xy + spot.corner,
+        covariance=covariance,
+        axes=np.asarray(axes),
+        angle=float(angle),
+        bright=spot.contrast > 0,
+        threshold=spot.threshold,
+        contrast=abs(spot.contrast),
         noise=spot.noise,
-    )  # fmt: skip
+    )
 
 
 def _place(spot, xy):
@@ -140,8 +145,18 @@ def _fit_disc(spot, xy, axes, angle):
     turn = np.array([[c, -s], [s, c]])
     M = turn @ np.diag(np.asarray(axes) ** -2.0) @ turn.T
     theta = np.array([*xy, M[0, 0], M[0, 1], M[1, 1], spot.background, spot.contrast, 0.0, 0, 0])
-    scale = np.array([1, 1, *[2 / axes[1] ** 3] * 3, abs(spot.contrast), abs(spot.contrast), 1,
-                      spot.noise, spot.noise])  # fmt: skip
+    scale = np.array(
+        [
+            1,
+            1,
+            *[2 / axes[1] ** 3] * 3,
+            abs(spot.contrast),
+            abs(spot.contrast),
+            1,
+            spot.noise,
+            spot.noise,
+        ]
+    )
     places, grey = _places(spot).reshape(2, -1), spot.grey.ravel()
     theta, A, r, weight, sector = _iterate(theta, scale, places, grey, 1.0)
     kept = _consistent_sectors(A, r, weight, sector)
@@ -203,10 +218,20 @@ def _blurred_disc(theta, places):
     z = d / tau
     step, density = scipy.special.ndtr(z), np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
     f = contrast * density / tau
-    J = np.stack([
-        f * gu / slope, f * gv / slope, -f * u * u / (2 * slope), -f * u * v / slope,
-        -f * v * v / (2 * slope), np.ones_like(u), step, -contrast * z * density, u, v,
-    ])  # fmt: skip
+    J = np.stack(
+        [
+            f * gu / slope,
+            f * gv / slope,
+            -f * u * u / (2 * slope),
+            -f * u * v / slope,
+            -f * v * v / (2 * slope),
+            np.ones_like(u),
+            step,
+            -contrast * z * density,
+            u,
+            v,
+        ]
+    )
     sector = ((np.arctan2(v, u) / np.pi + 1) / 2 * SECTORS).astype(int) % SECTORS
     half, other = (A + C) / 2, np.hypot((A - C) / 2, B)
     return ground + contrast * step + mx * u + my * v, J, d, sector, (half + other) ** -0.5

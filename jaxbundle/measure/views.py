@@ -152,6 +152,7 @@ def measure_boards(
         return (repeated[name], False) if name in repeated else _search(file_of[name], board)
 
     looks, negatives = {}, {}
+
     def tell(done: int) -> None:
         if progress is not None:
             progress(SEARCHING, done, len(file_of))
@@ -164,7 +165,7 @@ def measure_boards(
     notes = (
         f"light squares on dark ground, the negative of the usual board, in {of_negatives} of "
         f"{len(views)} photographs",
-    ) * bool(of_negatives)  # fmt: skip
+    ) * bool(of_negatives)
     warnings = _part_of_a_larger(file_of, views.names, board)
     return dataclasses.replace(views, warnings=warnings, notes=notes)
 
@@ -198,9 +199,12 @@ def collect_views(
     used = [(name, xy) for name, xy in used if name not in failed]
     order = {name: i for i, name in enumerate(file_of)}
     return BoardViews(
-        board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
+        board,
+        tuple(name for name, _ in used),
+        size,
+        np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
-    )  # fmt: skip
+    )
 
 
 def search_board(path: str | Path, board: Board) -> Look:
@@ -293,13 +297,15 @@ def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, 
         return {
             name: f"{failed[name]}. But there are markers of {other.dictionary}: give --dictionary "
             f"{other.dictionary}"
-            for name, other in sizes.items() if other is not None
-        }  # fmt: skip
+            for name, other in sizes.items()
+            if other is not None
+        }
     return {
         name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT} "
         f"{other.columns}x{other.rows}, if it is seen whole"
-        for name, other in sizes.items() if other is not None
-    }  # fmt: skip
+        for name, other in sizes.items()
+        if other is not None
+    }
 
 
 def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[str, ...]:

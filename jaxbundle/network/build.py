@@ -113,8 +113,12 @@ def make_network(
 
     **Raises:** `InputError` naming table, row and column. `check_network` makes the other checks.
     """
-    given: dict[str, Any] = {"datum": datum, "residuals": residuals,
-             "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
+    given: dict[str, Any] = {
+        "datum": datum,
+        "residuals": residuals,
+        "angle_unit": angle_unit,
+        "image_unit": image_unit,
+    }
     for key, choices in CHOICES.items():
         check_choice(key, given[key], choices)
     if sigma_image is not None:
@@ -141,9 +145,9 @@ def make_network(
         images=images,
         points=points,
         observations=dataclasses.replace(observations, xy=xy, sigma=sigma),
-        distances=Distances.none() if distances is None else _make_distances(
-            as_columns(distances, "distances"), points
-        ),
+        distances=Distances.none()
+        if distances is None
+        else _make_distances(as_columns(distances, "distances"), points),
         datum_points=tuple(str(id) for id in datum_points),
         object_unit=object_unit,
         name=name,

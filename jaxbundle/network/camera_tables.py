@@ -43,12 +43,19 @@ class CameraTable:
         at = self.parameters.index
         tied = tuple(
             (at(name), moving.index(at(group[0])))
-            for group in self.tie if at(group[0]) in moving for name in group[1:]
-        )  # fmt: skip
+            for group in self.tie
+            if at(group[0]) in moving
+            for name in group[1:]
+        )
         return ls.Table(
-            self.name, value, Vector(len(self.parameters), moving, tied), free[:, moving],
-            [camera.id for camera in own], tuple(self.parameters[j] for j in moving), "camera",
-        )  # fmt: skip
+            self.name,
+            value,
+            Vector(len(self.parameters), moving, tied),
+            free[:, moving],
+            [camera.id for camera in own],
+            tuple(self.parameters[j] for j in moving),
+            "camera",
+        )
 
 
 def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
@@ -58,11 +65,14 @@ def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
     named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
     return tuple(
         CameraTable(
-            "camera" if len(different) == 1 else named(model, tie), key_of(model),
-            model.parameters, np.array([c for c, s in enumerate(sorts) if s == (model, tie)]), tie,
+            "camera" if len(different) == 1 else named(model, tie),
+            key_of(model),
+            model.parameters,
+            np.array([c for c, s in enumerate(sorts) if s == (model, tie)]),
+            tie,
         )
         for model, tie in different
-    )  # fmt: skip
+    )
 
 
 def start_of(camera: Camera) -> list[float]:

@@ -153,30 +153,46 @@ def _check_images(network: Network) -> None:
     check_unique(images.id, images.source, "image")
     values, sigma = np.concatenate([images.position, images.angles], 1), images.sigma
     _refuse(
-        images, np.isinf(values), "image",
+        images,
+        np.isinf(values),
+        "image",
         lambda row, k: f"{EXTERIOR[k]} is infinite; a number is expected",
-    )  # fmt: skip
+    )
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
-        images, np.abs(images.angles) > 2 * math.pi * 1.01, "image",
-        lambda row, k: f"{EXTERIOR[3 + k]} is {images.angles[row, k] / ANGLE_UNITS[unit]:.6g} "
-        f"{unit}, more than a full turn; {hint} Set angle_unit",
-    )  # fmt: skip
+        images,
+        np.abs(images.angles) > 2 * math.pi * 1.01,
+        "image",
+        lambda row, k: (
+            f"{EXTERIOR[3 + k]} is {images.angles[row, k] / ANGLE_UNITS[unit]:.6g} "
+            f"{unit}, more than a full turn; {hint} Set angle_unit"
+        ),
+    )
     _refuse(
-        images, (sigma < 0) | np.isinf(sigma), "image",
-        lambda row, k: f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
-        'empty (no prior), or "fixed" (0) to hold the value',
-    )  # fmt: skip
+        images,
+        (sigma < 0) | np.isinf(sigma),
+        "image",
+        lambda row, k: (
+            f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
+            'empty (no prior), or "fixed" (0) to hold the value'
+        ),
+    )
     _refuse(
-        images, ~np.isnan(sigma) & np.isnan(values), "image",
+        images,
+        ~np.isnan(sigma) & np.isnan(values),
+        "image",
         lambda row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
-    )  # fmt: skip
+    )
     held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
-        images, (held > 0) & (held < 3), "image",
-        lambda row, k: "omega, phi, kappa can be held fixed only all three together; give the "
-        "one to be held a small σ instead",
-    )  # fmt: skip
+        images,
+        (held > 0) & (held < 3),
+        "image",
+        lambda row, k: (
+            "omega, phi, kappa can be held fixed only all three together; give the "
+            "one to be held a small σ instead"
+        ),
+    )
 
 
 def _check_points(network: Network) -> Network:
@@ -184,29 +200,43 @@ def _check_points(network: Network) -> Network:
     points, sigma = network.points, network.points.sigma
     check_unique(points.id, points.source, "point")
     _refuse(
-        points, ~points.has_role(*ROLES)[:, None], "point",
+        points,
+        ~points.has_role(*ROLES)[:, None],
+        "point",
         lambda row, k: f"role must be one of {', '.join(ROLES)}, not {points.role[row]!r}",
-    )  # fmt: skip
+    )
     _refuse(
-        points, np.isinf(points.position), "point",
+        points,
+        np.isinf(points.position),
+        "point",
         lambda row, k: f"{AXES[k]} is infinite; a number is expected",
-    )  # fmt: skip
+    )
     _refuse(
-        points, np.isnan(points.position) & ~points.has_role("tie")[:, None], "point",
+        points,
+        np.isnan(points.position) & ~points.has_role("tie")[:, None],
+        "point",
         lambda row, k: f"{AXES[k]} is missing; a {points.role[row]} point needs its coordinates",
-    )  # fmt: skip
+    )
     control = points.has_role("control")
     none, loose = control & np.isnan(sigma).all(1), control & np.isposinf(sigma).all(1)
     _refuse(
-        points, control[:, None] & (sigma <= 0), "control point",
-        lambda row, k: f"σ of {AXES[k]} is {sigma[row, k]:g}; it must be positive; leave all "
-        'three σ empty to hold the point, write "free" for an axis that is not controlled',
-    )  # fmt: skip
+        points,
+        control[:, None] & (sigma <= 0),
+        "control point",
+        lambda row, k: (
+            f"σ of {AXES[k]} is {sigma[row, k]:g}; it must be positive; leave all "
+            'three σ empty to hold the point, write "free" for an axis that is not controlled'
+        ),
+    )
     _refuse(
-        points, (control & ~none)[:, None] & np.isnan(sigma), "control point",
-        lambda row, k: f"σ of {AXES[k]} is missing while another axis has one; give all three, "
-        'or write "free" for an axis that is not controlled',
-    )  # fmt: skip
+        points,
+        (control & ~none)[:, None] & np.isnan(sigma),
+        "control point",
+        lambda row, k: (
+            f"σ of {AXES[k]} is missing while another axis has one; give all three, "
+            'or write "free" for an axis that is not controlled'
+        ),
+    )
     unused = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
     network = network.replace(points=with_roles(with_roles(points, none, "fixed"), loose, "tie"))
     if unused.any():
@@ -275,7 +305,7 @@ def _check_distances(network: Network) -> Network:
     for row in np.flatnonzero(points.has_role("check")[distances.points].any(1))[:1]:
         raise InputError(
             f"{distances.source(row)}: distance {names[row]}: a check point is excluded from the "
-                "adjustment; make it a tie point or remove the distance"
+            "adjustment; make it a tie point or remove the distance"
         )
     idle = np.all(points.has_role("fixed")[distances.points], axis=1)
     if idle.any():
@@ -301,8 +331,8 @@ def _check_datum_points(network: Network) -> Network:
             )
     if network.datum_points and network.datum == "control":
         return network.note(
-            "datum_points are not used: the datum is given by control; choose datum = \"inner\" or "
-            "\"minimal\" for them"
+            'datum_points are not used: the datum is given by control; choose datum = "inner" or '
+            '"minimal" for them'
         )
     return network
 
@@ -320,10 +350,14 @@ def _refuse_missing(table, values, names, thing):
     more = missing.any(1).sum() - 1
     also = f" (and {more} more)" if more > 0 else ""
     _refuse(
-        table, missing, thing,
-        lambda row, k: f"{names[k]} has no start value{also}; give start values, or find them with "
-        "jaxbundle.orient",
-    )  # fmt: skip
+        table,
+        missing,
+        thing,
+        lambda row, k: (
+            f"{names[k]} has no start value{also}; give start values, or find them with "
+            "jaxbundle.orient"
+        ),
+    )
 
 
 def _note_points_behind(network: Network) -> Network:

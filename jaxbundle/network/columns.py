@@ -91,9 +91,9 @@ class Columns:
         values = self.column(name)
         numbers = _plain_numbers(values)
         if numbers is None:
-            numbers = np.array([
-                self._number(row, name, value, words or {}) for row, value in enumerate(values)
-            ])
+            numbers = np.array(
+                [self._number(row, name, value, words or {}) for row, value in enumerate(values)]
+            )
         if required and np.isnan(numbers).any():
             raise InputError(f"{self.source(np.isnan(numbers).argmax())}: {name} is missing")
         return numbers
@@ -117,9 +117,9 @@ class Columns:
             )
         return number
 
-    def indices(self, name: str, thing: str, of: Mapping[str, int], where: str) -> Int[
-        np.ndarray, " rows"
-    ]:
+    def indices(
+        self, name: str, thing: str, of: Mapping[str, int], where: str
+    ) -> Int[np.ndarray, " rows"]:
         """A column of ids as indices into another table (`thing`s in `where`)."""
         ids = self.ids(name)
         try:
@@ -163,10 +163,13 @@ def _of_frame(table: Any, source: Source) -> Columns:
         twice = next(column for column in names if names.count(column) > 1)
         raise InputError(f"{source.name}: two columns are called {twice!r}; expected one of each")
     present = table.notna()
-    return Columns({
-        name: table[c].astype(object).where(present[c], None).to_list()
-        for name, c in zip(names, table.columns)
-    }, source)
+    return Columns(
+        {
+            name: table[c].astype(object).where(present[c], None).to_list()
+            for name, c in zip(names, table.columns)
+        },
+        source,
+    )
 
 
 def _column(values: Any, column: str, name: str) -> Column:

@@ -21,16 +21,24 @@ from jaxbundle.network.tables import Camera, Network
 
 SIZES = ("image_size", "pixel_size")
 COUNTERPARTS = (
-    ("c", "f", "fx", "fy"), ("x0", "cx"), ("y0", "cy"), ("K1", "k1"), ("K2", "k2"), ("K3", "k3"),
+    ("c", "f", "fx", "fy"),
+    ("x0", "cx"),
+    ("y0", "cy"),
+    ("K1", "k1"),
+    ("K2", "k2"),
+    ("K3", "k3"),
     ("P1", "P2", "p1", "p2"),
-)  # fmt: skip
+)
 """Corresponding parameters of different models; free in one means free in the other."""
 
 
 def convert_cameras(
-    network: Network, model: str | CameraModel, r0: float = 0.0, only: Sequence[str] | None = None,
+    network: Network,
+    model: str | CameraModel,
+    r0: float = 0.0,
+    only: Sequence[str] | None = None,
     measured: bool = False,
-) -> tuple[Network, dict[str, Conversion]]:  # fmt: skip
+) -> tuple[Network, dict[str, Conversion]]:
     """The network with all cameras, or `only` some, in the model with this name, or a given one.
 
     **Arguments:** `r0` of the target, mm, if it has one; `measured`: fit over the measured area, as
@@ -102,10 +110,13 @@ def _convert(camera: Camera, model: str | CameraModel, r0: float, xy, measured: 
         remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""
         raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
     made = dataclasses.replace(
-        camera, model=model, parameters=conversion.parameters, sigma={},
+        camera,
+        model=model,
+        parameters=conversion.parameters,
+        sigma={},
         free=_counterparts(camera.free, source, target),
         tie=camera.tie if source == target else (),
-    )  # fmt: skip
+    )
     return made, conversion, shift - step * centre, step
 
 

@@ -90,9 +90,12 @@ class MovingImagePoint(ImagePoint):
 
 
 def image_points(
-    model: str | cameras.CameraModel, domain: str, camera: str, poses: tuple[str, ...] = ("image",),
+    model: str | cameras.CameraModel,
+    domain: str,
+    camera: str,
+    poses: tuple[str, ...] = ("image",),
     moving: bool = False,
-) -> Kind:  # fmt: skip
+) -> Kind:
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
     cameras with a rolling shutter."""
@@ -126,6 +129,7 @@ def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
 SIMILARITY = similarity(("point",), ("image",))
 SIMILARITY_AT_ANY_DISTANCE = dataclasses.replace(
     SIMILARITY,
-    actions=tuple((name, move_at_any_distance if name == "point" else act)
-                  for name, act in SIMILARITY.actions),
-)  # fmt: skip
+    actions=tuple(
+        (name, move_at_any_distance if name == "point" else act) for name, act in SIMILARITY.actions
+    ),
+)

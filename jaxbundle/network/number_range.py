@@ -18,8 +18,9 @@ def check_coordinates(network: Network) -> Network:
 
     **Raises:** `InputError` for coordinates that cannot be computed with."""
     for table, thing, axes in (
-        (network.points, "point", ("X", "Y", "Z")), (network.images, "image", ("X0", "Y0", "Z0")),
-    ):  # fmt: skip
+        (network.points, "point", ("X", "Y", "Z")),
+        (network.images, "image", ("X0", "Y0", "Z0")),
+    ):
         x = table.position
         for row, k in np.argwhere(np.isfinite(x) & (np.abs(x) > LARGEST))[:1]:
             raise InputError(

@@ -36,8 +36,9 @@ def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
         values, pitch = np.zeros((len(cameras), len(model.parameters))), np.ones((len(cameras), 2))
         for c, camera in enumerate(cameras):
             if camera.model == name:
-                values[c] = [{**default_parameters(model), **camera.parameters}[p]
-                             for p in model.parameters]  # fmt: skip
+                values[c] = [
+                    {**default_parameters(model), **camera.parameters}[p] for p in model.parameters
+                ]
                 if in_pixels and model.unit == "mm":
                     pitch[c] = camera.pixel_size
         rows = np.flatnonzero(np.array([camera.model == name for camera in cameras])[of_ray])
@@ -60,9 +61,12 @@ def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
             all = np.pad(mine, (0, POINTS_AT_ONCE - len(mine)), mode="edge")
             image = rays.image[all]
             part = _portion(
-                model, values[images.camera[image]], images.position[image], images.angles[image],
+                model,
+                values[images.camera[image]],
+                images.position[image],
+                images.angles[image],
                 network.points.position[rays.point[all]],
-            )  # fmt: skip
+            )
             found[first : first + POINTS_AT_ONCE] = np.asarray(part)[: len(mine)]
     return found
 

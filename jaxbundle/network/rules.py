@@ -59,7 +59,7 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
         raise InputError(
             f"{where}unknown {'' if where else 'camera '}model {show(model)}{known}"
             f"{'' if known.endswith('?') else ';'} pass your own as a CameraModel, for a "
-        "file that names it by read_network(path, models=[…])"
+            "file that names it by read_network(path, models=[…])"
         )
     try:
         return get_model(model)
@@ -126,14 +126,17 @@ def _check_fields(camera: Camera, where: str) -> None:
     for field in ("parameters", "sigma"):
         given = getattr(camera, field)
         if not isinstance(given, Mapping):
-            raise InputError(f"{where}{field} is {show(given)}; expected numbers by name, such as "
-                             "{'c': 20.0}")  # fmt: skip
+            raise InputError(
+                f"{where}{field} is {show(given)}; expected numbers by name, such as {{'c': 20.0}}"
+            )
     if not _are_names(camera.free):
-        raise InputError(f"{where}free is {show(camera.free)}; expected names of parameters, such "
-                         "as ('c', 'x0')")  # fmt: skip
+        raise InputError(
+            f"{where}free is {show(camera.free)}; expected names of parameters, such as ('c', 'x0')"
+        )
     if not isinstance(camera.tie, list | tuple) or not all(map(_are_names, camera.tie)):
-        raise InputError(f"{where}tie is {show(camera.tie)}; expected groups of names, such as "
-                         "[('fx', 'fy')]")  # fmt: skip
+        raise InputError(
+            f"{where}tie is {show(camera.tie)}; expected groups of names, such as [('fx', 'fy')]"
+        )
 
 
 def _are_names(given) -> bool:
@@ -146,15 +149,17 @@ def _check_ties(camera: Camera, values, where: str) -> None:
     for name in names:
         if name not in get_model(camera.model).parameters:
             known = get_model(camera.model).parameters
-            raise InputError(f"{where}tie names the unknown parameter {name!r}"
-                             f"{did_you_mean(name, known)}")  # fmt: skip
+            raise InputError(
+                f"{where}tie names the unknown parameter {name!r}{did_you_mean(name, known)}"
+            )
         if names.count(name) > 1:
             raise InputError(f"{where}tie names {name} twice")
     for group in camera.tie:
         if len({values.get(name, 0.0) for name in group}) > 1:
             start = ", ".join(f"{name} {values.get(name, 0.0):g}" for name in group)
-            raise InputError(f"{where}tied parameters are one unknown, but have different "
-                             f"values: {start}")  # fmt: skip
+            raise InputError(
+                f"{where}tied parameters are one unknown, but have different values: {start}"
+            )
 
 
 def _check_pair(where, name, pair, meaning):

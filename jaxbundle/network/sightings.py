@@ -49,9 +49,7 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
     return network.replace(
         points=network.points.take(keep),
         observations=dataclasses.replace(observations, point=index[observations.point]),
-        distances=dataclasses.replace(
-            network.distances, points=index[network.distances.points]
-        ),
+        distances=dataclasses.replace(network.distances, points=index[network.distances.points]),
         datum_points=tuple(id for id in network.datum_points if id not in gone),
     )
 
@@ -89,9 +87,7 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
 def count_controlled_axes(points: Points):
     """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
     axes = np.isfinite(points.sigma).sum(1)
-    return np.where(
-        points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0)
-    )
+    return np.where(points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0))
 
 
 def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
@@ -259,13 +255,17 @@ def check_redundancy(network: Network) -> None:
     weighted = np.isfinite(points.sigma) & points.has_role("control")[:, None]
     exterior = images.sigma > 0
     rows = (
-        2 * taking_part.sum() + weighted.sum() + exterior.sum() + sum(interior)
+        2 * taking_part.sum()
+        + weighted.sum()
+        + exterior.sum()
+        + sum(interior)
         + len(network.distances)
-    )  # fmt: skip
+    )
     unknowns = (
-        (images.sigma != 0).sum() + sum(len(camera.unknowns) for camera in network.cameras)
+        (images.sigma != 0).sum()
+        + sum(len(camera.unknowns) for camera in network.cameras)
         + 3 * (~points.has_role("fixed")).sum()
-    )  # fmt: skip
+    )
     conditions = 0
     if network.datum != "control":
         known = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()

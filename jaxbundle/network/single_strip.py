@@ -40,7 +40,7 @@ def check_single_strip(network: Network) -> Network:
     if off.max() < ON_A_LINE * extents[0]:
         raise InputError(
             f"{where} and nothing else fixes the datum: the rotation about the axis of the strip "
-            f"(its roll) is not determined; {REMEDY}, or choose datum = \"inner\" or \"minimal\""
+            f'(its roll) is not determined; {REMEDY}, or choose datum = "inner" or "minimal"'
         )
     spread = float(np.sqrt((off**2).sum()))
     roll = float(np.degrees(np.sqrt(np.mean(sigma[given] ** 2)) / spread))

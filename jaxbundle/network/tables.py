@@ -124,9 +124,13 @@ class Images:
         """The chosen images (a mask or indices), with their source rows."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
         return Images(
-            tuple(self.id[row] for row in rows), self.camera[rows], self.position[rows],
-            self.angles[rows], self.sigma[rows], self.source.take(rows),
-        )  # fmt: skip
+            tuple(self.id[row] for row in rows),
+            self.camera[rows],
+            self.position[rows],
+            self.angles[rows],
+            self.sigma[rows],
+            self.source.take(rows),
+        )
 
 
 @print_in_one_screen
@@ -148,8 +152,11 @@ class Points:
         """The chosen points (a mask or indices), with their source rows."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
         return Points(
-            tuple(self.id[row] for row in rows), tuple(self.role[row] for row in rows),
-            self.position[rows], self.sigma[rows], self.source.take(rows),
+            tuple(self.id[row] for row in rows),
+            tuple(self.role[row] for row in rows),
+            self.position[rows],
+            self.sigma[rows],
+            self.source.take(rows),
         )
 
     def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
@@ -176,8 +183,12 @@ class Observations:
     def take(self, rows) -> "Observations":
         """The chosen rows (a mask or indices), with their source rows."""
         return dataclasses.replace(
-            self, image=self.image[rows], point=self.point[rows], xy=self.xy[rows],
-            sigma=self.sigma[rows], source=self.source.take(rows),
+            self,
+            image=self.image[rows],
+            point=self.point[rows],
+            xy=self.xy[rows],
+            sigma=self.sigma[rows],
+            source=self.source.take(rows),
         )
 
 
@@ -270,8 +281,11 @@ def require_network(network: Network, name: str = "network") -> Network:
     if isinstance(network, Network):
         return network
     is_path = isinstance(network, str | os.PathLike)
-    remedy = f"jaxbundle.read_network({os.fspath(network)!r})" if is_path else (
-        "use jaxbundle.read_network(path), make_network or simulate"
+    remedy = (
+        f"jaxbundle.read_network({os.fspath(network)!r})"
+        if is_path
+        else ("use jaxbundle.read_network(path), make_network or simulate")
     )
-    raise InputError(f"{name} must be a Network, but is {show(network)}: {remedy}"
-                     + " reads it" * is_path)  # fmt: skip
+    raise InputError(
+        f"{name} must be a Network, but is {show(network)}: {remedy}" + " reads it" * is_path
+    )

@@ -151,9 +151,10 @@ def name_pixels(network: Network) -> str:
     of_camera = network.images.camera[network.observations.image]
     rows = (network.observations.xy[of_camera == c] for c in range(len(network.cameras)))
     first, *more = [
-        line for camera, xy in zip(network.cameras, rows, strict=True)
+        line
+        for camera, xy in zip(network.cameras, rows, strict=True)
         if len(xy) and (line := _in_pixels(camera, xy))
-    ] or [""]  # fmt: skip
+    ] or [""]
     return first + (f"; so with {count(len(more), 'other camera')}" if more else "")
 
 

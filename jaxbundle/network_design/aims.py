@@ -74,7 +74,7 @@ class Aim:
         if isinstance(self.of, str):
             one_of("aim: of", self.of, ("points", "cameras"))
         elif not callable(self.of) and not len(self.of):
-            raise InputError("aim: no names; give names, \"points\" or \"cameras\"")
+            raise InputError('aim: no names; give names, "points" or "cameras"')
 
     @property
     def convex(self) -> bool:
@@ -84,8 +84,12 @@ class Aim:
     def __str__(self) -> str:
         if self.measure == "reliability":
             return "1/√r of the worst controlled image coordinate"
-        what = self.of if isinstance(self.of, str) else "functions" if callable(self.of) else (
-            ", ".join(" ".join(name) for name in self.of)
+        what = (
+            self.of
+            if isinstance(self.of, str)
+            else "functions"
+            if callable(self.of)
+            else (", ".join(" ".join(name) for name in self.of))
         )
         return f"{self.measure} σ of {what}"
 
@@ -104,8 +108,9 @@ def functions_of(problem: Problem, aim: Aim) -> Functions | None:
     if isinstance(of, str):
         of = [("camera", c.id, name) for c in problem.network.cameras for name in c.unknowns]
         if not of:
-            raise InputError("aim: no camera has a free parameter; say what is free, or aim at "
-                             "points")  # fmt: skip
+            raise InputError(
+                "aim: no camera has a free parameter; say what is free, or aim at points"
+            )
         if aim.measure != "determinant" and len({name for *_, name in of}) > 1:
             raise InputError(
                 f"aim: the {aim.measure} σ of camera parameters of different units; choose the "
@@ -166,8 +171,10 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
         if task.reliability:
             r = redundancy(declared, plan, data)
             weights = [diagonal_of(w) for w in (data.weight[o] for o in task.image_sets)]
-            inverse = [_mask(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
-                       for o, w in zip(task.image_sets, weights)]  # fmt: skip
+            inverse = [
+                _mask(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
+                for o, w in zip(task.image_sets, weights)
+            ]
             return jnp.log(_norm(jnp.concatenate(inverse), POWER)) / 2
         functions, still = task.functions, zero_tangent(plan)
         if functions is None:
@@ -253,7 +260,8 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
         if problem.network.datum == "minimal":
             raise InputError(
                 "aim: the datum is minimal, so that the σ of points depend on the held "
-            'coordinates; choose inner constraints (datum = "inner"), the datum of smallest mean σ '
+                'coordinates; choose inner constraints (datum = "inner"), the datum of smallest '
+                "mean σ "
                 "(design of order zero), or control points"
             )
         return
@@ -278,6 +286,9 @@ def _move(values: Values, t: Float[AnyArray, "7"]) -> Values:
     moved = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]
     in_camera = jax.vmap(lambda q: retract_quaternion(q, -matrix_from_quaternion(q) @ t[3:6]))
     return Values(
-        values.camera, moved(values.position), in_camera(jnp.asarray(values.rotation)),
-        moved(values.point), values.other,
-    )  # fmt: skip
+        values.camera,
+        moved(values.position),
+        in_camera(jnp.asarray(values.rotation)),
+        moved(values.point),
+        values.other,
+    )

@@ -101,7 +101,7 @@ def design(
         more = 1 if photographs is None else integer("photographs", photographs)
         return _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed)
     if photographs is not None:
-        raise InputError("photographs: their number is designed by order \"second\" or \"third\"")
+        raise InputError('photographs: their number is designed by order "second" or "third"')
     return _design_configuration(
         network, aim, conditions, sigma, tuple(free), stations, starts, max_iterations, seed
     )
@@ -123,8 +123,11 @@ def _design_configuration(
     before = _state(pairs, network, start.values, seed)
     best, path, converged = None, [], True
     for attempt in range(starts):
-        begin = _roll(start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
-                        variables, seed + attempt)  # fmt: skip
+        begin = _roll(
+            start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
+            variables,
+            seed + attempt,
+        )
         end, steps, done = search(pairs, variables, begin, program, ends, max_iterations)
         if not satisfies(conditions, variables, pairs.problem.origin, end):
             continue
@@ -143,12 +146,11 @@ def _design_configuration(
 
 def _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed) -> Design:
     if photographs is None:
-        raise InputError("photographs: order \"second\" needs the number of candidates to select")
+        raise InputError('photographs: order "second" needs the number of candidates to select')
     candidates = network.images.id
     pairs = make_pairs(network, aim, conditions, sigma)
     values = start_at(pairs).values
-    rays = np.bincount(pairs.problem.image[pairs.measured(values)],
-                       minlength=len(network.images))  # fmt: skip
+    rays = np.bincount(pairs.problem.image[pairs.measured(values)], minlength=len(network.images))
     seeing = rays >= FEWEST_TARGETS
     if seeing.any() and not seeing.all():
         network = keep_images(network, seeing)
@@ -156,8 +158,10 @@ def _design_weights(network, aim, conditions, sigma, photographs, max_iterations
         values = start_at(pairs).values
     lost = lost_targets(pairs, pairs.measured(values))
     if lost:
-        raise InputError(f"targets {', '.join(lost[:10])}: fewer than two of the candidates see "
-                         "them; give further candidates, or leave these targets out")  # fmt: skip
+        raise InputError(
+            f"targets {', '.join(lost[:10])}: fewer than two of the candidates see "
+            "them; give further candidates, or leave these targets out"
+        )
     before = _state(pairs, network, values, seed)
     found = select(pairs, integer("photographs", photographs), max_iterations)
     ids = network.images.id
@@ -166,11 +170,17 @@ def _design_weights(network, aim, conditions, sigma, photographs, max_iterations
     _require_determined(after)
     path = tuple(Step(0.0, aim, np.zeros((0, 3))) for aim in found.aims)
     return Design(
-        "second", aim, conditions, before, after, path, found.converged,
+        "second",
+        aim,
+        conditions,
+        before,
+        after,
+        path,
+        found.converged,
         bound=found.bound or None,
         dropped=tuple(id for id in candidates if id not in after.network.images.id),
         weights=dict(zip(ids, found.weight.tolist())),
-    )  # fmt: skip
+    )
 
 
 def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed) -> Design:
@@ -192,8 +202,17 @@ def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed
         states.append(_state(pairs, network, start.values, seed))
         _require_determined(states[-1])
         network = states[-1].network
-    return Design("third", aim, conditions, states[0], states[-1], tuple(path), converged,
-                  tried=tried[0], added=tuple(added))  # fmt: skip
+    return Design(
+        "third",
+        aim,
+        conditions,
+        states[0],
+        states[-1],
+        tuple(path),
+        converged,
+        tried=tried[0],
+        added=tuple(added),
+    )
 
 
 def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
@@ -224,11 +243,11 @@ def _design_datum(network, aim, conditions, sigma, seed) -> Design:
     """Inner constraints on all object points, the datum of the smallest mean σ of them (Meissl
     1969), compared with the datum of the network."""
     if aim.measure == "reliability" or aim.of != "points":
-        raise InputError("order \"zero\": the datum is designed for the σ of points")
+        raise InputError('order "zero": the datum is designed for the σ of points')
     if network.datum == "control":
         raise InputError(
-            "order \"zero\": the datum of this network is given by control points and priors; "
-            "datum = \"minimal\" or \"inner\" leaves it to be chosen"
+            'order "zero": the datum of this network is given by control points and priors; '
+            'datum = "minimal" or "inner" leaves it to be chosen'
         )
     inner = network.replace(datum="inner", datum_points=())
     pairs = make_pairs(inner, aim, conditions, sigma)
@@ -313,9 +332,13 @@ def _with_another(network: Network) -> tuple[Network, str]:
         number += 1
     again = lambda x: np.concatenate([x, x[-1:]])
     more = Images(
-        (*images.id, id), again(images.camera), again(images.position), again(images.angles),
-        np.concatenate([images.sigma, np.full((1, 6), np.nan)]), images.source,
-    )  # fmt: skip
+        (*images.id, id),
+        again(images.camera),
+        again(images.position),
+        again(images.angles),
+        np.concatenate([images.sigma, np.full((1, 6), np.nan)]),
+        images.source,
+    )
     return network.replace(images=more), id
 
 
@@ -333,6 +356,5 @@ def _sigma(network: Network, given: float | None) -> float:
         return positive("sigma_image", given)
     sigma = network.observations.sigma
     if not len(sigma) or not np.isfinite(sigma).any():
-        raise InputError("sigma_image: the network has no image points; give the σ they will "
-                         "have")  # fmt: skip
+        raise InputError("sigma_image: the network has no image points; give the σ they will have")
     return float(np.nanmedian(sigma))

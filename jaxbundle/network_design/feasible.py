@@ -101,15 +101,22 @@ def _why(found, tried: int) -> str:
         return f"conditions: all targets are hidden by the obstacles from everywhere {places}"
     for name, rows in found.items():
         if not rows.any():
-            return (f"conditions: no station can satisfy the condition \"{name}\" for any target "
-                    f"{places}; widen it, or the room")  # fmt: skip
+            return (
+                f'conditions: no station can satisfy the condition "{name}" for any target '
+                f"{places}; widen it, or the room"
+            )
     names = ", ".join(found)
-    without = [
-        name for name in found
-        if np.logical_and.reduce([rows for other, rows in found.items() if other != name]).any()
-    ] if len(found) > 1 else []  # fmt: skip
-    hint = f"; without \"{without[0]}\" they could" if without else ""
-    return (f"conditions: no station can satisfy {names} together for any target {places}{hint}")
+    without = (
+        [
+            name
+            for name in found
+            if np.logical_and.reduce([rows for other, rows in found.items() if other != name]).any()
+        ]
+        if len(found) > 1
+        else []
+    )
+    hint = f'; without "{without[0]}" they could' if without else ""
+    return f"conditions: no station can satisfy {names} together for any target {places}{hint}"
 
 
 def _test_conditions(pairs: Pairs, c: int, start: Values, position, rotation):
@@ -122,8 +129,12 @@ def _test_conditions(pairs: Pairs, c: int, start: Values, position, rotation):
 
     of_points = jax.vmap(one, (None, None, 0, None if pairs.normals is None else 0))
     of_all = jax.jit(jax.vmap(of_points, (0, 0, None, None)))
-    found = of_all(jnp.asarray(position), jnp.asarray(rotation), jnp.asarray(start.point),
-                   None if pairs.normals is None else jnp.asarray(pairs.normals))  # fmt: skip
+    found = of_all(
+        jnp.asarray(position),
+        jnp.asarray(rotation),
+        jnp.asarray(start.point),
+        None if pairs.normals is None else jnp.asarray(pairs.normals),
+    )
     return {name: np.asarray(rows) for name, rows in found.items()}
 
 

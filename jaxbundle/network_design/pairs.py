@@ -89,8 +89,15 @@ class Pairs:
             axes = 0, 0, None, 0, None if normal is None else 0
             mapped = jax.vmap(partial(function, view), axes)
             at = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
-            found.append(mapped(at(values.position, image), at(values.rotation, image), interior,
-                                at(values.point, point), normal))  # fmt: skip
+            found.append(
+                mapped(
+                    at(values.position, image),
+                    at(values.rotation, image),
+                    interior,
+                    at(values.point, point),
+                    normal,
+                )
+            )
             order.append(rows)
         back = np.argsort(np.concatenate(order))
         return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *found)
@@ -148,7 +155,10 @@ class Pairs:
 
 
 def make_pairs(
-    network: Network, aim: Aim, conditions: Conditions, sigma: float,
+    network: Network,
+    aim: Aim,
+    conditions: Conditions,
+    sigma: float,
     new: Bool[np.ndarray, " images"] | None = None,
 ) -> Pairs:
     """The problem of all pairs of a network without check points.
@@ -175,11 +185,16 @@ def make_pairs(
     problem = make_problem(full)
     refuse_arbitrary(aim, problem)
     return Pairs(
-        problem, aim, task_of(problem, aim), conditions, kept.ravel(),
+        problem,
+        aim,
+        task_of(problem, aim),
+        conditions,
+        kept.ravel(),
         views=tuple(view_of(c, conditions.edge) for c in problem.network.cameras),
-        rules=rules_of(conditions, problem.origin), normals=conditions.of_points(len(points)),
+        rules=rules_of(conditions, problem.origin),
+        normals=conditions.of_points(len(points)),
         interest=points_of_interest(problem),
-    )  # fmt: skip
+    )
 
 
 def _refuse(network: Network) -> None:
@@ -188,13 +203,17 @@ def _refuse(network: Network) -> None:
     **Raises:** `InputError`."""
     images, points = network.images, network.points
     poses = np.concatenate([images.position, images.angles], 1)
-    for table, rows, words in ((images, poses, "position and angles of every station"),
-                               (points, points.position, "coordinates of every target")):
+    for table, rows, words in (
+        (images, poses, "position and angles of every station"),
+        (points, points.position, "coordinates of every target"),
+    ):
         bad = ~np.isfinite(rows).all(1)
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(f"{table.source(row)}: {table.id[row]!r} has no start values; a "
-                             f"design starts from {words}")  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: {table.id[row]!r} has no start values; a "
+                f"design starts from {words}"
+            )
     others = [one for one in network.further if not isinstance(one, CameraParameters)]
     if others:
         raise InputError(

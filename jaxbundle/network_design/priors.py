@@ -45,7 +45,7 @@ def _at_own_values(network: Network, given: CameraParameters) -> CameraParameter
     values = {
         camera.id: {**default_parameters(get_model(camera.model)), **camera.parameters}
         for camera in network.cameras
-    }  # fmt: skip
+    }
 
     def value(camera: str, parameter: str) -> float:
         name, _, divisor = parameter.partition(RATIO)

@@ -92,7 +92,7 @@ def _measure(exact: Data, random: np.random.Generator) -> Data:
         name: np.asarray(exact.measured(name))
         + random.standard_normal(exact.measured(name).shape) * _sigma(exact.weight(name))
         for name in FIELDS
-    }  # fmt: skip
+    }
     xy = noisy.pop("image")
     return dataclasses.replace(exact, image_xy=xy, **noisy)
 

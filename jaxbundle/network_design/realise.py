@@ -15,13 +15,14 @@ from jaxbundle.network.sightings import keep_images
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs
 
-_angles = jax.jit(
-    jax.vmap(lambda q: omega_phi_kappa_from_matrix(matrix_from_quaternion(q)))
-)
+_angles = jax.jit(jax.vmap(lambda q: omega_phi_kappa_from_matrix(matrix_from_quaternion(q))))
 
 
 def realise(
-    pairs: Pairs, values: Values, measured: Bool[np.ndarray, " rays"], seed: int | None = 0,
+    pairs: Pairs,
+    values: Values,
+    measured: Bool[np.ndarray, " rays"],
+    seed: int | None = 0,
     residuals: str = "corrected",
 ) -> Network:
     """The network of a design with simulated measurements; stations with fewer than three
@@ -31,9 +32,10 @@ def realise(
     already measured ones are unchanged; None: all rays without noise."""
     network, origin = pairs.problem.network, pairs.problem.origin
     images = dataclasses.replace(
-        network.images, position=np.asarray(values.position) + origin,
+        network.images,
+        position=np.asarray(values.position) + origin,
         angles=np.asarray(_angles(np.asarray(values.rotation))),
-    )  # fmt: skip
+    )
     points = dataclasses.replace(network.points, position=np.asarray(values.point) + origin)
     rays = network.observations
     xy = np.asarray(pairs.predict(values))
@@ -45,7 +47,10 @@ def realise(
         rays.take(rows), xy=xy[rows], source=Source("simulated image points")
     )
     moved = network.replace(
-        images=images, points=points, observations=observations, residuals=residuals,
+        images=images,
+        points=points,
+        observations=observations,
+        residuals=residuals,
         distances=_distances(network, points.position, seed),
     )
     seen = np.bincount(rays.image[rows], minlength=len(images))
@@ -58,8 +63,10 @@ def _distances(network: Network, points, seed: int | None):
     ends = points[given.points], network.points.position[given.points]
     length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
     moved = np.abs(length - before) > 1e-12 * before
-    noise = np.zeros(len(given)) if seed is None else (
-        given.sigma * np.random.default_rng([seed, 1]).standard_normal(len(given))
+    noise = (
+        np.zeros(len(given))
+        if seed is None
+        else (given.sigma * np.random.default_rng([seed, 1]).standard_normal(len(given)))
     )
     return dataclasses.replace(given, value=np.where(moved, length + noise, given.value))
 

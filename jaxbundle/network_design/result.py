@@ -142,11 +142,15 @@ class Design:
             yield "gain: none; the start is as good as any found"
         for name, state in (("before", self.before), ("after", self.after)):
             if state.lost:
-                yield (f"{name}: {len(state.lost)} targets have fewer than two rays and are "
-                       f"excluded: {list_some(state.lost)}")  # fmt: skip
+                yield (
+                    f"{name}: {len(state.lost)} targets have fewer than two rays and are "
+                    f"excluded: {list_some(state.lost)}"
+                )
         if self.bound:
-            yield (f"no {self.after.photographs} photographs of these have an aim below "
-                   f"{self.bound:.4g} ({100 * (self.after.aim / self.bound - 1):.2g} % less)")
+            yield (
+                f"no {self.after.photographs} photographs of these have an aim below "
+                f"{self.bound:.4g} ({100 * (self.after.aim / self.bound - 1):.2g} % less)"
+            )
         if self.dropped:
             yield f"not needed: {list_some(self.dropped)}"
         for id in self.added:

@@ -109,10 +109,14 @@ def station_margins(
 
 
 def search(
-    pairs: Pairs, variables: Variables, start: Start, program: Callable,
-    ends: Callable[[Start], tuple[np.ndarray, np.ndarray]], max_iterations: int,
+    pairs: Pairs,
+    variables: Variables,
+    start: Start,
+    program: Callable,
+    ends: Callable[[Start], tuple[np.ndarray, np.ndarray]],
+    max_iterations: int,
     rounds: tuple[float, ...] = ROUNDS,
-) -> tuple[Start, list[Step], bool]:  # fmt: skip
+) -> tuple[Start, list[Step], bool]:
     """The best configuration from a start.
 
     **Arguments:** `ends`: smallest and largest variables at a start; `max_iterations`: of a round.
@@ -145,9 +149,15 @@ def search(
             keep(x)
         bound = [{**c, "args": (start,)} for c in conditions]
         found = minimize(
-            log_aim, x, jac=True, method="SLSQP", bounds=np.stack([low, high], 1), callback=keep,
-            constraints=bound, options={"maxiter": max_iterations, "ftol": SMALLEST_CHANGE},
-        )  # fmt: skip
+            log_aim,
+            x,
+            jac=True,
+            method="SLSQP",
+            bounds=np.stack([low, high], 1),
+            callback=keep,
+            constraints=bound,
+            options={"maxiter": max_iterations, "ftol": SMALLEST_CHANGE},
+        )
         start = jax.tree.map(np.asarray, variables.placed(start, np.clip(found.x, low, high)))
         converged = bool(found.success)
     return start, steps, converged

@@ -148,7 +148,9 @@ def points_on_axes(values: Values) -> Float[np.ndarray, "images 3"]:
 
 
 def bounds(
-    variables: Variables, start: Start, room: Float[np.ndarray, "2 3"],
+    variables: Variables,
+    start: Start,
+    room: Float[np.ndarray, "2 3"],
     targets: Float[np.ndarray, "2 3"],
 ) -> tuple[Float[np.ndarray, " variables"], Float[np.ndarray, " variables"]]:
     """The smallest and largest values of the variables; boxes relative to the origin."""
@@ -156,9 +158,10 @@ def bounds(
     low, high = points.min(0), points.max(0)
     spare = ROOM_OF_SIGHT * max((high - low).max(), 1e-9)
     boxes = {
-        "position": room, "targets": targets,
+        "position": room,
+        "targets": targets,
         "direction": np.stack([low - spare, high + spare]),
-    }  # fmt: skip
+    }
     ends = []
     for end in (0, 1):
         parts = [np.zeros(0)]

@@ -75,8 +75,10 @@ def view_of(camera: Camera, edge: float) -> View:
             "image_size, and pixel_size of a model in mm"
         ) from None
     if not np.isfinite(field.diagonal):
-        raise InputError(f"camera {camera.id}: there is no ray to the corners of its image; a "
-                         "design needs a camera whose distortion holds to the corners")  # fmt: skip
+        raise InputError(
+            f"camera {camera.id}: there is no ray to the corners of its image; a "
+            "design needs a camera whose distortion holds to the corners"
+        )
     inner = edge * (high - low)
     low, high = (tuple(map(float, corner)) for corner in (low + inner, high - inner))
     return View(model, low, high, field.diagonal / 2)
@@ -96,15 +98,19 @@ def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
     pair = lambda given: None if given is None else np.array(given)
     incidence, boxes = conditions.incidence, conditions.obstacles
     return Rules(
-        pair(conditions.distance), pair(conditions.focus),
+        pair(conditions.distance),
+        pair(conditions.focus),
         None if incidence is None else np.asarray(np.cos(incidence)),
         np.array(boxes) - origin if boxes else None,
     )
 
 
 def image_of(
-    view: View, position: Float[AnyArray, "3"], rotation: Float[AnyArray, "4"],
-    interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
+    view: View,
+    position: Float[AnyArray, "3"],
+    rotation: Float[AnyArray, "4"],
+    interior: Float[AnyArray, " parameters"],
+    point: Float[AnyArray, "3"],
 ) -> Float[Array, "2"]:
     """The image of a target; outside the field of view that of the nearest ray inside, since a
     distorted camera may have no image there."""
@@ -113,9 +119,14 @@ def image_of(
 
 
 def margins(
-    view: View, rules: Rules, position: Float[AnyArray, "3"], rotation: Float[AnyArray, "4"],
-    interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
-    normal: Float[AnyArray, "3"] | None, softness: float | Float[AnyArray, ""] = 0.0,
+    view: View,
+    rules: Rules,
+    position: Float[AnyArray, "3"],
+    rotation: Float[AnyArray, "4"],
+    interior: Float[AnyArray, " parameters"],
+    point: Float[AnyArray, "3"],
+    normal: Float[AnyArray, "3"] | None,
+    softness: float | Float[AnyArray, ""] = 0.0,
 ) -> dict[str, Float[Array, " margins"]]:
     """The margins of one ray by condition; obstacles with this softness, 0: exact."""
     away = point - position
@@ -138,8 +149,9 @@ def margins(
 def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
     """The smooth weight of a ray, 0 to 1, from its margins at this softness."""
     spared = lambda name: SPARED if name == "obstacles" else 0.0
-    return jnp.exp(sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name)))
-                       for name, m in found.items()))  # fmt: skip
+    return jnp.exp(
+        sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name))) for name, m in found.items())
+    )
 
 
 def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:

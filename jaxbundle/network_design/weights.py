@@ -46,8 +46,10 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
 
     images = len(pairs.problem.network.images)
     if not 1 <= photographs < images:
-        raise InputError(f"photographs must be from 1 to {images - 1}, one less than there are "
-                         f"candidates, but is {photographs}")  # fmt: skip
+        raise InputError(
+            f"photographs must be from 1 to {images - 1}, one less than there are "
+            f"candidates, but is {photographs}"
+        )
     program = _program(pairs)
     start = np.full(images, photographs / images)
     aims: list[float] = []
@@ -59,12 +61,17 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
     if program(start)[0] >= 2 * UNDETERMINED_AIM:
         raise NotSolvedError("design: all candidates together do not determine the network")
     found = minimize(
-        program, start, jac=True, method="SLSQP", bounds=[(IDLE_WEIGHT, 1.0)] * images,
+        program,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=[(IDLE_WEIGHT, 1.0)] * images,
         callback=keep,
-        constraints=[{"type": "eq", "fun": lambda w: w.sum() - photographs,
-                      "jac": lambda w: np.ones_like(w)}],
+        constraints=[
+            {"type": "eq", "fun": lambda w: w.sum() - photographs, "jac": lambda w: np.ones_like(w)}
+        ],
         options={"maxiter": max_iterations, "ftol": 1e-8},
-    )  # fmt: skip
+    )
     weight = np.clip(found.x, IDLE_WEIGHT, 1.0)
     chosen = np.zeros(images, bool)
     chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
@@ -73,8 +80,9 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
     bound = float(np.sqrt(max(lowest, 0.0))) if pairs.aim.convex else 0.0
-    return Selection(np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0), chosen, aims, bound,
-                     bool(found.success))  # fmt: skip
+    return Selection(
+        np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0), chosen, aims, bound, bool(found.success)
+    )
 
 
 def _program(pairs: Pairs):

@@ -68,9 +68,12 @@ def absolute_orientation(
     N = jnp.where(line, jnp.eye(7, dtype=J.dtype), J.T @ J)
     v = computed(tau) - target
     return AbsoluteOrientation(
-        tau, v, jnp.sum(p[:, None] * v * v), jnp.where(line, jnp.inf, inverse(N)),
+        tau,
+        v,
+        jnp.sum(p[:, None] * v * v),
+        jnp.where(line, jnp.inf, inverse(N)),
         first_of((line, Status.COLLINEAR_POINTS)),
-    )  # fmt: skip
+    )
 
 
 def rotation_between(

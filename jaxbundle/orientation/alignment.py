@@ -106,9 +106,13 @@ def join(sights: Sights, model: Model, part: Model) -> Model | None:
     image, point = part.placed & ~model.placed, part.known & ~model.known
     choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     return Model(
-        choose(image, part.X0, model.X0), choose(image, part.M, model.M), model.placed | image,
-        choose(point, part.X, model.X), model.known | point, model.held,
-    )  # fmt: skip
+        choose(image, part.X0, model.X0),
+        choose(image, part.M, model.M),
+        model.placed | image,
+        choose(point, part.X, model.X),
+        model.known | point,
+        model.held,
+    )
 
 
 def _by_an_image(model, part, image, both):

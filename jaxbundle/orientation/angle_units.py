@@ -40,5 +40,5 @@ def name_angle_unit(network: Network) -> str:
         return ""
     return (
         f"the start values of the images fit the measurements if omega, phi, kappa are in {best}, "
-        f"not in {network.angle_unit}: set angle_unit = \"{best}\""
+        f'not in {network.angle_unit}: set angle_unit = "{best}"'
     )

@@ -89,8 +89,9 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     """
     if not len(found):
         nothing, lacking = np.zeros((0, 3)), (True, True)
-        return Assessment(np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0),
-                          lacking)  # fmt: skip
+        return Assessment(
+            np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0), lacking
+        )
     used = _search(found, assumed, significance)
     factor = 1.0
     if 2 * (~used).sum() >= len(found) and np.isfinite(found.sigma).any():
@@ -195,8 +196,11 @@ def _predict(
         if not len(part) or (unknown[part].any() and freedom < LEAST_REDUNDANCY):
             continue  # an assumed σ tests nothing
         T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
-        p.append(f_tail(T / len(part), len(part), freedom) if unknown[part].any()
-                 else chi2_tail(T, len(part)))  # fmt: skip
+        p.append(
+            f_tail(T / len(part), len(part), freedom)
+            if unknown[part].any()
+            else chi2_tail(T, len(part))
+        )
     p = min(1.0, len(p) * min(p, default=1.0))
     error, spread = np.full(3, np.nan), np.full(3, np.nan)
     first = rows[mine] // 3 == tested[0]

@@ -82,8 +82,11 @@ def name_image_convention(network: Network) -> str:
     x, y = ("u", "v") if unit == "px" else ("x", "y")
     words = []
     if best[1]:
-        words.append("they are counted from the image centre" if unit == "px" else
-                     "they are counted from a corner of the image")  # fmt: skip
+        words.append(
+            "they are counted from the image centre"
+            if unit == "px"
+            else "they are counted from a corner of the image"
+        )
     if best[0] != SAME:
         words.append(SYMMETRIES[best[0]].format(x=x, y=y))
     return (
@@ -139,4 +142,3 @@ def name_image_extent(network: Network) -> str:
             origin = "the image centre" if unit == "px" else "a corner of the image"
             return f"{said}: are they counted from {origin}? Expected are {EXPECTED[unit]}"
     return ""
-

@@ -69,9 +69,7 @@ def have_one_line(
     return one_line, one_line & (misses(away / usual) < limit)
 
 
-def see_a_line(
-    seen: Sights, model: Model, factor: float = 1.0
-) -> Bool[np.ndarray, " images"]:
+def see_a_line(seen: Sights, model: Model, factor: float = 1.0) -> Bool[np.ndarray, " images"]:
     """Which images see known points on a line only, or fewer than three. Images that are not placed
     count as at the usual distance."""
     rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
@@ -108,6 +106,6 @@ def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
 def _quantiles(degrees) -> np.ndarray:
     """χ² quantiles of whole degrees of freedom; infinite for none."""
     values, index = np.unique(degrees, return_inverse=True)
-    return np.array([
-        chi2_quantile(1 - SIGNIFICANCE, int(k)) if k > 0 else np.inf for k in values
-    ])[index]  # fmt: skip
+    return np.array([chi2_quantile(1 - SIGNIFICANCE, int(k)) if k > 0 else np.inf for k in values])[
+        index
+    ]

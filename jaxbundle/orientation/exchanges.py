@@ -83,9 +83,10 @@ class Contradiction:
 
 
 def contradiction(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"],
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
     sigma: Float[np.ndarray, "n 3"] | None = None,
-) -> Contradiction | None:  # fmt: skip
+) -> Contradiction | None:
     """How two lists of points contradict each other after a similarity; None where they do not, or
     where no explanation is found.
 

@@ -66,9 +66,13 @@ class Model:
     def empty(cls, sights: Sights) -> "Model":
         images, points = sights.images, sights.points
         return cls(
-            np.full((images, 3), np.nan), np.full((images, 3, 3), np.nan), np.zeros(images, bool),
-            np.full((points, 3), np.nan), np.zeros(points, bool), np.zeros(points, bool),
-        )  # fmt: skip
+            np.full((images, 3), np.nan),
+            np.full((images, 3, 3), np.nan),
+            np.zeros(images, bool),
+            np.full((points, 3), np.nan),
+            np.zeros(points, bool),
+            np.zeros(points, bool),
+        )
 
     def place(self, image, X0, M) -> None:
         """An image, or several, with their poses."""
@@ -78,16 +82,18 @@ class Model:
         """A copy without these images, and with only the held points."""
         X = np.where(self.held[:, None], self.X, np.nan)
         return dataclasses.replace(
-            self, X0=self.X0.copy(), M=self.M.copy(), placed=self.placed & ~images, X=X,
+            self,
+            X0=self.X0.copy(),
+            M=self.M.copy(),
+            placed=self.placed & ~images,
+            X=X,
             known=self.known & self.held,
-        )  # fmt: skip
+        )
 
     def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
         """The same model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))
-        return dataclasses.replace(
-            self, X0=self.X0 @ A.T + t, M=self.M @ R.T, X=self.X @ A.T + t
-        )
+        return dataclasses.replace(self, X0=self.X0 @ A.T + t, M=self.M @ R.T, X=self.X @ A.T + t)
 
 
 def are_controlled(points: Points) -> Bool[np.ndarray, " points"]:
@@ -152,9 +158,9 @@ def finish(sights: Sights, model: Model) -> None:
 
 def place_far_points(sights: Sights, model: Model) -> None:
     """Unknown points with at least three parallel rays: far away in their direction. Such rays
-        hardly intersect, because of noise often behind the cameras.
+    hardly intersect, because of noise often behind the cameras.
 
-        None if there are many: then the images have one common projection centre."""
+    None if there are many: then the images have one common projection centre."""
     rows = np.flatnonzero(model.placed[sights.image] & ~model.known[sights.point])
     point, image = sights.point[rows], sights.image[rows]
     ray = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
@@ -217,9 +223,11 @@ def _refine(sights: Sights, model: Model) -> None:
         return
     images, rows, R = images[use], [rows[k] for k in use], R[use]
     model.X0[images], M = many.refine(
-        (model.X0[images], R @ model.M[images]), [xy[k] for k in use],
-        [model.X[sights.point[r]] for r in rows], [weights[k] for k in use],
-    )  # fmt: skip
+        (model.X0[images], R @ model.M[images]),
+        [xy[k] for k in use],
+        [model.X[sights.point[r]] for r in rows],
+        [weights[k] for k in use],
+    )
     model.M[images] = R.swapaxes(1, 2) @ M
 
 

@@ -127,6 +127,12 @@ def _products(H, i, j):
     """hᵢᵀ·B·hⱼ as the coefficients of (B11, B12, B22, B13, B23, B33)."""
     a, b = H[:, i], H[:, j]
     return jnp.stack(
-        [a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[1] * b[1], a[2] * b[0] + a[0] * b[2],
-         a[2] * b[1] + a[1] * b[2], a[2] * b[2]]
-    )  # fmt: skip
+        [
+            a[0] * b[0],
+            a[0] * b[1] + a[1] * b[0],
+            a[1] * b[1],
+            a[2] * b[0] + a[0] * b[2],
+            a[2] * b[1] + a[1] * b[2],
+            a[2] * b[2],
+        ]
+    )

@@ -47,18 +47,26 @@ def resect(
     pose."""
     rows = [spread(len(a)) for a in xy]
     return run_in_lanes(
-        _resect, LANES, _gather_slots(xy, rows, SLOTS), _gather_slots(X, rows, SLOTS),
-        _weights(rows, SLOTS), tolerance,
-    )  # fmt: skip
+        _resect,
+        LANES,
+        _gather_slots(xy, rows, SLOTS),
+        _gather_slots(X, rows, SLOTS),
+        _weights(rows, SLOTS),
+        tolerance,
+    )
 
 
 def refine(poses, xy, X, weights):
     """X0, M of images improved from start values by points of weight > 0."""
     rows = [spread(len(a)) for a in xy]
     return run_in_lanes(
-        _refine, LANES, *poses, _gather_slots(xy, rows, SLOTS), _gather_slots(X, rows, SLOTS),
+        _refine,
+        LANES,
+        *poses,
+        _gather_slots(xy, rows, SLOTS),
+        _gather_slots(X, rows, SLOTS),
         _gather_slots(weights, rows, SLOTS),
-    )  # fmt: skip
+    )
 
 
 def orient_pairs(xy1, xy2, tolerance):
@@ -66,9 +74,13 @@ def orient_pairs(xy1, xy2, tolerance):
     median angle of intersection (radians)."""
     rows = [spread(len(a)) for a in xy1]
     return run_in_lanes(
-        _orient_pair, LANES, _gather_slots(xy1, rows, SLOTS), _gather_slots(xy2, rows, SLOTS),
-        _weights(rows, SLOTS), tolerance,
-    )  # fmt: skip
+        _orient_pair,
+        LANES,
+        _gather_slots(xy1, rows, SLOTS),
+        _gather_slots(xy2, rows, SLOTS),
+        _weights(rows, SLOTS),
+        tolerance,
+    )
 
 
 def intersect(X0, rays, weights):
@@ -80,9 +92,12 @@ def similarity(source, target, weights):
     """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
     rows = [spread(len(source))]
     A, t, status = run_in_lanes(
-        _similarity, 1, _gather_slots([source], rows, SLOTS), _gather_slots([target], rows, SLOTS),
+        _similarity,
+        1,
+        _gather_slots([source], rows, SLOTS),
+        _gather_slots([target], rows, SLOTS),
         _gather_slots([weights], rows, SLOTS) * _weights(rows, SLOTS),
-    )  # fmt: skip
+    )
     return (A[0], t[0]) if status[0] == int(Status.SOUND) else None
 
 

@@ -322,9 +322,9 @@ def _pairs_in_common(seen: Sights, among, old, linked):
     pairs, number = pairs[use], number[use]
     order = np.argsort(-number, kind="stable")
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
-    chosen = np.unique(np.concatenate(
-        [order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]]
-    ))
+    chosen = np.unique(
+        np.concatenate([order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]])
+    )
     return pairs[chosen], number[chosen]
 
 
@@ -388,8 +388,10 @@ def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what:
     if not reasons:
         return network
     names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
-    groups = {why: tuple(id for id, one in reasons.items() if one == why)
-              for why in dict.fromkeys(reasons.values())}  # fmt: skip
+    groups = {
+        why: tuple(id for id, one in reasons.items() if one == why)
+        for why in dict.fromkeys(reasons.values())
+    }
     network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
     notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
     return network.replace(left_out=(*network.left_out, *notes))

@@ -76,9 +76,14 @@ def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
     rows = np.flatnonzero(np.isfinite(d).all(1))
     rows = rows[np.argsort(rays.image[rows], kind="stable")]
     return Sights(
-        rays.image[rows], rays.point[rows], d[rows], sigma[rows], rows, tolerance * extent,
+        rays.image[rows],
+        rays.point[rows],
+        d[rows],
+        sigma[rows],
+        rows,
+        tolerance * extent,
         len(network.points),
-    )  # fmt: skip
+    )
 
 
 def rays_of(

@@ -72,9 +72,7 @@ def _law_of_cosines(i, j, cosine):
 def _pair_of_lines(A, B):
     """t, eigenvalues and eigenvectors of A + t·B, of three t the best conditioned pair of lines."""
     a, b = _cofactors(A), _cofactors(B)
-    roots = _real_roots(
-        jnp.sum(b[0] * B[0]), jnp.sum(b * A), jnp.sum(a * B), jnp.sum(a[0] * A[0])
-    )
+    roots = _real_roots(jnp.sum(b[0] * B[0]), jnp.sum(b * A), jnp.sum(a * B), jnp.sum(a[0] * A[0]))
     w, v = jnp.linalg.eigh(A + roots[:, None, None] * B)
     crossing = jnp.minimum(-w[:, 0], w[:, 2]) / jnp.max(jnp.abs(w), axis=1)
     best = jnp.argmax(crossing)

@@ -177,9 +177,12 @@ def _place(gps, xmp: Xmp) -> Place | None:
     height = _number(gps.get(6))
     below = gps.get(5) in (1, b"\x01")
     return Place(
-        latitude, longitude, None if height is None else -height if below else height,
-        xmp.sigma or _positive(gps.get(31)), xmp.sigma_height,
-    )  # fmt: skip
+        latitude,
+        longitude,
+        None if height is None else -height if below else height,
+        xmp.sigma or _positive(gps.get(31)),
+        xmp.sigma_height,
+    )
 
 
 def _angle(parts, reference) -> float | None:

@@ -44,5 +44,6 @@ def describe_other_files(folder: Path) -> str:
 
 
 def _visible(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir()
-                  if not p.name.startswith(".") and p.name.lower() not in HIDDEN)  # fmt: skip
+    return sorted(
+        p for p in folder.iterdir() if not p.name.startswith(".") and p.name.lower() not in HIDDEN
+    )

@@ -7,9 +7,19 @@ import importlib
 from pathlib import Path
 
 SUFFIXES = (
-    ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".png", ".webp", ".bmp", ".jp2", ".ppm",
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jfif",
+    ".tif",
+    ".tiff",
+    ".png",
+    ".webp",
+    ".bmp",
+    ".jp2",
+    ".ppm",
     ".pgm",
-)  # fmt: skip
+)
 """Suffixes of photographs that OpenCV or Pillow reads."""
 HEIC = (".heic", ".heif", ".hif")
 RAW = (
@@ -29,9 +39,13 @@ OF_RAW = (
 )
 OF_OTHERS = "this format is not read: convert it to JPEG or TIFF, with its metadata"
 BRANDS = {
-    b"heic": OF_HEIC, b"heix": OF_HEIC, b"mif1": OF_HEIC, b"hevc": OF_HEIC, b"avif": OF_OTHERS,
+    b"heic": OF_HEIC,
+    b"heix": OF_HEIC,
+    b"mif1": OF_HEIC,
+    b"hevc": OF_HEIC,
+    b"avif": OF_OTHERS,
     b"crx ": OF_RAW,
-}  # fmt: skip
+}
 """By the brand in the header of an ISO media file: photographs are also named .jpg wrongly."""
 
 

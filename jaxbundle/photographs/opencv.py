@@ -19,7 +19,5 @@ def need_pillow():
     try:
         from PIL import Image
     except ImportError:
-        raise InputError(
-            "image headers need Pillow: pip install 'jaxbundle[images]'"
-        ) from None
+        raise InputError("image headers need Pillow: pip install 'jaxbundle[images]'") from None
     return Image

@@ -50,15 +50,26 @@ def planned_network(
     along, across = (_control(n, control_every) for n in counts)
     control = [row * columns + column for row in across for column in along]
     stations = aerial_block(
-        design.strips, design.photographs_per_strip, height=design.height,
-        footprint=design.footprint, forward_overlap=design.forward_overlap,
+        design.strips,
+        design.photographs_per_strip,
+        height=design.height,
+        footprint=design.footprint,
+        forward_overlap=design.forward_overlap,
         side_overlap=design.side_overlap,
-    )  # fmt: skip
+    )
     return simulate(
-        stations, targets, camera, noise=sigma_image, seed=seed, datum="control",
-        image_format=image_format, control=control, control_sigma=control_sigma, min_rays=2,
+        stations,
+        targets,
+        camera,
+        noise=sigma_image,
+        seed=seed,
+        datum="control",
+        image_format=image_format,
+        control=control,
+        control_sigma=control_sigma,
+        min_rays=2,
         name="planned block",
-    )  # fmt: skip
+    )
 
 
 def _control(points: int, every: int | None) -> list[int]:

@@ -142,8 +142,9 @@ def render_rays(
     rows, columns = (n - 1 for n in directions.shape[:2])
     high = max(1, min(STRIP // (columns + 1), -(-rows // available_cores())))
     starts = range(0, rows, high)
-    strip = lambda r: _render_strip(scene, origins[r : r + high + 1], directions[r : r + high + 1],
-                                    sensor)  # fmt: skip
+    strip = lambda r: _render_strip(
+        scene, origins[r : r + high + 1], directions[r : r + high + 1], sensor
+    )
     with ThreadPoolExecutor(available_cores()) as pool:
         parts = list(pool.map(strip, starts))
     grey, point, surface = (np.concatenate(p) for p in zip(*parts))

@@ -100,9 +100,13 @@ class HeightField:
         spread = lambda a: np.nan_to_num(widest(away(a)), nan=np.inf).ravel()
         slack = np.hypot(1.0, present(self.steepest))
         t = self._follow(
-            middle(o), middle(d), np.zeros(len(r[::side]) * len(c[::side])),
-            slack * spread(o), slack * spread(d), last=False,
-        )  # fmt: skip
+            middle(o),
+            middle(d),
+            np.zeros(len(r[::side]) * len(c[::side])),
+            slack * spread(o),
+            slack * spread(d),
+            last=False,
+        )
         t = np.where(np.isfinite(t), t, 0.0).reshape(len(r[::side]), len(c[::side]))
         return t[np.arange(rows)[:, None] // side, np.arange(columns)[None] // side]
 
@@ -188,8 +192,10 @@ class Rectangle:
     across: tuple[float, float, float]
 
     def __post_init__(self):
-        a, b = (vector(name, getattr(self, name), 3, "coordinates X, Y, Z")
-                for name in ("along", "across"))  # fmt: skip
+        a, b = (
+            vector(name, getattr(self, name), 3, "coordinates X, Y, Z")
+            for name in ("along", "across")
+        )
         vector("corner", self.corner, 3, "coordinates X, Y, Z")
         positive("length of along", float(np.linalg.norm(a)))
         positive("length of across", float(np.linalg.norm(b)))

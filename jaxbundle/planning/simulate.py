@@ -179,15 +179,25 @@ def simulate_with_truth(
     points = _points(targets, role, used, control_sigma)
     ends = _ends(distances, len(targets), used, row)
     observations = Observations(
-        image, row[point], xy, _sigma_of_images(sigma_xy, xy), Source("image points"),
+        image,
+        row[point],
+        xy,
+        _sigma_of_images(sigma_xy, xy),
+        Source("image points"),
         STATED if np.all(sigma_xy) else UNIT,
     )
     truth = Network(
-        cameras=cameras, images=_images(stations, of_station), points=points,
-        observations=observations, distances=_distances(points.position, ends, distance_sigma),
-        datum=datum, residuals=residuals, name=name, object_unit=object_unit,
+        cameras=cameras,
+        images=_images(stations, of_station),
+        points=points,
+        observations=observations,
+        distances=_distances(points.position, ends, distance_sigma),
+        datum=datum,
+        residuals=residuals,
+        name=name,
+        object_unit=object_unit,
         image_unit=get_model(cameras[0].model).unit,
-    )  # fmt: skip
+    )
     towards = stations.position[image] - points.position[observations.point]
     disturbance = _disturbance(disturb, towards)
     return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
@@ -209,10 +219,13 @@ def _select_imaged(rays, kept, need):
 
 def _images(stations: Stations, of_station) -> Images:
     return Images(
-        id=tuple(str(i + 1) for i in range(len(stations))), camera=of_station,
-        position=stations.position, angles=stations.angles,
-        sigma=np.full((len(stations), 6), np.nan), source=Source("stations", None, "station"),
-    )  # fmt: skip
+        id=tuple(str(i + 1) for i in range(len(stations))),
+        camera=of_station,
+        position=stations.position,
+        angles=stations.angles,
+        sigma=np.full((len(stations), 6), np.nan),
+        source=Source("stations", None, "station"),
+    )
 
 
 def _points(targets, role, used, control_sigma) -> Points:
@@ -221,8 +234,9 @@ def _points(targets, role, used, control_sigma) -> Points:
     if "control" in role:
         sigma[role == "control"] = np.broadcast_to(control_sigma, 3)
     source = Source("targets", number, "target")
-    return Points(tuple(map(str, number.tolist())), tuple(role.tolist()), targets[used], sigma,
-                  source)  # fmt: skip
+    return Points(
+        tuple(map(str, number.tolist())), tuple(role.tolist()), targets[used], sigma, source
+    )
 
 
 def _distances(position, ends, sigma: float) -> Distances:
@@ -294,16 +308,18 @@ def _indices(name: str, values):
     """Indices of targets; none may be given as []."""
     array = numeric_array(name, values, "indices of targets")
     if array.size and array.dtype.kind not in "iu":
-        raise InputError(f"{name} must be indices of targets, whole numbers, but is "
-                         f"{show(array.tolist())}")  # fmt: skip
+        raise InputError(
+            f"{name} must be indices of targets, whole numbers, but is {show(array.tolist())}"
+        )
     return array.astype(int)
 
 
 def _not_negative(value, size: int, name: str):
     value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
     if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
-        raise InputError(f"{name} is {show(value.tolist())}; it must be 0 or positive, one number "
-                         f"or {size}")  # fmt: skip
+        raise InputError(
+            f"{name} is {show(value.tolist())}; it must be 0 or positive, one number or {size}"
+        )
     return np.broadcast_to(value, size)
 
 
@@ -318,8 +334,9 @@ def _disturbance(disturb, rays):
 def _ends(distances, targets: int, used, row):
     """The ends of the distances as rows of the points used."""
     ends = _indices("distances", distances)
-    if ends.shape != (0,) and (ends.ndim != 2 or ends.shape[1] != 2 or (ends[:, 0] == ends[:, 1])
-                               .any()):  # fmt: skip
+    if ends.shape != (0,) and (
+        ends.ndim != 2 or ends.shape[1] != 2 or (ends[:, 0] == ends[:, 1]).any()
+    ):
         raise InputError(
             "distances must be pairs of indices of two different targets, but is "
             f"{show(ends.tolist())}"

@@ -88,8 +88,9 @@ def stations_looking_at(
     above = vector("up", up, 3, "a direction X, Y, Z")
     if not above.any():
         raise InputError("up must be a direction X, Y, Z, but is 0, 0, 0")
-    angle = vector("roll", roll, len(position), f"an angle, or one for each of {len(position)} "
-                  "stations")  # fmt: skip
+    angle = vector(
+        "roll", roll, len(position), f"an angle, or one for each of {len(position)} stations"
+    )
     # The camera looks along −z, so z points from the object back to the camera.
     z = position - look_at
     length = np.linalg.norm(z, axis=1, keepdims=True)
@@ -187,9 +188,7 @@ def aerial_block(
     up = np.array([0.0, 0.0, 1.0])
     x = np.cos(tilt) * direction + np.sin(tilt) * up
     z = np.cos(tilt) * up - np.sin(tilt) * direction
-    return Stations(
-        middle + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
-    )
+    return Stations(middle + offset, _angles(np.stack([x, np.cross(z, x), z], 1)))
 
 
 def _a_length(x: float) -> bool:

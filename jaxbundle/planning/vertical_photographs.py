@@ -102,9 +102,16 @@ def design_block(
     given = {"height": height, "scale_number": scale_number, "pixel_on_ground": pixel_on_ground}
     if sum(value is not None for value in given.values()) != 1:
         raise InputError(f"give one of {', '.join(given)}")
-    named = {"c": c, "width of the format": image_format[0], "height of the format":
-             image_format[1], "length of the area": area[0], "width of the area": area[1],
-             "sigma_image": sigma_image, "pixel": pixel, **given}  # fmt: skip
+    named = {
+        "c": c,
+        "width of the format": image_format[0],
+        "height of the format": image_format[1],
+        "length of the area": area[0],
+        "width of the area": area[1],
+        "sigma_image": sigma_image,
+        "pixel": pixel,
+        **given,
+    }
     for name, value in named.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(f"{name} is {value}; it must be positive")
@@ -125,10 +132,16 @@ def design_block(
     if strips > 1:
         spacing = (area[1] - footprint[1]) / (strips - 1)
     return BlockDesign(
-        height=height, scale_number=1000 * ratio,
-        pixel_on_ground=None if pixel is None else pixel * ratio, footprint=footprint, base=base,
-        spacing=spacing, strips=strips, photographs_per_strip=per_strip,
-        forward_overlap=forward_overlap, side_overlap=1 - spacing / footprint[1],
+        height=height,
+        scale_number=1000 * ratio,
+        pixel_on_ground=None if pixel is None else pixel * ratio,
+        footprint=footprint,
+        base=base,
+        spacing=spacing,
+        strips=strips,
+        photographs_per_strip=per_strip,
+        forward_overlap=forward_overlap,
+        side_overlap=1 - spacing / footprint[1],
         sigma_plan=sigma_plan(c, height, sigma_image),
         sigma_height=sigma_height(c, height, base, sigma_image),
-    )  # fmt: skip
+    )

@@ -1,5 +1,4 @@
-"""Calibrations without an adjustment: their distortion curves, and the difference of two as a map.
-"""
+"""Calibrations without an adjustment: distortion curves, the difference of two as a map."""
 
 from collections.abc import Mapping
 

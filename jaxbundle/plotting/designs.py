@@ -47,8 +47,9 @@ def network_view(designed: Design, ax=None, after: bool = True):
         if chosen.any():
             lines = camera_lines(network, SIZE * size)[chosen].reshape(-1, 2, 3)
             ax.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
-            ax.scatter(*network.images.position[chosen].T, s=9, color=colour, label=name,
-                       depthshade=False)  # fmt: skip
+            ax.scatter(
+                *network.images.position[chosen].T, s=9, color=colour, label=name, depthshade=False
+            )
     ways = [s.position for s in designed.path if len(s.position)]
     if after and designed.order == "first" and ways:
         for way in np.stack(ways, 1):
@@ -142,7 +143,8 @@ def places_tried(designed: Design, ax=None):
 
 def _box_edges(box):
     """The twelve edges of a box, [12, 2, 3]."""
-    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]]
-                        for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
+    corners = np.array(
+        [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
     pairs = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
     return corners[np.array(pairs)]

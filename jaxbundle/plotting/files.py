@@ -28,8 +28,14 @@ DRAWING = "drawing"
 """The stage of figures in reports of progress."""
 PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
 """Suffix of an id that is the name of a photograph; removed in names of figures."""
-FIGURES = ("plan.png", "perspective.png", "histogram.png",
-           "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
+FIGURES = (
+    "plan.png",
+    "perspective.png",
+    "histogram.png",
+    "residuals_*.png",
+    "distortion_*.png",
+    "correlations_*.png",
+)
 """Patterns of the names of the figures of a result."""
 PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
 """Patterns of the figures of pairs of photographs, and of the tracks in them."""
@@ -76,24 +82,38 @@ def draw_figures(adjustment, folder: Path, progress: Progress | None = None) -> 
         if n > 1:
             side = float(np.clip(2.2 + 0.42 * n, 4, 12))
             drawings[names("correlations", camera)] = (
-                (side + 0.8, side), None, correlation_matrix, (camera,)
-            )  # fmt: skip
-    return write_figures(folder, {
-        name: (size, projection, partial(draw, adjustment, *arguments))
-        for name, (size, projection, draw, arguments) in drawings.items()
-    }, progress)
+                (side + 0.8, side),
+                None,
+                correlation_matrix,
+                (camera,),
+            )
+    return write_figures(
+        folder,
+        {
+            name: (size, projection, partial(draw, adjustment, *arguments))
+            for name, (size, projection, draw, arguments) in drawings.items()
+        },
+        progress,
+    )
 
 
 def draw_pairs(
-    names: Sequence[str], pairs: Pairs, alone: Sequence[str], folder: Path,
+    names: Sequence[str],
+    pairs: Pairs,
+    alone: Sequence[str],
+    folder: Path,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Write the match graph and the overlap of photographs; arguments as of `match_graph`."""
     graph, overlap = (Path(name).stem for name in PAIRS)
-    return write_figures(folder, {
-        graph: ((7, 7), None, partial(match_graph, names, pairs, alone)),
-        overlap: ((7, 6), None, partial(overlap_matrix, names, pairs)),
-    }, progress)  # fmt: skip
+    return write_figures(
+        folder,
+        {
+            graph: ((7, 7), None, partial(match_graph, names, pairs, alone)),
+            overlap: ((7, 6), None, partial(overlap_matrix, names, pairs)),
+        },
+        progress,
+    )
 
 
 def draw_tracks(
@@ -106,12 +126,18 @@ def draw_tracks(
     images = adjustment.network.images.id
     chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_IMAGES)).astype(int))
     names = FigureNames(())
-    return write_figures(folder, {
-        names("tracks", images[k]): (
-            (8, 6), None,
-            lambda ax, id=images[k]: tracks_in_photograph(adjustment, id, read(id), ax),
-        ) for k in chosen
-    }, progress)  # fmt: skip
+    return write_figures(
+        folder,
+        {
+            names("tracks", images[k]): (
+                (8, 6),
+                None,
+                lambda ax, id=images[k]: tracks_in_photograph(adjustment, id, read(id), ax),
+            )
+            for k in chosen
+        },
+        progress,
+    )
 
 
 def write_figures(

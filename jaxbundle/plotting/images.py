@@ -49,29 +49,50 @@ def residual_vectors(adjustment, image: str, ax=None):
     factor = round_number(0.1 * diagonal / longest) if longest > 0 else 1.0
     large = (np.abs(tau) > LARGE_TAU).any(1)
     arrows = ax.quiver(
-        *xy.T, *v.T, angles="xy", scale_units="xy", scale=1 / factor, width=0.0028,
-        headwidth=3.5, headlength=4.5, headaxislength=4, minlength=0,
-        color=np.where(large, RUST, BLUE), zorder=3,
-    )  # fmt: skip
+        *xy.T,
+        *v.T,
+        angles="xy",
+        scale_units="xy",
+        scale=1 / factor,
+        width=0.0028,
+        headwidth=3.5,
+        headlength=4.5,
+        headaxislength=4,
+        minlength=0,
+        color=np.where(large, RUST, BLUE),
+        zorder=3,
+    )
     ax.scatter(*xy.T, s=5, color=INK, linewidths=0, zorder=4)
     if known:
         corner, sides = (low[0], low[1]), high - low
-        frame = Rectangle(
-            corner, *sides, fill=False, edgecolor=GREY, linewidth=1.2, zorder=2
-        )
+        frame = Rectangle(corner, *sides, fill=False, edgecolor=GREY, linewidth=1.2, zorder=2)
         ax.add_patch(frame)
     scale, unit = micrometres(model.unit)
     bar = round_number(scale * 0.1 * diagonal / factor) / scale
     ax.quiverkey(
-        arrows, 0.9, 1.035, bar, f"{scale * bar:g} {unit}", coordinates="axes", labelpos="N",
-        color=INK, labelcolor=INK, labelsep=0.05, fontproperties={"size": 8},
-    )  # fmt: skip
+        arrows,
+        0.9,
+        1.035,
+        bar,
+        f"{scale * bar:g} {unit}",
+        coordinates="axes",
+        labelpos="N",
+        color=INK,
+        labelcolor=INK,
+        labelsep=0.05,
+        fontproperties={"size": 8},
+    )
     if len(points) <= LABELLED // 2:
         for point, place in zip(points, xy):
             ax.annotate(
-                plain(point), place, xytext=(4, 4), textcoords="offset points", fontsize=7,
-                color=GREY, parse_math=False,
-            )  # fmt: skip
+                plain(point),
+                place,
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=7,
+                color=GREY,
+                parse_math=False,
+            )
     centre = principal_point(adjustment, given.id)
     if (low <= centre).all() and (centre <= high).all():
         ax.plot(*centre, "+", color=GREY, markersize=9, zorder=2)
@@ -106,8 +127,18 @@ def residual_histogram(adjustment, ax=None):
     reach = float(np.clip(np.ceil(np.abs(tau).max(initial=0.0)), 4, 6))
     edges = np.arange(-reach, reach + step / 2, step)
     counted = np.histogram(np.clip(tau, -reach, reach), edges)[0]
-    ax.bar(edges[:-1], counted, step, align="edge", color=BLUE, alpha=0.55, edgecolor="white",
-           linewidth=0.6, label=f"{len(tau)} observations", zorder=2)  # fmt: skip
+    ax.bar(
+        edges[:-1],
+        counted,
+        step,
+        align="edge",
+        color=BLUE,
+        alpha=0.55,
+        edgecolor="white",
+        linewidth=0.6,
+        label=f"{len(tau)} observations",
+        zorder=2,
+    )
     t = np.linspace(-reach, reach, 241)
     normal = len(tau) * step * np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi)
     ax.plot(t, normal, color=RUST, linewidth=1.4, label="normal distribution", zorder=3)

@@ -44,9 +44,14 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
         colour, line = KINDS[kind]
         share = verified / most
         ax.plot(
-            *np.stack([place[one], place[other]], 1), line, color=colour, alpha=0.25 + 0.6 * share,
-            linewidth=WIDEST_LINE * max(share, 0.1), label="" if kind in drawn else kind, zorder=2,
-        )  # fmt: skip
+            *np.stack([place[one], place[other]], 1),
+            line,
+            color=colour,
+            alpha=0.25 + 0.6 * share,
+            linewidth=WIDEST_LINE * max(share, 0.1),
+            label="" if kind in drawn else kind,
+            zorder=2,
+        )
         drawn.add(kind)
     at = np.array(list(place.values()))
     lonely = np.isin(names, list(alone))
@@ -54,13 +59,25 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
     if len(names) <= LABELLED:
         for name, angle in zip(names, turn):
             c, s = 1.06 * np.cos(angle), 1.06 * np.sin(angle)
-            ax.text(c, s, plain(name), fontsize=7, color=INK, parse_math=False,
-                    ha="center" if abs(c) < 0.2 else "left" if c > 0 else "right", va="center")
+            ax.text(
+                c,
+                s,
+                plain(name),
+                fontsize=7,
+                color=INK,
+                parse_math=False,
+                ha="center" if abs(c) < 0.2 else "left" if c > 0 else "right",
+                va="center",
+            )
     ax.set_axis_off()
     ax.set_aspect("equal")
     ax.margins(0.25)
-    title(ax, "Match graph", f"{len(names)} photographs, {len(pairs)} verified pairs, "
-          f"{most if pairs else 0} matches at most")  # fmt: skip
+    title(
+        ax,
+        "Match graph",
+        f"{len(names)} photographs, {len(pairs)} verified pairs, "
+        f"{most if pairs else 0} matches at most",
+    )
     if len(drawn) > 1:
         legend(ax, loc="lower right")
     return ax
@@ -85,8 +102,15 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
     if len(names) <= LABELLED // 3:
         for i, j in np.argwhere(np.isfinite(number)):
             dark = number[i, j] > 0.6 * np.nanmax(number)
-            ax.text(j, i, f"{number[i, j]:.0f}", ha="center", va="center", fontsize=7,
-                    color="white" if dark else INK)  # fmt: skip
+            ax.text(
+                j,
+                i,
+                f"{number[i, j]:.0f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                color="white" if dark else INK,
+            )
     quiet(ax, grid=False)
     title(ax, "Overlap", "verified matches of every two photographs")
     return ax
@@ -107,11 +131,24 @@ def tracks_in_photograph(adjustment, image: str, picture: UInt8[np.ndarray, "r c
     rows = problem.image == i
     xy = np.asarray(problem.data.image_xy)
     columns, height = problem.network.cameras[problem.network.images.camera[i]].image_size
-    ax.imshow(picture, cmap="gray", vmin=0, vmax=255, alpha=0.75,
-              extent=(-0.5, columns - 0.5, height - 0.5, -0.5))  # fmt: skip
+    ax.imshow(
+        picture,
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+        alpha=0.75,
+        extent=(-0.5, columns - 0.5, height - 0.5, -0.5),
+    )
     good = rows & used
-    shown = ax.scatter(*xy[good].T, s=7, c=rays[problem.point[good]], cmap="viridis", vmin=2,
-                       linewidths=0, zorder=3)  # fmt: skip
+    shown = ax.scatter(
+        *xy[good].T,
+        s=7,
+        c=rays[problem.point[good]],
+        cmap="viridis",
+        vmin=2,
+        linewidths=0,
+        zorder=3,
+    )
     bad = rows & ~used
     ax.scatter(*xy[bad].T, s=18, marker="x", color=RUST, linewidths=0.8, zorder=4)
     ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="photographs that show the point")

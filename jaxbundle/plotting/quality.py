@@ -39,9 +39,13 @@ def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
     ax = axes(ax, (7, 5.6))
     w, h = image_size
     shown = ax.imshow(
-        np.ma.masked_equal(coverage.counts, 0), cmap="Blues", vmin=0, alpha=0.85,
-        extent=(-0.5, w - 0.5, h - 0.5, -0.5), interpolation="nearest",
-    )  # fmt: skip
+        np.ma.masked_equal(coverage.counts, 0),
+        cmap="Blues",
+        vmin=0,
+        alpha=0.85,
+        extent=(-0.5, w - 0.5, h - 0.5, -0.5),
+        interpolation="nearest",
+    )
     ax.plot(*uv.T, ".", color=INK, markersize=1.2, alpha=0.5)
     _frame(ax, image_size)
     bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
@@ -96,10 +100,18 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
     u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
     levels = np.geomspace(low, high, 13)
     u, v, sigma = _smooth(u, v, sigma)
-    shown = ax.contourf(u, v, np.ma.masked_invalid(sigma), levels, cmap="viridis",
-                        norm=LogNorm(low, high), extend="both")  # fmt: skip
-    lines = ax.contour(u, v, np.ma.masked_invalid(sigma), levels[2:-1:3], colors="white",
-                       linewidths=0.7)  # fmt: skip
+    shown = ax.contourf(
+        u,
+        v,
+        np.ma.masked_invalid(sigma),
+        levels,
+        cmap="viridis",
+        norm=LogNorm(low, high),
+        extend="both",
+    )
+    lines = ax.contour(
+        u, v, np.ma.masked_invalid(sigma), levels[2:-1:3], colors="white", linewidths=0.7
+    )
     places = _label_places(lines, np.array(image_size))
     if places:
         ax.clabel(lines, fmt="%.2g", fontsize=7, manual=places)
@@ -142,13 +154,26 @@ def uncertainty_curve(
             known, there = np.isfinite(values), np.isfinite(away)
             ax.plot(away[there & known], values[there & known], "o", color=colour, markersize=5)
             for x, y in zip(away[there & known], values[there & known]):
-                ax.annotate(f"{y:.3g}", (x, y), xytext=(5, 5), textcoords="offset points",
-                            fontsize=7, color=colour)  # fmt: skip
+                ax.annotate(
+                    f"{y:.3g}",
+                    (x, y),
+                    xytext=(5, 5),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color=colour,
+                )
             for y in values[known & ~there]:
                 ax.axhline(y, color=colour, linewidth=0.8, linestyle=":")
-                ax.annotate(f"{y:.3g} at infinity", (1, y), xycoords=("axes fraction", "data"),
-                            xytext=(-4, 3), textcoords="offset points", ha="right", fontsize=7,
-                            color=colour)  # fmt: skip
+                ax.annotate(
+                    f"{y:.3g} at infinity",
+                    (1, y),
+                    xycoords=("axes fraction", "data"),
+                    xytext=(-4, 3),
+                    textcoords="offset points",
+                    ha="right",
+                    fontsize=7,
+                    color=colour,
+                )
     quiet(ax)
     label(ax, "x", "distance", unit)
     label(ax, "y", "σ of a projected point", "px")

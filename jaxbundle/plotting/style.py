@@ -53,7 +53,7 @@ def axes_3d(ax, size: tuple[float, float]):
 
         ax = pyplot.figure(figsize=size, layout="constrained").add_subplot(projection="3d")
     if not isinstance(ax, Axes3D):
-        raise ValueError("a perspective view needs 3D axes: add_subplot(projection=\"3d\")")
+        raise ValueError('a perspective view needs 3D axes: add_subplot(projection="3d")')
     return ax
 
 

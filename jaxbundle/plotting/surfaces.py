@@ -50,8 +50,13 @@ def dsm_relief(dsm: Dsm, ax=None):
     down, right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
     azimuth, elevation = SUN
     # the normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows
-    light = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
-                      np.sin(elevation)])  # fmt: skip
+    light = np.array(
+        [
+            np.sin(azimuth) * np.cos(elevation),
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ]
+    )
     shade = (-right * light[0] + down * light[1] + light[2]) / np.sqrt(1 + right**2 + down**2)
     low, high = np.nanpercentile(dsm.height, [1, 99])
     colour = colormaps["terrain"](np.clip((Z - low) / max(high - low, 1e-9), 0, 1) * 0.8 + 0.1)

@@ -41,8 +41,9 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
         return [f"{value:.{max(places, 0)}f}" for value in values]
     exponent = math.floor(math.log10(largest) + 1e-9)  # one for all ticks of an axis
     shown = max(exponent + places, 0)
-    return [f"{value / 10.0**exponent:.{shown}f}e{exponent:+03d}" if value else "0"
-            for value in values]  # fmt: skip
+    return [
+        f"{value / 10.0**exponent:.{shown}f}e{exponent:+03d}" if value else "0" for value in values
+    ]
 
 
 def _places(values: Float[np.ndarray, " n"]) -> int:

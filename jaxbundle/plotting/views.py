@@ -66,8 +66,14 @@ def network_plan(adjustment, ax=None):
     for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
-            ax.scatter(chosen[:, 0], chosen[:, 1], label=f"{role} points", linewidths=0, zorder=5,
-                       **_lighter(role, len(points["id"])))  # fmt: skip
+            ax.scatter(
+                chosen[:, 0],
+                chosen[:, 1],
+                label=f"{role} points",
+                linewidths=0,
+                zorder=5,
+                **_lighter(role, len(points["id"])),
+            )
     ellipses, selection = _draw_ellipses(adjustment, ax, size)
     away = centres - pyramids[:, 1:].mean(1)
     drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
@@ -81,10 +87,21 @@ def network_plan(adjustment, ax=None):
         label_coordinates(ax, name, unit)
     title(ax, f"{adjustment.network.name}: plan", selection and f"error ellipses {selection}")
     below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
-    legend(ax, loc="upper left", bbox_to_anchor=(0, 0), bbox_transform=below, ncols=5,
-           frameon=False, borderaxespad=0, handletextpad=0.3, columnspacing=1.5)  # fmt: skip
-    ids = [(adjustment.images["id"], centres, INK, LABELLED // 2, away / size),
-           (points["id"], points["xyz"], BLUE, LABELLED, None)]  # fmt: skip
+    legend(
+        ax,
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        bbox_transform=below,
+        ncols=5,
+        frameon=False,
+        borderaxespad=0,
+        handletextpad=0.3,
+        columnspacing=1.5,
+    )
+    ids = [
+        (adjustment.images["id"], centres, INK, LABELLED // 2, away / size),
+        (points["id"], points["xyz"], BLUE, LABELLED, None),
+    ]
     places = np.concatenate([centres, points["xyz"][: 50 * LABELLED]])[:, :2]
     _write_ids(ax, [table for table in ids if len(table[0]) <= table[3]], places)
     return ax
@@ -108,8 +125,13 @@ def network_perspective(adjustment, ax=None):
     for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
-            ax.scatter(*chosen.T, label=f"{role} points", linewidths=0, depthshade=False,
-                       **_lighter(role, len(points["id"])))  # fmt: skip
+            ax.scatter(
+                *chosen.T,
+                label=f"{role} points",
+                linewidths=0,
+                depthshade=False,
+                **_lighter(role, len(points["id"])),
+            )
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
@@ -233,8 +255,10 @@ class Ellipses(NamedTuple):
         drawn = len(self.rows)
         if drawn == self.total:
             return ""
-        return (f"of {drawn} of {self.total} points: the {LARGEST_ELLIPSES} largest and "
-                f"{drawn - LARGEST_ELLIPSES} others")  # fmt: skip
+        return (
+            f"of {drawn} of {self.total} points: the {LARGEST_ELLIPSES} largest and "
+            f"{drawn - LARGEST_ELLIPSES} others"
+        )
 
 
 def choose_ellipses(adjustment, size: float) -> Ellipses:
@@ -290,10 +314,13 @@ def _draw_ellipses(adjustment, ax, size: float) -> tuple[np.ndarray, str]:
         return np.zeros((0, 1, 2)), ""
     polygons = error_ellipses(adjustment, ellipses)
     drawn = LineCollection(
-        list(polygons), colors=BLUE, linewidths=0.8, zorder=3,
+        list(polygons),
+        colors=BLUE,
+        linewidths=0.8,
+        zorder=3,
         alpha=0.8 if len(ellipses.rows) == ellipses.total else 0.5,
         label=f"error ellipses (1σ, {PROBABILITY[2]}) {ellipses.exaggeration}",
-    )  # fmt: skip
+    )
     ax.add_collection(drawn)
     return polygons, ellipses.selection
 
@@ -320,11 +347,18 @@ def _write_ids(ax, tables, places) -> None:
             taken.append(boxes[best])
             left, right, low, top = boxes[best]
             ax.annotate(
-                text, place[:2], xytext=((0.5 * (left + right) - x) / dots,
-                                         (0.5 * (low + top) - y) / dots),
-                textcoords="offset points", fontsize=7, color=colour, parse_math=False,
-                annotation_clip=True, zorder=6, ha="center", va="center",
-            )  # fmt: skip
+                text,
+                place[:2],
+                xytext=((0.5 * (left + right) - x) / dots, (0.5 * (low + top) - y) / dots),
+                textcoords="offset points",
+                fontsize=7,
+                color=colour,
+                parse_math=False,
+                annotation_clip=True,
+                zorder=6,
+                ha="center",
+                va="center",
+            )
 
 
 def _box(x, y, wide, high, gap, turn):

@@ -118,9 +118,11 @@ def simulate_accuracy(
     covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
     length = np.linalg.norm(errors, axis=2)
     return GroundAccuracy(
-        covariance, np.sqrt(np.mean(length**2, 0)), np.quantile(length, 0.9, axis=0),
+        covariance,
+        np.sqrt(np.mean(length**2, 0)),
+        np.quantile(length, 0.9, axis=0),
         float(np.quantile(length, 0.9)),
-    )  # fmt: skip
+    )
 
 
 def ground_errors(
@@ -174,10 +176,10 @@ def _covariances(image, surface, lines, pixels, sigma):
         X0 = locate_point(image, surface, line, pixel)
         axes = east_north(surface, X0)
         move = lambda errors: horizontal(
-            axes, X0, locate_point(
-                add_errors(image, nothing._replace(**errors)), surface, line, pixel
-            ),
-        )  # fmt: skip
+            axes,
+            X0,
+            locate_point(add_errors(image, nothing._replace(**errors)), surface, line, pixel),
+        )
         J = jax.jacrev(move)(zero)
         parts = [(J[name] * sigma[name]).reshape(2, -1) for name in sigma]
         return sum((part @ part.T for part in parts), jnp.zeros((2, 2)))

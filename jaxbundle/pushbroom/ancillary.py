@@ -61,9 +61,7 @@ def position_table(
         raise InputError(
             f"{source.name}: 'hermite' needs velocities; give VX, VY, VZ or another interpolation"
         )
-    return _table(
-        times, positions, velocities, method, order, gap, extrapolate, "position", source
-    )  # fmt: skip
+    return _table(times, positions, velocities, method, order, gap, extrapolate, "position", source)
 
 
 def attitude_table(
@@ -165,9 +163,10 @@ def warn_of_extrapolation(
         return ()
     number = int(((times < rows[0] - ROUNDING) | (times > rows[-1] + ROUNDING)).sum())
     where = " and ".join(
-        f"{value:.6g} s {text}" for value, text in ((before, "at its start"), (after, "at its end"))
+        f"{value:.6g} s {text}"
+        for value, text in ((before, "at its start"), (after, "at its end"))
         if value > ROUNDING
-    )  # fmt: skip
+    )
     return (
         f"{source.name}: the table does not cover the whole image: extrapolated by {where} "
         f"({number} of {len(times)} lines; up to {limit:.6g} s are allowed)",
@@ -187,9 +186,7 @@ def check_span(rows, extrapolate, times, source, thing="image line") -> None:
         )
 
 
-def check_covered(
-    table: Table, times: Numbers, source: Source, thing: str = "image line"
-) -> None:
+def check_covered(table: Table, times: Numbers, source: Source, thing: str = "image line") -> None:
     """Refuse a table that does not cover the times, or has a gap among them.
 
     `source` names the table and its rows, `thing` what the times belong to.

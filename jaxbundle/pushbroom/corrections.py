@@ -96,9 +96,7 @@ def earlier_earth(v: Vector, distance: Scalar) -> Triple:
     return cosine * v[0] - sine * v[1], sine * v[0] + cosine * v[1], v[2]
 
 
-def refract(
-    earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector
-) -> tuple[Triple, Triple]:
+def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tuple[Triple, Triple]:
     """The last straight part of a ray down to a `height`: its origin and direction.
 
     The air bends the ray over all heights, by dN/dh of N = n − 1. With N₁ at the origin and N₂ at

@@ -97,7 +97,9 @@ def turn_positions(
 
 
 def turn_positions(
-    R: Matrices, positions: Rows, velocities: Rows | None = None,
+    R: Matrices,
+    positions: Rows,
+    velocities: Rows | None = None,
     orientation: EarthOrientation = EarthOrientation(),  # noqa: B008
 ) -> tuple[Rows, Rows | None]:
     """Earth-fixed positions, and velocities relative to the turning Earth, of inertial ones."""

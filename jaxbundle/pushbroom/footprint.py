@@ -45,9 +45,7 @@ SLOPE_MARGIN = 1.2
 """Slopes are tested this factor beyond those of the lattice points."""
 LARGEST_ERROR = 50.0
 """Allowed error of the polynomials, in lines and pixels."""
-POWERS = np.array([
-    (i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)
-])  # fmt: skip
+POWERS = np.array([(i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)])
 
 
 class Footprint(eqx.Module):
@@ -76,9 +74,12 @@ class Footprint(eqx.Module):
 
 
 def make_footprint(
-    image, pieces: Pieces, samples: Float[AnyArray, " k"], line: Float[AnyArray, " 6"],
+    image,
+    pieces: Pieces,
+    samples: Float[AnyArray, " k"],
+    line: Float[AnyArray, " 6"],
     earth: Ellipsoid | None,
-) -> Footprint | None:  # fmt: skip
+) -> Footprint | None:
     """The footprint, or None if it is not certain that every point is seen once."""
     heights = _heights(image, earth)
     if heights is None:
@@ -164,9 +165,9 @@ def _fit(D, times, u, heights):
     x = (points - middle) @ A.T
     terms = np.prod(x[:, None, :] ** POWERS, axis=2)
     shape = D.shape[:3]
-    tu = np.stack([
-        np.broadcast_to(times[:, None, None], shape), np.broadcast_to(u[None, :, None], shape)
-    ], -1).reshape(-1, 2)  # fmt: skip
+    tu = np.stack(
+        [np.broadcast_to(times[:, None, None], shape), np.broadcast_to(u[None, :, None], shape)], -1
+    ).reshape(-1, 2)
     coefficients = np.linalg.lstsq(terms, tu, rcond=None)[0]
     errors = np.abs(terms @ coefficients - tu).max(0)
     frame = np.c_[A, -A @ middle]
@@ -189,6 +190,5 @@ def _reach(pieces, samples, D):
 def _cubic(c, x, y, z):
     """The cubic polynomial with coefficients in the order of `POWERS`, Horner in all three."""
     c = iter(c)
-    rows = [[value([next(c) for _ in range(4 - i - j)], z) for j in range(4 - i)]
-            for i in range(4)]  # fmt: skip
+    rows = [[value([next(c) for _ in range(4 - i - j)], z) for j in range(4 - i)] for i in range(4)]
     return value([value(row, y) for row in rows], x)

@@ -130,9 +130,7 @@ def recorded_pose(image: PushbroomImage, t: Scalar) -> Pose:
     return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
 
 
-def move_pose(
-    given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
-) -> Pose:
+def move_pose(given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]) -> Pose:
     """The pose of the camera, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)
     R = given.R @ turn @ matrix_from_pitch_roll_yaw(mounting)

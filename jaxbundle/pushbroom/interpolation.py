@@ -88,9 +88,15 @@ def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]
     t = table.times[:-1, None] + jnp.diff(table.times)[:, None] * _chebyshev(nodes)
     pieces = jax.vmap(jax.vmap(value))(t)
     return Table(
-        table.times, table.values, None, table.gap, "lagrange", table.order, table.extrapolate,
+        table.times,
+        table.values,
+        None,
+        table.gap,
+        "lagrange",
+        table.order,
+        table.extrapolate,
         pieces,
-    )  # fmt: skip
+    )
 
 
 def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
@@ -155,9 +161,11 @@ def spline_rates(
     )
     right = jnp.where(first[:, None], forward[2], jnp.where(last[:, None], back[2], inner))
     return tridiagonal_solve(
-        choose(0.0, back[1], after), choose(forward[0], back[0], 2 * (before + after)),
-        choose(forward[1], 0.0, before), right,
-    )  # fmt: skip
+        choose(0.0, back[1], after),
+        choose(forward[0], back[0], 2 * (before + after)),
+        choose(forward[1], 0.0, before),
+        right,
+    )
 
 
 def _end_rows(step, slope, first, last):
@@ -173,9 +181,9 @@ def _end_rows(step, slope, first, last):
     ending = lambda by: jnp.concatenate([last[by:], jnp.ones(by, bool)])
     two, three = ending(1), ending(2)
     short = last | two | three
-    right = jnp.where(last[:, None], 0.0, jnp.where(
-        two[:, None], s0, jnp.where(three[:, None], parabola, knot)
-    ))  # fmt: skip
+    right = jnp.where(
+        last[:, None], 0.0, jnp.where(two[:, None], s0, jnp.where(three[:, None], parabola, knot))
+    )
     return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both), right
 
 

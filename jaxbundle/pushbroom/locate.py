@@ -20,17 +20,13 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
 
 
-def locate_point(
-    image: PushbroomImage, surface: Surface, line: Scalar, pixel: Scalar
-) -> Triple:
+def locate_point(image: PushbroomImage, surface: Surface, line: Scalar, pixel: Scalar) -> Triple:
     """The point (X, Y, Z), in metres, of an image position; NaN if the ray misses."""
     pose = pose_at(image, image.times.time(line))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
-def ground_point(
-    pose: Pose, slopes: Pair, surface: Surface, corrections: Corrections
-) -> Triple:
+def ground_point(pose: Pose, slopes: Pair, surface: Surface, corrections: Corrections) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
     o, d = P, rotate(R, (*slopes, -1.0))

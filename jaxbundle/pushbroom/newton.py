@@ -152,6 +152,8 @@ def _round(image, pieces, earth, X, t, u):
 def _component(numbers, D, i):
     """Component i of M·D + m."""
     return (
-        numbers[3 * i] * D[0] + numbers[3 * i + 1] * D[1] + numbers[3 * i + 2] * D[2]
+        numbers[3 * i] * D[0]
+        + numbers[3 * i + 1] * D[1]
+        + numbers[3 * i + 2] * D[2]
         + numbers[9 + i]
-    )  # fmt: skip
+    )

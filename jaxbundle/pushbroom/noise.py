@@ -62,10 +62,12 @@ def zero_errors(image: PushbroomImage) -> Errors:
 
 def sigmas(image: PushbroomImage, noise: Noise) -> Errors:
     """The standard deviation of every single error."""
-    return Errors(*(
-        np.broadcast_to(np.asarray(sigma, float), zero.shape)
-        for sigma, zero in zip(noise, zero_errors(image))
-    ))  # fmt: skip
+    return Errors(
+        *(
+            np.broadcast_to(np.asarray(sigma, float), zero.shape)
+            for sigma, zero in zip(noise, zero_errors(image))
+        )
+    )
 
 
 def draw(sigma: Errors, key: AnyArray) -> Errors:
@@ -87,17 +89,27 @@ def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     offsets = image.offsets
     return eqx.tree_at(
         lambda i: (
-            i.trajectory.attitude.table.values, i.trajectory.position.values, i.offsets.attitude,
-            i.offsets.attitude_rate, i.offsets.position, i.offsets.position_rate,
-        ), image, (
-            jax.vmap(turn)(attitude.values, errors.attitude_white)
-            if len(errors.attitude_white) else attitude.values,
-            position.values + errors.position_white
-            if len(errors.position_white) else position.values,
-            offsets.attitude + errors.attitude_bias, offsets.attitude_rate + errors.attitude_drift,
-            offsets.position + errors.position_bias, offsets.position_rate + errors.position_drift,
+            i.trajectory.attitude.table.values,
+            i.trajectory.position.values,
+            i.offsets.attitude,
+            i.offsets.attitude_rate,
+            i.offsets.position,
+            i.offsets.position_rate,
         ),
-    )  # fmt: skip
+        image,
+        (
+            jax.vmap(turn)(attitude.values, errors.attitude_white)
+            if len(errors.attitude_white)
+            else attitude.values,
+            position.values + errors.position_white
+            if len(errors.position_white)
+            else position.values,
+            offsets.attitude + errors.attitude_bias,
+            offsets.attitude_rate + errors.attitude_drift,
+            offsets.position + errors.position_bias,
+            offsets.position_rate + errors.position_drift,
+        ),
+    )
 
 
 def _rotate_quaternion(q, error):

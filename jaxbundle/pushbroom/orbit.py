@@ -51,10 +51,15 @@ def state_orbit(
         if not len(when):
             continue
         found = solve_ivp(
-            lambda t, y: np.r_[y[3:], acceleration(y[:3], j2)], (at, when[-1]), start, "DOP853",
-            t_eval=when, rtol=TOLERANCE, atol=TOLERANCE * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
+            lambda t, y: np.r_[y[3:], acceleration(y[:3], j2)],
+            (at, when[-1]),
+            start,
+            "DOP853",
+            t_eval=when,
+            rtol=TOLERANCE,
+            atol=TOLERANCE * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
             events=_ground,
-        )  # fmt: skip
+        )
         if found.status:
             raise InputError(
                 f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "

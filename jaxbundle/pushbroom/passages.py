@@ -45,9 +45,7 @@ slopes = compile_once(lambda optics, u: optics.slopes(u), ())
 
 def ahead(numbers, D, along):
     """(F, ξ): the slope by which a sight D is ahead of the detectors; NaN behind the camera."""
-    r, s, q = (
-        sum(numbers[3 * i + k] * D[k] for k in range(3)) + numbers[9 + i] for i in range(3)
-    )
+    r, s, q = (sum(numbers[3 * i + k] * D[k] for k in range(3)) + numbers[9 + i] for i in range(3))
     front = q < 0
     q = jnp.where(front, q, -1.0)
     xi = -r / q
@@ -86,19 +84,27 @@ def passages(image, search, X, most, margin):
         once, twice, places = _zeros(before, value, rate_before * h, rate * h)
         new = once + 2 * twice
         starts = tuple(
-            jnp.select([(count + j == i) & (new > j) for j in range(2)],
-                       [t_before + h * s for s in places], start)
+            jnp.select(
+                [(count + j == i) & (new > j) for j in range(2)],
+                [t_before + h * s for s in places],
+                start,
+            )
             for i, start in enumerate(starts)
-        )  # fmt: skip
+        )
         first = jnp.where(k == 0, value, first)
         return (value, rate, t, count + new, starts, first, risen), None
 
     zero = jnp.zeros_like(X[0])
     nowhere, never = zero * jnp.nan, zero > 1
     state = (
-        nowhere, zero, samples[0], zero.astype(int), (zero,) * most, nowhere,
+        nowhere,
+        zero,
+        samples[0],
+        zero.astype(int),
+        (zero,) * most,
+        nowhere,
         never if up is not None else ~never,
-    )  # fmt: skip
+    )
     unroll = 1 if image.corrections.any else 4
     (final, _, _, count, starts, first, risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll

@@ -43,10 +43,15 @@ CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
 """Check times between the nodes and at the ends, where the polynomial error is largest."""
 TO_COEFFICIENTS = np.linalg.inv(np.vander(NODES, increasing=True))
 TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
-TO_HALVES = np.array([
-    [[comb(k, j) * side ** (k - j) / 2**k for k in range(DEGREE + 1)] for j in range(DEGREE + 1)]
-    for side in (-1.0, 1.0)
-])  # fmt: skip
+TO_HALVES = np.array(
+    [
+        [
+            [comb(k, j) * side ** (k - j) / 2**k for k in range(DEGREE + 1)]
+            for j in range(DEGREE + 1)
+        ]
+        for side in (-1.0, 1.0)
+    ]
+)
 """From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 

@@ -267,9 +267,10 @@ def _search(image, search, X, most, margin):
         start, there = args
         middle = jnp.zeros_like(start) + (image.pixels - 1) / 2
         return jax.lax.cond(
-            jnp.any(there), lambda: refine(image, search.pieces, search.earth, X, start, middle),
+            jnp.any(there),
+            lambda: refine(image, search.pieces, search.earth, X, start, middle),
             lambda: (start, start, start != start),
-        )  # fmt: skip
+        )
 
     # a loop: all passages share one compiled Newton's method
     t, u, settled = jax.lax.map(place, (starts, there))
@@ -281,11 +282,19 @@ def _search(image, search, X, most, margin):
     number = seen.sum(0) + jnp.maximum(count - most, 0)
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
-        [jnp.asarray(int(s)) for s in (
-            Status.SEEN, Status.HIDDEN, Status.NOT_CONVERGED, Status.BESIDE, Status.AFTER,
-            Status.BEFORE,
-        )], int(Status.HIDDEN),
-    )  # fmt: skip
+        [
+            jnp.asarray(int(s))
+            for s in (
+                Status.SEEN,
+                Status.HIDDEN,
+                Status.NOT_CONVERGED,
+                Status.BESIDE,
+                Status.AFTER,
+                Status.BEFORE,
+            )
+        ],
+        int(Status.HIDDEN),
+    )
     return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
 
 

@@ -92,18 +92,18 @@ def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tu
     return _image(rpc, *normalise(rpc, longitude, latitude, height))
 
 
-def locate(
-    rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar
-) -> tuple[Array, Array, Array]:
+def locate(rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar) -> tuple[Array, Array, Array]:
     """Longitude and latitude, radians, of an image position at a height; and its `RpcStatus`.
 
     NaN if Newton's method does not converge.
     """
     H = (height - rpc.height_offset) / rpc.height_scale
-    target = jnp.stack([
-        (line - rpc.line_offset) / rpc.line_scale,
-        (sample - rpc.sample_offset) / rpc.sample_scale,
-    ])  # fmt: skip
+    target = jnp.stack(
+        [
+            (line - rpc.line_offset) / rpc.line_scale,
+            (sample - rpc.sample_offset) / rpc.sample_scale,
+        ]
+    )
     held = stop_gradient((rpc, H, target))
 
     def newton(_, state):
@@ -180,6 +180,7 @@ def sight(
 
     Earth-fixed, metres; the direction is a unit vector.
     """
+
     def point(height):
         longitude, latitude, _ = locate(rpc, line, sample, height)
         return jnp.stack(earth_fixed(earth, (longitude, latitude, height)))
@@ -223,10 +224,27 @@ def locate_points_on(
 def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     """The 20 terms in the order of RPC00B."""
     return (
-        1.0 + 0 * L, L, P, H, L * P, L * H, P * H, L * L, P * P, H * H, P * L * H,
-        L * L * L, L * P * P, L * H * H, L * L * P, P * P * P, P * H * H, L * L * H, P * P * H,
+        1.0 + 0 * L,
+        L,
+        P,
+        H,
+        L * P,
+        L * H,
+        P * H,
+        L * L,
+        P * P,
+        H * H,
+        P * L * H,
+        L * L * L,
+        L * P * P,
+        L * H * H,
+        L * L * P,
+        P * P * P,
+        P * H * H,
+        L * L * H,
+        P * P * H,
         H * H * H,
-    )  # fmt: skip
+    )
 
 
 def normalise(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
@@ -265,6 +283,6 @@ def _inside(values):
 def _solve(J, v):
     """J⁻¹·v of 2 × 2."""
     determinant = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
-    return jnp.stack([
-        J[1, 1] * v[0] - J[0, 1] * v[1], J[0, 0] * v[1] - J[1, 0] * v[0]
-    ]) / determinant  # fmt: skip
+    return (
+        jnp.stack([J[1, 1] * v[0] - J[0, 1] * v[1], J[0, 0] * v[1] - J[1, 0] * v[0]]) / determinant
+    )

@@ -62,9 +62,9 @@ def compare_with_rpc(
     found = []
     for corrections in sets:
         # without `jit`: a program of two hundred points would be compiled for each set
-        point = lambda pose, slopes, h, on=corrections: (
-            ground_point(pose, slopes, Height(level=h, earth=WGS84), on)
-        )  # fmt: skip
+        point = lambda pose, slopes, h, on=corrections: ground_point(
+            pose, slopes, Height(level=h, earth=WGS84), on
+        )
         here, along, across = np.split(np.stack(jax.vmap(point)(*sights)), 3, axis=1)
         seen = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*here)
         off = np.stack([np.asarray(seen[0]) - line, np.asarray(seen[1]) - pixel])
@@ -74,8 +74,9 @@ def compare_with_rpc(
         rms = lambda values, known=known: float(np.sqrt(np.mean(values[known] ** 2)))
         found.append(
             Agreement(rms(ground), float(ground[known].max()), rms(off))
-            if known.any() else Agreement(np.nan, np.nan, np.nan)
-        )  # fmt: skip
+            if known.any()
+            else Agreement(np.nan, np.nan, np.nan)
+        )
     return found
 
 

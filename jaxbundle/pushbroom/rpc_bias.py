@@ -13,7 +13,6 @@ For correlated observations (Baarda, 1968), with Q the cofactors of the unknowns
     Qv = P⁻¹ − A·Q·Aᵀ,      r = diag(Qv·P),      w = (P·v)ᵢ/√(P·Qv·P)ᵢᵢ.
 """
 
-
 from functools import partial
 
 import equinox as eqx
@@ -201,10 +200,13 @@ def _check_domain(rpc, control, source):
 
 def _terms(rpc, line, sample):
     """1, l̂, ŝ."""
-    return jnp.stack([
-        1.0 + 0 * line, (line - rpc.line_offset) / rpc.line_scale,
-        (sample - rpc.sample_offset) / rpc.sample_scale,
-    ])  # fmt: skip
+    return jnp.stack(
+        [
+            1.0 + 0 * line,
+            (line - rpc.line_offset) / rpc.line_scale,
+            (sample - rpc.sample_offset) / rpc.sample_scale,
+        ]
+    )
 
 
 @partial(compile_once, static=())

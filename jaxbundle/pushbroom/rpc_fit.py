@@ -174,7 +174,7 @@ def image_table(
             row = int(bad.argmax())
             raise InputError(
                 f"the ray of line {lines[row]:g}, pixel {pixels[row]:g} misses the height "
-            f"{height:g} m; check attitude, mounting and heights"
+                f"{height:g} m; check attitude, mounting and heights"
             )
         layers.append(np.stack([*place, lines, pixels]))
     return RpcTable(*np.concatenate(layers, axis=1))
@@ -218,9 +218,12 @@ def _offsets(table: RpcTable) -> dict[str, float]:
     mean = np.angle(np.mean(np.exp(1j * table.longitude)))
     east = np.degrees(mean + np.angle(np.exp(1j * (table.longitude - mean))))
     columns = {
-        "line": table.line, "sample": table.sample, "longitude": east,
-        "latitude": np.degrees(table.latitude), "height": table.height,
-    }  # fmt: skip
+        "line": table.line,
+        "sample": table.sample,
+        "longitude": east,
+        "latitude": np.degrees(table.latitude),
+        "height": table.height,
+    }
     offsets = {}
     for name, column in columns.items():
         low, high = float(column.min()), float(column.max())

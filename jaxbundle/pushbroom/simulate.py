@@ -100,14 +100,17 @@ def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
 
     zero = jax.tree.map(jnp.zeros_like, errors)
     attitude, position = image.trajectory.attitude.table, image.trajectory.position
-    return add_errors(image, zero._replace(
-        attitude_white=rows(
-            attitude, errors.attitude_bias, errors.attitude_drift, errors.attitude_white
+    return add_errors(
+        image,
+        zero._replace(
+            attitude_white=rows(
+                attitude, errors.attitude_bias, errors.attitude_drift, errors.attitude_white
+            ),
+            position_white=rows(
+                position, errors.position_bias, errors.position_drift, errors.position_white
+            ),
         ),
-        position_white=rows(
-            position, errors.position_bias, errors.position_drift, errors.position_white
-        ),
-    ))  # fmt: skip
+    )
 
 
 def take_image(
@@ -134,9 +137,13 @@ _resample = compile_once(resample, 3)
 def _image(flight, position, attitude):
     times = LineTimes(jnp.zeros(()), jnp.asarray(float(flight.period)))
     return make_image(
-        Trajectory(position, attitude), times, flight.optics, flight.lines, flight.pixels,
+        Trajectory(position, attitude),
+        times,
+        flight.optics,
+        flight.lines,
+        flight.pixels,
         flight.mounting,
-    )  # fmt: skip
+    )
 
 
 def _samples(flight, rate):
@@ -149,8 +156,9 @@ def _position(flight, rate, method):
     t, track = _samples(flight, rate), dict(flight.track)
     if "start" in track:
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
-        return position_table(t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)),
-                              method="linear")  # fmt: skip
+        return position_table(
+            t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)), method="linear"
+        )
     if "state" in track:
         state = np.asarray(track.pop("state"), float)
         return position_table(t, *state_orbit(t, state[:3], state[3:], **track), method=method)

@@ -34,8 +34,11 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
 TRAJECTORIES = {
-    "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw",), "3 axes": ("pitch", "roll", "yaw"),
-}  # fmt: skip
+    "roll": ("roll",),
+    "pitch": ("pitch",),
+    "yaw": ("yaw",),
+    "3 axes": ("pitch", "roll", "yaw"),
+}
 FLOORS = ("linear", "spline")
 SIGMAS = (math.radians(0.01), math.radians(0.1))
 """Default accuracies of attitudes, radians."""
@@ -116,19 +119,27 @@ def accuracy_table(
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # above a plane, near the nadir, errors along and across are almost alike
             round_ = circular_error(np.eye(2) * level**2 / 2)
-            erring.append(Erring(
-                name, float(sigma), counted.overall, exact.overall, level, counted.overall_ce90,
-                exact.overall_ce90, round_,
-            ))  # fmt: skip
+            erring.append(
+                Erring(
+                    name,
+                    float(sigma),
+                    counted.overall,
+                    exact.overall,
+                    level,
+                    counted.overall_ce90,
+                    exact.overall_ce90,
+                    round_,
+                )
+            )
     return AccuracyTable(altitude, view, kind, draws, error_free, erring)
 
 
 def altitude_and_view(image: PushbroomImage, surface: Surface) -> tuple[float, float]:
     """Height of the middle line above the surface, metres, and the angle of the line, radians."""
     P = np.asarray(_position(image))
-    ground = np.asarray(_locate(image, surface, *(np.array([(n - 1) / 2]) for n in (
-        image.lines, image.pixels
-    ))))[:, 0]  # fmt: skip
+    ground = np.asarray(
+        _locate(image, surface, *(np.array([(n - 1) / 2]) for n in (image.lines, image.pixels)))
+    )[:, 0]
     heights = [float(surface.height(tuple(X))) for X in (P, ground)]
     edges = np.array([-0.5, image.pixels - 0.5])
     left, right = (np.append(slope, -1.0) for slope in np.stack(_slopes(image.optics, edges), 1))

@@ -119,9 +119,14 @@ def make_terrain(
     heights = np.where(np.isfinite(heights), heights, np.nan)
     (x, y), (dx, dy) = origin, step
     return Terrain(
-        heights=jnp.asarray(heights), origin=(float(x), float(y)), step=(float(dx), float(dy)),
-        lowest=low, highest=high, earth=earth, over_voids=over_voids,
-    )  # fmt: skip
+        heights=jnp.asarray(heights),
+        origin=(float(x), float(y)),
+        step=(float(dx), float(dy)),
+        lowest=low,
+        highest=high,
+        earth=earth,
+        over_voids=over_voids,
+    )
 
 
 def _above_ground(s, _, data):
@@ -183,9 +188,7 @@ def _first_hit(path, heights, over_voids):
         middle = (tau + out) / 2
         x, y = value(px, middle), value(py, middle)
         cell = _cell(heights, jnp.floor(x), jnp.floor(y))
-        f = [
-            value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)
-        ]
+        f = [value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)]
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)

@@ -115,9 +115,10 @@ def adjust_weighted(
             return found or clearer
         if clearer.adjustment.converged and _is_better(clearer, found if solved else None):
             return dataclasses.replace(
-                clearer, agreeing=_count_agreeing(network, clearer),
+                clearer,
+                agreeing=_count_agreeing(network, clearer),
                 unused=len(network.points) - len(clear.points),
-            )  # fmt: skip
+            )
     assert found is not None, "an attempt ends with a result or an error"
     if solved and _removed_many(found.adjustment):
         raise NotSolvedError(
@@ -224,8 +225,9 @@ def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0
         doubtful = _name(result, ~used.any(1))
-    kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
-            if (kinds == k).any()}  # fmt: skip
+    kept = {
+        name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
+    }
     used = np.asarray(result.problem.data.image_weight) > 0
     return Weighted(result, kept, int(used.any(1).sum()))
 

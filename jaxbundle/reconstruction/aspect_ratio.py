@@ -91,13 +91,16 @@ def release(network: Network, cameras) -> Network:
     observed = observed_parameters(network)
     if observed is None:
         return network
-    keep = [name != ASPECT or id not in cameras
-            for id, name in zip(observed.camera, observed.parameter)]  # fmt: skip
+    keep = [
+        name != ASPECT or id not in cameras for id, name in zip(observed.camera, observed.parameter)
+    ]
     network = with_observed(network, observed.take(np.array(keep)))
-    return network.replace(further=tuple(
-        _without_focal_lengths(one, cameras) if isinstance(one, Ties) else one
-        for one in network.further
-    ))  # fmt: skip
+    return network.replace(
+        further=tuple(
+            _without_focal_lengths(one, cameras) if isinstance(one, Ties) else one
+            for one in network.further
+        )
+    )
 
 
 def _without_focal_lengths(ties: Ties, cameras) -> Ties:
@@ -122,8 +125,9 @@ def _at_solution(result: Adjustment) -> Network:
     )
     given = np.isfinite(images.sigma[:, :3])  # observed positions stay what was observed
     start = np.concatenate([np.where(given, images.position, values[:, :3]), values[:, 3:]], 1)
-    images = Images(images.id, images.camera, start[:, :3], start[:, 3:], images.sigma,
-                    images.source)  # fmt: skip
+    images = Images(
+        images.id, images.camera, start[:, :3], start[:, 3:], images.sigma, images.source
+    )
     points = Points(points.id, points.role, position, points.sigma, points.source)
     rays = rays.take(used)
     found = network.replace(cameras=cameras, images=images, points=points, observations=rays)

@@ -49,14 +49,17 @@ class CameraPositions:
         said = []
         for axis, value, s in zip("XYZ", self.offset, prior):
             if np.isfinite(value) and abs(value) > CONTRADICTORY * s:
-                said.append(f"satellite positions and control contradict each other: their offset "
-                            f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
-                            "their coordinate systems")  # fmt: skip
+                said.append(
+                    f"satellite positions and control contradict each other: their offset "
+                    f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
+                    "their coordinate systems"
+                )
         for axis, value, s in zip("XYZ", self.rms, self.sigma):
             if value > CONTRADICTORY * s:
                 numbers = f"{significant(value)} {unit}, their σ {significant(s)} {unit}"
-                said.append(f"satellite positions contradict the photographs: RMS in {axis} "
-                            f"{numbers}")  # fmt: skip
+                said.append(
+                    f"satellite positions contradict the photographs: RMS in {axis} {numbers}"
+                )
         return said
 
 
@@ -89,17 +92,21 @@ class Block:
         rows += [
             ("Computed", in_words(self.computed)),
             ("Coordinate system", self.system),
-            ("Ground sample distance", f"{significant(self.ground_sample_distance)} {self.unit} a "
-             "pixel, median"),
+            (
+                "Ground sample distance",
+                f"{significant(self.ground_sample_distance)} {self.unit} a pixel, median",
+            ),
             ("Distance to the object", f"{significant(self.object_distance)} {self.unit}, median"),
-        ]  # fmt: skip
+        ]
         if self.flying_height is not None:
             height = significant(self.flying_height)
             rows.append(("Flying height", f"{height} {self.unit} above the ground, median"))
         if self.area is not None:
             rows.append(("Area covered", f"{significant(self.area)} {area}, of the tie points"))
-        overlap = (f"{self.rays_per_point:.1f} rays a tie point, "
-                   f"{self.points_per_photograph:.0f} tie points a photograph")  # fmt: skip
+        overlap = (
+            f"{self.rays_per_point:.1f} rays a tie point, "
+            f"{self.points_per_photograph:.0f} tie points a photograph"
+        )
         if self.photographs_per_place is not None:
             overlap += f", each place in {self.photographs_per_place:.1f} photographs"
         rows.append(("Overlap", overlap))
@@ -110,16 +117,23 @@ class Block:
             return [("Camera positions", "none in the files were used")]
         axes = lambda values, sign="": " ".join(
             f"{a} {significant(v) if not sign else f'{v:+.3g}'}"
-            for a, v in zip("XYZ", values) if np.isfinite(v)
+            for a, v in zip("XYZ", values)
+            if np.isfinite(v)
         )
         found = self.positions
-        rows = [("Camera positions",
-                 f"{len(found.difference)} in the files, RMS of adjusted − given {axes(found.rms)} "
-                 f"{self.unit} (σ {axes(found.sigma)})")]  # fmt: skip
+        rows = [
+            (
+                "Camera positions",
+                f"{len(found.difference)} in the files, RMS of adjusted − given {axes(found.rms)} "
+                f"{self.unit} (σ {axes(found.sigma)})",
+            )
+        ]
         if np.isfinite(found.offset).any():
-            offset = " ".join(f"{a} {v:+.3g} ± {significant(s, 2)}" for a, v, s in
-                              zip("XYZ", found.offset, found.offset_sigma)
-                              if np.isfinite(v))  # fmt: skip
+            offset = " ".join(
+                f"{a} {v:+.3g} ± {significant(s, 2)}"
+                for a, v, s in zip("XYZ", found.offset, found.offset_sigma)
+                if np.isfinite(v)
+            )
             rows.append(("Their offset", f"{offset} {self.unit}, positions minus control"))
         return rows
 
@@ -130,19 +144,31 @@ class Block:
         found = {
             "photographs": self.photographs,
             "taken": None if self.taken is None else [t.isoformat() for t in self.taken],
-            "computed": self.computed.isoformat(timespec="seconds"), "system": self.system,
-        }  # fmt: skip
-        names = ("ground_sample_distance", "object_distance", "flying_height", "area",
-                 "rays_per_point", "points_per_photograph", "photographs_per_place")  # fmt: skip
+            "computed": self.computed.isoformat(timespec="seconds"),
+            "system": self.system,
+        }
+        names = (
+            "ground_sample_distance",
+            "object_distance",
+            "flying_height",
+            "area",
+            "rays_per_point",
+            "points_per_photograph",
+            "photographs_per_place",
+        )
         found |= {name: number(getattr(self, name)) for name in names}
         if self.positions is None:
             return found | {"camera_positions": None}
         of = self.positions
-        return found | {"camera_positions": {
-            "rms": axes(of.rms), "sigma": axes(of.sigma), "offset": axes(of.offset),
-            "offset_sigma": axes(of.offset_sigma),
-            "difference": {id: axes(d) for id, d in of.difference.items()},
-        }}  # fmt: skip
+        return found | {
+            "camera_positions": {
+                "rms": axes(of.rms),
+                "sigma": axes(of.sigma),
+                "offset": axes(of.offset),
+                "offset_sigma": axes(of.offset_sigma),
+                "difference": {id: axes(d) for id, d in of.difference.items()},
+            }
+        }
 
 
 def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) -> Block:
@@ -157,16 +183,20 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     known = np.isfinite(X[point]).all(1)
     image, point = image[known], point[known]
     depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
-    of_image = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan
-                         for k in range(len(X0))])  # fmt: skip
+    of_image = np.array(
+        [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
+    )
     pixel = np.array([_pixel_angle(camera) for camera in network.cameras])[network.images.camera]
     down = bool(system) and float(np.median(M[:, 2, 2])) > DOWNWARD
     height = area = places = None
     tie = network.points.has_role("tie")
     ground = X[np.unique(point[tie[point]])]
     if down and len(ground) > 3:
-        above = [X0[k, 2] - np.median(X[point[image == k], 2]) for k in range(len(X0))
-                 if (image == k).any()]  # fmt: skip
+        above = [
+            X0[k, 2] - np.median(X[point[image == k], 2])
+            for k in range(len(X0))
+            if (image == k).any()
+        ]
         height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
         footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
         places = sum(footprints) / area if area else None
@@ -174,13 +204,25 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     taken = sorted(t for t in times if t is not None)
     on_ties = tie[point]
     return Block(
-        len(X0), (taken[0], taken[-1]) if taken else None, now(),
-        system or ("local, to scale" if network.object_unit == "m" else
-                   "arbitrary: neither control, satellite positions nor scale bars"),
-        network.object_unit, float(np.nanmedian(of_image * pixel)), float(np.nanmedian(of_image)),
-        height, area, on_ties.sum() / max(len(ground), 1), on_ties.sum() / len(X0), places,
+        len(X0),
+        (taken[0], taken[-1]) if taken else None,
+        now(),
+        system
+        or (
+            "local, to scale"
+            if network.object_unit == "m"
+            else "arbitrary: neither control, satellite positions nor scale bars"
+        ),
+        network.object_unit,
+        float(np.nanmedian(of_image * pixel)),
+        float(np.nanmedian(of_image)),
+        height,
+        area,
+        on_ties.sum() / max(len(ground), 1),
+        on_ties.sum() / len(X0),
+        places,
         camera_positions(result),
-    )  # fmt: skip
+    )
 
 
 def _pixel_angle(camera: Camera) -> float:

@@ -67,8 +67,11 @@ def read_control_measurements(path: str | Path) -> Control:
     """
     path = Path(path)
     lines = read_text(path).splitlines()
-    rows = [(n, line) for n, line in enumerate(lines, 1)
-            if line.strip() and not line.lstrip().startswith("#")]  # fmt: skip
+    rows = [
+        (n, line)
+        for n, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not rows:
         raise InputError(f"{path}: the file is empty")
     head = [cell.strip().lower() for cell in rows[0][1].split(",")]
@@ -126,8 +129,16 @@ def _table(path, head, rows) -> Control:
         check_choice("role", role, ROLES, f"{path}, line {number}: ")
         sigmas[id] = ([value(f"s{axis}") for axis in "xyz"], role)
         place = (value("u"), value("v"))
-        records.append((id, tuple(value(axis) for axis in "xyz"), cells["image"].strip(), place,
-                        value("suv", MANUAL), number))  # fmt: skip
+        records.append(
+            (
+                id,
+                tuple(value(axis) for axis in "xyz"),
+                cells["image"].strip(),
+                place,
+                value("suv", MANUAL),
+                number,
+            )
+        )
     return _collect(path, records, "", sigmas)
 
 
@@ -150,5 +161,6 @@ def _collect(path, records, system, sigmas) -> Control:
         Points(tuple(position), roles, X, sigma, source),
         tuple((image, name) for name, _, image, *_ in records),
         np.array([place for *_, place, _, _ in records]),
-        np.array([sigma for *_, sigma, _ in records]), said,
-    )  # fmt: skip
+        np.array([sigma for *_, sigma, _ in records]),
+        said,
+    )

@@ -58,15 +58,19 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     if len(points) < ENOUGH_CONTROL or heights.any() or np.isfinite(points.sigma[:, 2]).any():
         return points, ""
     if not block.has_positions:
-        return points, ("the heights of all control points are 0: used as the file states them; "
-                        "their residuals show how far the ground is from this plane")  # fmt: skip
+        return points, (
+            "the heights of all control points are 0: used as the file states them; "
+            "their residuals show how far the ground is from this plane"
+        )
     rows = [block.determined[id] for id in points.id if id in block.determined]
     spread = block.network.images.sigma[:, 2]
     sigma = float(np.nanmedian(spread[np.isfinite(spread)]))
     middle = float(np.median(block.X[rows, 2])) if rows else 0.0
     if abs(middle) <= CONTRADICTORY_HEIGHTS * sigma:
-        return points, (f"the heights of all control points are 0, {abs(middle):.1f} m from those "
-                        "by the satellite positions: used as the file states them")  # fmt: skip
+        return points, (
+            f"the heights of all control points are 0, {abs(middle):.1f} m from those "
+            "by the satellite positions: used as the file states them"
+        )
     free = points.sigma.copy()
     free[:, 2] = np.inf
     return dataclasses.replace(points, sigma=free), (
@@ -86,15 +90,25 @@ def assess_control(
     found = [assess(block.compare(group, control), assumed) for group in groups]
     join = lambda name: np.concatenate([getattr(one, name) for one in found])
     return [k for group in groups for k in group], Assessment(
-        join("used"), join("sigma"), found[0].redundancy, join("error"), join("error_sigma"),
-        join("probability"), found[0].assumed, max(one.factor for one in found),
-    )  # fmt: skip
+        join("used"),
+        join("sigma"),
+        found[0].redundancy,
+        join("error"),
+        join("error_sigma"),
+        join("probability"),
+        found[0].assumed,
+        max(one.factor for one in found),
+    )
 
 
 def choose_control(
-    block: OrientedBlock, control: Points, measured: dict[str, Measured], usable: Sequence[int],
-    assessed: Assessment, assumed: float,
-) -> ControlChoice:  # fmt: skip
+    block: OrientedBlock,
+    control: Points,
+    measured: dict[str, Measured],
+    usable: Sequence[int],
+    assessed: Assessment,
+    assumed: float,
+) -> ControlChoice:
     """Which points and measurements are used."""
     sigma = control.sigma.copy()
     for k in range(3):
@@ -140,9 +154,12 @@ def _describe_error(assessed: Assessment, n: int) -> str:
 
 
 def _settle_by_coordinates(
-    block: OrientedBlock, found: ControlChoice, k: int, control: Points,
+    block: OrientedBlock,
+    found: ControlChoice,
+    k: int,
+    control: Points,
     shift: Float[np.ndarray, "3"],
-) -> None:  # fmt: skip
+) -> None:
     """A point whose rays do not meet, or that has only one: its rays are compared with its
     coordinates."""
     id, one = control.id[k], found.measured[control.id[k]]
@@ -156,15 +173,20 @@ def _settle_by_coordinates(
     agree = off < WRONG * np.hypot(one.sigma, spread / (distance * one.pixel))
     if control.role[k] == "check" or (len(one.rows) > 1 and agree.sum() != 1):
         number = count(len(one.rows), "ray")
-        found.why[id] = (f"its {number} do not meet" if len(one.rows) > 1 else
-                         "a check point needs two rays, it has 1")  # fmt: skip
+        found.why[id] = (
+            f"its {number} do not meet"
+            if len(one.rows) > 1
+            else "a check point needs two rays, it has 1"
+        )
     elif agree.any():
         found.measured[id] = dataclasses.replace(one, good=agree)
         found.used[k] = True
     else:
         ground = off[0] * one.pixel[0] * distance[0]
-        found.why[id] = (f"its only ray, in {block.name_of(one, 0)}, misses its coordinates by "
-                         f"{off[0]:.0f} px, {ground:.1f} m")  # fmt: skip
+        found.why[id] = (
+            f"its only ray, in {block.name_of(one, 0)}, misses its coordinates by "
+            f"{off[0]:.0f} px, {ground:.1f} m"
+        )
 
 
 def _name_wrong(block: OrientedBlock, found: ControlChoice, id: str) -> None:
@@ -176,9 +198,11 @@ def _name_wrong(block: OrientedBlock, found: ControlChoice, id: str) -> None:
     off = block.misses(one, X)
     for n in np.flatnonzero(~one.good).tolist():
         passes = np.linalg.norm(np.cross(X - block.X0[one.image[n]], one.rays[n]))
-        said = (f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px "
-                "from where the other photographs see it, its ray passes at "
-                f"{passes:.2f} m")  # fmt: skip
+        said = (
+            f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px "
+            "from where the other photographs see it, its ray passes at "
+            f"{passes:.2f} m"
+        )
         other = block.seen_there(one, n, id, found.measured)
         found.wrong.setdefault(id, []).append(
             said + (f"; it is at the place of {other}: a wrong name" if other else "")

@@ -33,19 +33,30 @@ class ControlPoint:
     def cells(self, places: int) -> tuple[str, ...]:
         """The row of the table as text, in the order of `HEADER`; decimal `places` of lengths."""
         sigma = ("free" if np.isinf(s) else fixed(s, places) for s in self.sigma)
-        return (self.id, str(self.rays), *(fixed(d, places) for d in self.residual), *sigma,
-                fixed(self.image_residual, 2), self.verdict)  # fmt: skip
+        return (
+            self.id,
+            str(self.rays),
+            *(fixed(d, places) for d in self.residual),
+            *sigma,
+            fixed(self.image_residual, 2),
+            self.verdict,
+        )
 
     def numbers(self) -> dict:
         """The row as numbers by name; None: not there."""
-        axes = lambda values: {a: float(v) if np.isfinite(v) else None
-                               for a, v in zip("XYZ", values)}  # fmt: skip
+        axes = lambda values: {
+            a: float(v) if np.isfinite(v) else None for a, v in zip("XYZ", values)
+        }
         return {
-            "role": self.role, "used": self.used, "rays": self.rays, "given": axes(self.given),
-            "sigma": axes(self.sigma), "residual": axes(self.residual),
+            "role": self.role,
+            "used": self.used,
+            "rays": self.rays,
+            "given": axes(self.given),
+            "sigma": axes(self.sigma),
+            "residual": axes(self.residual),
             "image_residual": self.image_residual if np.isfinite(self.image_residual) else None,
             "verdict": self.verdict,
-        }  # fmt: skip
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,12 +93,16 @@ class ControlTable:
 
     def as_dict(self) -> dict:
         """The table for JSON."""
-        rms = lambda role: {a: float(v) if np.isfinite(v) else None
-                            for a, v in zip("XYZ", self.rms(role))}  # fmt: skip
+        rms = lambda role: {
+            a: float(v) if np.isfinite(v) else None for a, v in zip("XYZ", self.rms(role))
+        }
         return {
-            "sigma": self.sigma, "notes": list(self.notes), "rms": rms("control"),
-            "rms_check": rms("check"), "points": {p.id: p.numbers() for p in self.points},
-        }  # fmt: skip
+            "sigma": self.sigma,
+            "notes": list(self.notes),
+            "rms": rms("control"),
+            "rms_check": rms("check"),
+            "points": {p.id: p.numbers() for p in self.points},
+        }
 
     @property
     def left_out(self) -> list[str]:
@@ -108,8 +123,10 @@ def describe_sigma(
         ends = dict.fromkeys(significant(s, 2) for s in (stated.min(), stated.max()))
         said = f"σ of control as stated ({' to '.join(ends)} {unit})"
         if assessed.factor > 1:
-            said += (f", multiplied by {significant(assessed.factor)}: most points contradict "
-                     "each other by more than the stated σ")  # fmt: skip
+            said += (
+                f", multiplied by {significant(assessed.factor)}: most points contradict "
+                "each other by more than the stated σ"
+            )
         words.append(said)
     for k, name in ((0, "in the plane"), (2, "in height")):
         part = unknown[:, [0, 1]] if k == 0 else unknown[:, [2]]
@@ -118,12 +135,16 @@ def describe_sigma(
         sigma = float(assessed.sigma[:, k][unknown[:, k]][0])
         r = assessed.redundancy[0 if k == 0 else 1]
         if assessed.assumed[0 if k == 0 else 1]:
-            how = ("assumed, 2 pixels on the ground, because its residuals do not show a larger "
-                   "one (state it with --control-sigma)")  # fmt: skip
+            how = (
+                "assumed, 2 pixels on the ground, because its residuals do not show a larger "
+                "one (state it with --control-sigma)"
+            )
         else:
             how = f"estimated from the residuals of control (redundancy {r:.1f})"
         words.append(f"control without σ: {significant(sigma, 2)} {unit} {name}, {how}")
     if fixed:
-        words.append(f"held exactly, as stated by the role fixed: {', '.join(fixed[:5])}"
-                     + (" …" if len(fixed) > 5 else ""))  # fmt: skip
+        words.append(
+            f"held exactly, as stated by the role fixed: {', '.join(fixed[:5])}"
+            + (" …" if len(fixed) > 5 else "")
+        )
     return "; ".join(words)

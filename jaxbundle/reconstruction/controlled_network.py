@@ -53,26 +53,37 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     return network.replace(
         images=dataclasses.replace(images, position=block.X0, angles=block.angles),
         points=Points(
-            (*network.points.id, *added.id), (*network.points.role, *added.role),
+            (*network.points.id, *added.id),
+            (*network.points.role, *added.role),
             np.concatenate([block.X[moved], added.position]),
             np.concatenate([network.points.sigma, added.sigma]),
         ),
         observations=dataclasses.replace(
-            rays, image=np.concatenate([rays.image, added.image]),
+            rays,
+            image=np.concatenate([rays.image, added.image]),
             point=np.concatenate([at[rays.point], added.point]),
-            xy=np.concatenate([rays.xy, xy]), sigma=np.concatenate([rays.sigma, sigma]),
+            xy=np.concatenate([rays.xy, xy]),
+            sigma=np.concatenate([rays.sigma, sigma]),
             source=Source("observations"),
         ),
-        further=(*(one for one in network.further if not isinstance(one, ExteriorPriors)),
-                 *_positions(block, choice)),
-        distances=Distances(
-            np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep],
-                     int).reshape(-1, 2),
-            distances.value[here], distances.sigma[here], distances.source.take(here),
+        further=(
+            *(one for one in network.further if not isinstance(one, ExteriorPriors)),
+            *_positions(block, choice),
         ),
-        datum="control", datum_points=(), object_unit="m", warnings=whole.warnings,
+        distances=Distances(
+            np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep], int).reshape(
+                -1, 2
+            ),
+            distances.value[here],
+            distances.sigma[here],
+            distances.source.take(here),
+        ),
+        datum="control",
+        datum_points=(),
+        object_unit="m",
+        warnings=whole.warnings,
         notes=whole.notes,
-    )  # fmt: skip
+    )
 
 
 def _measured_points(
@@ -101,10 +112,15 @@ def _measured_points(
         ids.append(id)
         roles.append(role)
     return _Added(
-        tuple(ids), tuple(roles), np.reshape(position, (-1, 3)), np.reshape(sigma, (-1, 3)),
-        np.array(image, int), np.array(point, int), block.given.named.xy[np.array(rows, int)],
+        tuple(ids),
+        tuple(roles),
+        np.reshape(position, (-1, 3)),
+        np.reshape(sigma, (-1, 3)),
+        np.array(image, int),
+        np.array(point, int),
+        block.given.named.xy[np.array(rows, int)],
         np.repeat(np.reshape(spread, (-1, 1)), 2, 1),
-    )  # fmt: skip
+    )
 
 
 def _on_ray(block: OrientedBlock, one: Measured) -> Float[np.ndarray, "3"]:
@@ -128,10 +144,17 @@ def _positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
         return []
     axes = [a for k, a in enumerate("XYZ") if np.isfinite(choice.sigma[choice.used, k]).any()]
     prior = dict(zip("XYZ", (OFFSET, OFFSET, OFFSET_HEIGHT)))
-    settings = {"free": [f"shift_{a}" for a in axes],
-                "sigma": {f"shift_{a}": prior[a] for a in axes}}  # fmt: skip
-    return [Antennas(
-        image=tuple(block.network.images.id[k] for k in there), position=X[there],
-        covariance=np.einsum("ni,ij->nij", sigma[there] ** 2, np.eye(3)),
-        strip=("all",) * len(there), time=np.full(len(there), np.nan), settings=settings,
-    )]  # fmt: skip
+    settings = {
+        "free": [f"shift_{a}" for a in axes],
+        "sigma": {f"shift_{a}": prior[a] for a in axes},
+    }
+    return [
+        Antennas(
+            image=tuple(block.network.images.id[k] for k in there),
+            position=X[there],
+            covariance=np.einsum("ni,ij->nij", sigma[there] ** 2, np.eye(3)),
+            strip=("all",) * len(there),
+            time=np.full(len(there), np.nan),
+            settings=settings,
+        )
+    ]

@@ -47,8 +47,9 @@ def refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[st
     if weighted.agreeing < AGREEING_SHARE * found:
         raise _folded(
             f"of {found} measurements in {count(len(placed), 'photograph')} {weighted.agreeing} "
-            "agree with one object", names,
-        )  # fmt: skip
+            "agree with one object",
+            names,
+        )
 
 
 def refuse_superimposed(
@@ -74,12 +75,17 @@ def refuse_superimposed(
             if few[i, j] and few[j, i]:
                 bad.append((i, j))
     bad.sort(key=lambda pair: -number[pair])
-    said = [f"{common[i, j]} of {number[i, j]} points expected in both {names[place[i]]} and "
-            f"{names[place[j]]} were found" for i, j in bad]  # fmt: skip
+    said = [
+        f"{common[i, j]} of {number[i, j]} points expected in both {names[place[i]]} and "
+        f"{names[place[j]]} were found"
+        for i, j in bad
+    ]
     if len(bad) >= max(PAIRS, OF_ALL * compared):
         raise _folded(f"{said[0]}, and too few in {len(bad)} of {compared} such pairs", names)
-    return [f"{one}: something hides them, or parts of the object are superimposed"
-            for one in said[:MOST_NAMED]]  # fmt: skip
+    return [
+        f"{one}: something hides them, or parts of the object are superimposed"
+        for one in said[:MOST_NAMED]
+    ]
 
 
 def count_shared_points(
@@ -99,8 +105,10 @@ def count_shared_points(
     to_points = [X[points] - X0[i] for i, points in enumerate(agreeing)]
     far = [np.linalg.norm(d, axis=1) for d in to_points]
     reach = np.array([lengths.max(initial=0.0) for lengths in far])
-    fields = [_field(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
-              for c in network.cameras]  # fmt: skip
+    fields = [
+        _field(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
+        for c in network.cameras
+    ]
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
         there = np.zeros(len(X), bool)

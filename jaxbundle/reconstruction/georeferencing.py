@@ -56,8 +56,11 @@ def georeference(
     block = OrientedBlock(found.adjustment, given)
     measured = block.resolve()
     control, heights = without_unknown_heights(block)
-    usable = [k for k, id in enumerate(control.id)
-              if control.role[k] != "check" and block.is_determined(id, measured[id])]
+    usable = [
+        k
+        for k, id in enumerate(control.id)
+        if control.role[k] != "check" and block.is_determined(id, measured[id])
+    ]
     if not block.has_positions:
         block.move(usable, control)
         measured = block.resolve()
@@ -67,14 +70,16 @@ def georeference(
     if not block.has_positions and choice.used.sum() < ENOUGH_CONTROL:
         raise InputError(
             f"expected {ENOUGH_CONTROL} control points without contradictions, got "
-            f"{choice.used.sum()}: " + list_some((f"{id}: {why}" for id, why in
-                                                  choice.why.items()), 5, str)
-        )  # fmt: skip
+            f"{choice.used.sum()}: "
+            + list_some((f"{id}: {why}" for id, why in choice.why.items()), 5, str)
+        )
     doubtful = [pair for pair in block.removed() if pair[1] not in control.id]
     result, _, _ = adjust_determined(
-        network_with_control(block, control, choice), snooping="pope", significance=significance,
+        network_with_control(block, control, choice),
+        snooping="pope",
+        significance=significance,
         doubtful=doubtful,
-    )  # fmt: skip
+    )
     if not result.converged:
         raise NotSolvedError(f"with control: {result.termination}", list(result.undetermined))
     used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
@@ -109,12 +114,17 @@ def _tabulate(result: Adjustment, block: OrientedBlock, control: Points, choice:
         verdict = used if choice.used[k] else "left out"
         verdict = "check" if control.role[k] == "check" else verdict
         reasons = [*([choice.why[id]] if id in choice.why else []), *choice.wrong.get(id, [])]
-        reasons += [f"data snooping removed {name}" for name in snooped
-                    if f"point {id} " in f"{name} "]  # fmt: skip
+        reasons += [
+            f"data snooping removed {name}" for name in snooped if f"point {id} " in f"{name} "
+        ]
         yield ControlPoint(
-            id, control.role[k], bool(choice.used[k]) and id in points,
-            int(one.good.sum()), control.position[k],
-            np.full(3, np.nan) if control.role[k] == "fixed" else choice.sigma[k], residual,
+            id,
+            control.role[k],
+            bool(choice.used[k]) and id in points,
+            int(one.good.sum()),
+            control.position[k],
+            np.full(3, np.nan) if control.role[k] == "fixed" else choice.sigma[k],
+            residual,
             float(np.sqrt((off**2).mean())) if len(off) else np.nan,
             ": ".join([verdict, "; ".join(reasons)]) if reasons else verdict,
-        )  # fmt: skip
+        )

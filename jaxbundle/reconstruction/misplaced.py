@@ -37,8 +37,9 @@ def find_misplaced(network: Network, pairs: NamedPairs) -> dict[str, str]:
         if not judged:
             return found if 2 * len(found) < len(network.images) else {}
         worst = max(judged, key=lambda id: bad[id] / number[id])
-        found[worst] = (f"its position or attitude contradicts {bad[worst]} of its "
-                        f"{number[worst]} pairs")  # fmt: skip
+        found[worst] = (
+            f"its position or attitude contradicts {bad[worst]} of its {number[worst]} pairs"
+        )
         contradicted = {pair: wrong for pair, wrong in contradicted.items() if worst not in pair}
 
 

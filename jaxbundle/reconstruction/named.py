@@ -70,8 +70,9 @@ def find_named(
             xy += list(one.xy)
             sigma += list(one.sigma)
         left_out = Counter(why for one in found if one is not None for _, why in one.left_out)
-        notes += [f"{n} measurements of coded targets are left out: {why}"
-                  for why, n in left_out.items()]  # fmt: skip
+        notes += [
+            f"{n} measurements of coded targets are left out: {why}" for why, n in left_out.items()
+        ]
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
     if control is not None and control.seen:
         index = {p.name: k for k, p in enumerate(photographs)}
@@ -101,8 +102,10 @@ def name_unused(
 
     **Raises:** `InputError` if no scale bar, or fewer than `fewest` control points, are left.
     """
-    photographs = {name: len(set(named.image[np.array(named.name) == name].tolist()))
-                   for name in set(named.name)}  # fmt: skip
+    photographs = {
+        name: len(set(named.image[np.array(named.name) == name].tolist()))
+        for name in set(named.name)
+    }
     ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):
@@ -114,13 +117,13 @@ def name_unused(
     if control is not None:
         points = control.points
         lost = [id for id in points.id if id not in photographs]
-        found = sum(id in photographs and role != "check"
-                    for id, role in zip(points.id, points.role))  # fmt: skip
+        found = sum(
+            id in photographs and role != "check" for id, role in zip(points.id, points.role)
+        )
         if found < fewest:
             raise InputError(
                 f"{points.source.name}: {found} control points are measured in the photographs, "
-                f"{fewest} are needed"
-                + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
+                f"{fewest} are needed" + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
             )
         notes += [f"control points in no photograph: {list_some(lost, 5, str)}"] * bool(lost)
     return notes
@@ -144,5 +147,7 @@ def read_distances(path: str | Path) -> list[dict]:
     table = read_csv(Path(path))
     value = table.numbers("value", required=True)
     sigma = table.numbers("sigma", required=True)
-    return [{"from": a, "to": b, "value": float(v), "sigma": float(s)}
-            for a, b, v, s in zip(table.ids("from"), table.ids("to"), value, sigma)]  # fmt: skip
+    return [
+        {"from": a, "to": b, "value": float(v), "sigma": float(s)}
+        for a, b, v, s in zip(table.ids("from"), table.ids("to"), value, sigma)
+    ]

@@ -15,8 +15,15 @@ from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.tiepoints.refinement import Measurements
 
 PRIORS = {
-    "fx": 0.2, "cx": 0.01, "cy": 0.01, "k1": 0.3, "k2": 0.1, "k3": 0.05, "p1": 1e-3, "p2": 1e-3,
-}  # fmt: skip
+    "fx": 0.2,
+    "cx": 0.01,
+    "cy": 0.01,
+    "k1": 0.3,
+    "k2": 0.1,
+    "k3": 0.05,
+    "p1": 1e-3,
+    "p2": 1e-3,
+}
 """σ of the parameters of an unknown camera before the adjustment, all of them free: of fx relative
 to itself (unless the files state it), of cx and cy to the longer side. What few photographs do not
 determine is then part of the σ of the result; parameters held at usual values would bias the others
@@ -54,9 +61,10 @@ def tie_network(
     rows = np.unique(measured.image).tolist()
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
-    free = [cameras.cameras[c] if cameras.given else
-            dataclasses.replace(cameras.cameras[c], free=FREE)
-            for c in used]  # fmt: skip
+    free = [
+        cameras.cameras[c] if cameras.given else dataclasses.replace(cameras.cameras[c], free=FREE)
+        for c in used
+    ]
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     named = extra.named.take(np.isin(extra.named.image, rows))
     points = [*tracks, *dict.fromkeys(named.name)]
@@ -70,16 +78,28 @@ def tie_network(
     there = set(points)
     distances = [d for d in extra.distances if {d["from"], d["to"]} <= there]
     network = make_network(
-        free, images,
-        {"id": points, "role": ["tie"] * len(points),
-         **{axis: np.full(len(points), np.nan) for axis in "XYZ"}},
-        {"image": names[np.concatenate([measured.image, named.image])],
-         "point": [*map(track_name, measured.track.tolist()), *named.name],
-         "x": xy[:, 0], "y": xy[:, 1], "sx": sigma[:, 0], "sy": sigma[:, 1]},
-        distances or None, image_unit="px", name=name, sigma_origin=ESTIMATED,
+        free,
+        images,
+        {
+            "id": points,
+            "role": ["tie"] * len(points),
+            **{axis: np.full(len(points), np.nan) for axis in "XYZ"},
+        },
+        {
+            "image": names[np.concatenate([measured.image, named.image])],
+            "point": [*map(track_name, measured.track.tolist()), *named.name],
+            "x": xy[:, 0],
+            "y": xy[:, 1],
+            "sx": sigma[:, 0],
+            "sy": sigma[:, 1],
+        },
+        distances or None,
+        image_unit="px",
+        name=name,
+        sigma_origin=ESTIMATED,
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
-    )  # fmt: skip
+    )
     if not cameras.given:
         stated = [cameras.stated[c] for c in used]
         lens = [cameras.lens[c] for c in used]

@@ -75,7 +75,7 @@ class OrientedBlock:
         self.cameras = tuple(
             dataclasses.replace(c, parameters=result.camera_parameters(c.id))
             for c in self.network.cameras
-        )  # fmt: skip
+        )
         self.row = {id: k for k, id in enumerate(self.network.images.id)}
         points = self.network.points.id
         known = np.all(np.isfinite(self.X), axis=1)
@@ -88,19 +88,30 @@ class OrientedBlock:
     def measure(self, id: str) -> Measured:
         """The measurements of a point; all of them agree for now."""
         named, names = self.given.named, self.given.names
-        rows = [k for k, name in enumerate(named.name)
-                if name == id and names[named.image[k]] in self.row]  # fmt: skip
+        rows = [
+            k
+            for k, name in enumerate(named.name)
+            if name == id and names[named.image[k]] in self.row
+        ]
         rows = np.array(rows, int)
         image = np.array([self.row[names[named.image[k]]] for k in rows], int)
         if not len(rows):
             nothing = np.zeros(0)
-            return Measured(rows, image, np.zeros((0, 3)), nothing, nothing, np.zeros(0, bool),
-                            np.full(3, np.nan))  # fmt: skip
+            return Measured(
+                rows,
+                image,
+                np.zeros((0, 3)),
+                nothing,
+                nothing,
+                np.zeros(0, bool),
+                np.full(3, np.nan),
+            )
         camera = self.network.images.camera[image]
         ends = [self._ideal(camera, named.xy[rows] + shift) for shift in ([0, 0], [0.5, 0.5])]
         pixel = np.linalg.norm(ends[1] - ends[0], axis=1) / np.hypot(0.5, 0.5)
-        rays = np.einsum("nij,ni->nj", self.M[image],
-                         np.pad(ends[0], ((0, 0), (0, 1)), constant_values=-1.0))  # fmt: skip
+        rays = np.einsum(
+            "nij,ni->nj", self.M[image], np.pad(ends[0], ((0, 0), (0, 1)), constant_values=-1.0)
+        )
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         good = np.isfinite(rays).all(1)
         sigma = named.sigma[rows].mean(1)
@@ -128,15 +139,21 @@ class OrientedBlock:
         is larger than 1: a point is identified worse than it is measured."""
         measured = {id: self.measure(id) for id in self.given.points.id}
         first = {id: self._consistent(one) for id, one in measured.items()}
-        off = [self.misses(one, one.position)[one.good] / one.sigma[one.good]
-               / np.sqrt(1 - 1.5 / one.good.sum()) for one in first.values()
-               if one.good.sum() > 1]  # fmt: skip
+        off = [
+            self.misses(one, one.position)[one.good]
+            / one.sigma[one.good]
+            / np.sqrt(1 - 1.5 / one.good.sum())
+            for one in first.values()
+            if one.good.sum() > 1
+        ]
         # the median of a Rayleigh distribution is 1.1774 σ
         scale = max(1.0, float(np.median(np.concatenate(off))) / 1.1774) if off else 1.0
         if scale == 1.0:
             return first
-        return {id: self._consistent(dataclasses.replace(one, sigma=scale * one.sigma))
-                for id, one in measured.items()}  # fmt: skip
+        return {
+            id: self._consistent(dataclasses.replace(one, sigma=scale * one.sigma))
+            for id, one in measured.items()
+        }
 
     def _consistent(self, one: Measured) -> Measured:
         """The largest set of rays that meet, more than half of them, from the best pair."""
@@ -150,8 +167,9 @@ class OrientedBlock:
                 off = self.misses(one, self._meet(one, pair)) / one.sigma
                 good = off < WRONG
                 if good[[i, j]].all() and (good.sum(), -np.median(off[good])) > (
-                    best.sum(), -closest
-                ):  # fmt: skip
+                    best.sum(),
+                    -closest,
+                ):
                     best, closest = good, np.median(off[good])
         if best.sum() < 2 or 2 * best.sum() <= len(usable):
             return dataclasses.replace(one, good=np.zeros(len(one.rows), bool))
@@ -191,8 +209,10 @@ class OrientedBlock:
     @property
     def ground_sample_distance(self) -> float:
         """The length of a pixel at the named points, the median."""
-        found = [one.pixel * np.linalg.norm(X - self.X0[one.image], axis=1)
-                 for one, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())]
+        found = [
+            one.pixel * np.linalg.norm(X - self.X0[one.image], axis=1)
+            for one, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())
+        ]
         return float(np.median(np.concatenate(found))) if found else 1.0
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
@@ -235,8 +255,10 @@ class OrientedBlock:
         problem = self.result.problem
         gone = ~(np.asarray(problem.data.image_weight) > 0).any(1)
         images, points = self.network.images.id, self.network.points.id
-        return [(images[i], points[p]) for i, p in
-                zip(problem.image[gone].tolist(), problem.point[gone].tolist())]  # fmt: skip
+        return [
+            (images[i], points[p])
+            for i, p in zip(problem.image[gone].tolist(), problem.point[gone].tolist())
+        ]
 
     def is_determined(self, id: str, one: Measured) -> bool:
         """Whether a point was adjusted with the block, from the measurements that agree."""
@@ -256,8 +278,9 @@ class OrientedBlock:
             there = its.rows[its.image == one.image[n]]
             xy = self.given.named.xy
             near = np.linalg.norm(xy[there] - xy[one.rows[n]], axis=1) < WRONG * one.sigma[n]
-            if other != id and (near.any() or self.misses(one, its.position)[n] < WRONG *
-                                one.sigma[n]):  # fmt: skip
+            if other != id and (
+                near.any() or self.misses(one, its.position)[n] < WRONG * one.sigma[n]
+            ):
                 return other
         return ""
 

@@ -79,17 +79,24 @@ def _describe(found, part) -> Addition:
         overview += items(found.notes)
     findings, without = _findings(found, part)
     return Addition(
-        "reconstruction", tuple(findings), overview=overview, warnings=found.warnings,
-        sections=tuple(sections), tables={"pairs": _pairs(found)}, name=_name(found, part),
+        "reconstruction",
+        tuple(findings),
+        overview=overview,
+        warnings=found.warnings,
+        sections=tuple(sections),
+        tables={"pairs": _pairs(found)},
+        name=_name(found, part),
         without=without,
-    )  # fmt: skip
+    )
 
 
 def _name(found, part) -> str:
     """The name of the reconstruction, with that of the part if there are several."""
-    return found.name if found.name and len(found.parts) == 1 else ", ".join(
-        filter(None, (found.name, part.name))
-    )  # fmt: skip
+    return (
+        found.name
+        if found.name and len(found.parts) == 1
+        else ", ".join(filter(None, (found.name, part.name)))
+    )
 
 
 def _fit(part) -> Finding:
@@ -97,9 +104,13 @@ def _fit(part) -> Finding:
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
     state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
-    return Finding("Fit", state, f"residuals relative to their σ from matching: {words}; these "
-                   "factors are in all σ of the result",
-                   f"residuals {significant(worst)} times their σ from matching")  # fmt: skip
+    return Finding(
+        "Fit",
+        state,
+        f"residuals relative to their σ from matching: {words}; these "
+        "factors are in all σ of the result",
+        f"residuals {significant(worst)} times their σ from matching",
+    )
 
 
 def _photographs(found, part) -> Finding:
@@ -122,11 +133,16 @@ def _judge_control(part) -> list[Finding]:
         return []
     given = [p for p in part.control.points if p.role != "check"]
     checks = [p for p in part.control.points if p.role == "check"]
-    rms = lambda role: " ".join(f"{axis} {significant(x)}" for axis, x in
-                                zip("XYZ", part.control.rms(role)) if np.isfinite(x))  # fmt: skip
+    rms = lambda role: " ".join(
+        f"{axis} {significant(x)}"
+        for axis, x in zip("XYZ", part.control.rms(role))
+        if np.isfinite(x)
+    )
     used, left = [p for p in given if p.used], part.control.left_out
-    words = (f"{len(used)} of {count(len(given), 'control point')} used, RMS {rms('control')} "
-             f"{part.control.unit}; {part.control.sigma}")  # fmt: skip
+    words = (
+        f"{len(used)} of {count(len(given), 'control point')} used, RMS {rms('control')} "
+        f"{part.control.unit}; {part.control.sigma}"
+    )
     if left:
         words += f"; left out: {', '.join(left)}"
     wrong = sum("wrong measurement" in p.verdict for p in part.control.points)
@@ -172,12 +188,14 @@ def _counts(found, part) -> list[tuple[str, str]]:
     rows = []
     for one in found.parts:
         network = one.adjustment.network
-        rows.append((
-            clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
-            f"{count(len(network.images), 'photograph')}, "
-            f"{count(count_points(one.adjustment), 'point')}, "
-            f"σ0 {significant(one.adjustment.sigma0, 4)}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
+                f"{count(len(network.images), 'photograph')}, "
+                f"{count(count_points(one.adjustment), 'point')}, "
+                f"σ0 {significant(one.adjustment.sigma0, 4)}",
+            )
+        )
     return [*rows, ("Verified pairs", str(len(found.pairs)))]
 
 
@@ -191,9 +209,14 @@ def _factors(part) -> Section:
 def _pairs(found) -> Listing:
     one, other, matches, verified, kind = zip(*found.pairs) if found.pairs else ((),) * 5
     words = lambda values: np.array(values, dtype=object)
-    return Listing("Pairs of photographs", {
-        "image": Column(words(one), "image"), "other": Column(words(other), "other"),
-        "matches": Column(np.array(matches, int), "matches"),
-        "verified": Column(np.array(verified, int), "verified"),
-        "kind": Column(words(kind), "kind"),
-    }, "pairs.csv")  # fmt: skip
+    return Listing(
+        "Pairs of photographs",
+        {
+            "image": Column(words(one), "image"),
+            "other": Column(words(other), "other"),
+            "matches": Column(np.array(matches, int), "matches"),
+            "verified": Column(np.array(verified, int), "verified"),
+            "kind": Column(words(kind), "kind"),
+        },
+        "pairs.csv",
+    )

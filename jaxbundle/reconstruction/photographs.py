@@ -83,8 +83,10 @@ def _files(given) -> list[Path]:
             inside = list_photographs(one)
             if not inside:
                 other = describe_other_files(one).removeprefix(f"{one}: ")
-                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})"
-                                 + (f"; {other}" if other else ""))  # fmt: skip
+                raise InputError(
+                    f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})"
+                    + (f"; {other}" if other else "")
+                )
             paths += inside
         elif not one.exists():
             raise InputError(f"{one}: no such file")
@@ -143,13 +145,19 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
         stated.append(told)
         for k in rows:
             of[k] = number
-        where = (f"{told.value:.0f} ± {told.sigma:.0f} px from {told.source}" if told
-                 else "unknown: found from the photographs")  # fmt: skip
+        where = (
+            f"{told.value:.0f} ± {told.sigma:.0f} px from {told.source}"
+            if told
+            else "unknown: found from the photographs"
+        )
         same = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
             lens[number] in lens[:number]
         )
-        notes = (*notes, f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
-                 f"{exif.size[1]} pixels, principal distance {where}{same}")  # fmt: skip
+        notes = (
+            *notes,
+            f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
+            f"{exif.size[1]} pixels, principal distance {where}{same}",
+        )
     return Cameras(tuple(cameras), tuple(of), tuple(stated), False, notes, tuple(lens))
 
 

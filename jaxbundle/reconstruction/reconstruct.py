@@ -1,7 +1,7 @@
 """`reconstruct`: photographs in, adjusted networks out.
 
-    photographs ─features─▶ matches ─principal distance by loops─▶ verified pairs ─▶ parts
-    part ─tracks─▶ measured by least squares matching ─start values─▶ adjusted, weighted, snooped
+photographs ─features─▶ matches ─principal distance by loops─▶ verified pairs ─▶ parts
+part ─tracks─▶ measured by least squares matching ─start values─▶ adjusted, weighted, snooped
 """
 
 import dataclasses
@@ -123,8 +123,9 @@ def reconstruct(
         frame = Given(points, named, names, control.system, positions and positions[:2])
         checks = {id for id, role in zip(points.id, points.role) if role == "check"}
         named = named.take(np.array([one not in checks for one in named.name], bool))
-    extra = Extra(named, tuple(distances), positions[:2] if positions and framed else None,
-                  attitudes)  # fmt: skip
+    extra = Extra(
+        named, tuple(distances), positions[:2] if positions and framed else None, attitudes
+    )
     system = "" if control is None else control.system
     if positions is not None and (framed or control is not None):
         system = positions.words if control is None else system or positions.system
@@ -166,26 +167,31 @@ class _ReconstructionRun:
             for one in prepared:
                 one.result()
         parts = self._parts(features, matches, pairs)
-        said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
-                     for p in pairs)  # fmt: skip
+        said = tuple(
+            (self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
+            for p in pairs
+        )
         files = {p.name: p.path for p in self.photographs}
         warnings = [said for _, said in sorted(self.warnings, key=lambda one: -one[0])]
-        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files,
-                              tuple(warnings), self.title)  # fmt: skip
+        return Reconstruction(
+            tuple(parts), self.left_out, tuple(self.notes), said, files, tuple(warnings), self.title
+        )
 
     def _matches(self):
         features = self._features()
         prints = [p.fingerprint for p in self.photographs]
         place = self.extra.positions and self.extra.positions[0]
-        matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
-                        self.tell)  # fmt: skip
+        matches = match(
+            features, prints, self.settings.pairs, place, self.store, self.workers, self.tell
+        )
         self.store.drop_unused()
         sizes = [p.size for p in self.photographs]
         again = find_duplicates(matches, features, sizes)
         for k, (other, still, number) in again.items():
             self.left_out.setdefault(
-                self.names[k], f"it shows the same as {self.names[other]} ({still} of {number} "
-                "matches are at the same place): saved again, or taken from the same place"
+                self.names[k],
+                f"it shows the same as {self.names[other]} ({still} of {number} "
+                "matches are at the same place): saved again, or taken from the same place",
             )
         self._require_two()
         matches = [m for m in matches if not {*m.images} & again.keys()]
@@ -205,8 +211,15 @@ class _ReconstructionRun:
         columns, rows = max((p.size for p in self.photographs), key=math.prod)
         need = memory_of_features(rows, columns, detection)
         at_once = photographs_at_once(rows * columns, need, self.workers)
-        features = detect([p.path for p in self.photographs], read, prints, detection, self.store,
-                          at_once, self.tell)  # fmt: skip
+        features = detect(
+            [p.path for p in self.photographs],
+            read,
+            prints,
+            detection,
+            self.store,
+            at_once,
+            self.tell,
+        )
         bad = {k for k, f in enumerate(features) if len(f) < TEXTURE}
         for k in sorted(bad):
             self.left_out.setdefault(
@@ -236,8 +249,12 @@ class _ReconstructionRun:
         if self.cameras.given:
             return
         cameras, notes = start_cameras(
-            self.cameras.cameras, self.cameras.of, self.cameras.lens,
-            [one is not None for one in self.cameras.stated], features, matches,
+            self.cameras.cameras,
+            self.cameras.of,
+            self.cameras.lens,
+            [one is not None for one in self.cameras.stated],
+            features,
+            matches,
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
@@ -247,8 +264,10 @@ class _ReconstructionRun:
         pairs, wrong = without_contradicted(*cameras, verify(*cameras, matches, self.tell))
         if wrong:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
-            self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
-                              f"by others in triplets: {list_some(named, 3, str)}")  # fmt: skip
+            self.notes.append(
+                f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
+                f"by others in triplets: {list_some(named, 3, str)}"
+            )
         if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
             self._warn(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
@@ -280,10 +299,18 @@ class _ReconstructionRun:
             parts.append(part)
             rest = [k for k in group if self.names[k] in reasons]
             among = [p for p in pairs if set(p.images) <= set(rest)]
-            again = [[rest[k] for k in g] for g in group_connected(
-                len(rest), [dataclasses.replace(p, images=(rest.index(p.images[0]),
-                                                           rest.index(p.images[1])))
-                            for p in among])]  # fmt: skip
+            again = [
+                [rest[k] for k in g]
+                for g in group_connected(
+                    len(rest),
+                    [
+                        dataclasses.replace(
+                            p, images=(rest.index(p.images[0]), rest.index(p.images[1]))
+                        )
+                        for p in among
+                    ],
+                )
+            ]
             for g in again:
                 if len(g) >= SMALLEST_PART and len(g) < len(group):
                     waiting.append(g)
@@ -316,8 +343,10 @@ class _ReconstructionRun:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
         some = "no three photographs overlap one another" if pairs else "no photographs overlap"
-        return (f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
-                "to the next, on which the object or its surroundings have texture")  # fmt: skip
+        return (
+            f"not solved: {some}: {said}; take sharp photographs, at most 20 degrees from one "
+            "to the next, on which the object or its surroundings have texture"
+        )
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
@@ -327,11 +356,14 @@ class _ReconstructionRun:
         tracks = [track for track, keep in zip(tracks, kept) if keep]
         done = iter(range(1, len(features) + 1))
         measured = measure_tracks(
-            tracks, features, lambda k: read_photograph(self.photographs[k].path, colour=True),
+            tracks,
+            features,
+            lambda k: read_photograph(self.photographs[k].path, colour=True),
             lambda: self.tell("least squares matching", next(done), len(features)),
-        )  # fmt: skip
-        network = tie_network(self.photographs, self.cameras, measured, self.extra, name,
-                              self.settings.aspect_sigma)  # fmt: skip
+        )
+        network = tie_network(
+            self.photographs, self.cameras, measured, self.extra, name, self.settings.aspect_sigma
+        )
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
@@ -355,8 +387,15 @@ class _ReconstructionRun:
         # without control and positions the frame is an arbitrary one
         absolute = control is not None or self.extra.positions is not None
         block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
-        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors, block, control,
-                    no_control)  # fmt: skip
+        part = Part(
+            name,
+            weighted.adjustment,
+            _colours(measured),
+            weighted.factors,
+            block,
+            control,
+            no_control,
+        )
         if part.misfit >= LARGEST_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         for said in (*self._contradict_files(weighted.adjustment), *doubts):
@@ -383,8 +422,11 @@ class _ReconstructionRun:
     def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
-        guessed = [camera.id for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
-                   if stated is None and not self.cameras.given]  # fmt: skip
+        guessed = [
+            camera.id
+            for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
+            if stated is None and not self.cameras.given
+        ]
         failed: NotSolvedError | None = None
         for oriented in start_values(network, guessed, pairs):
             try:
@@ -430,8 +472,10 @@ class _ReconstructionRun:
                 released[id] = found
                 self.notes.append(f"{said}the pixels are not square")
             else:
-                self.notes.append(f"{said}not confirmed, the pixels are taken as square (fy/fx "
-                                  f"1 ± {self.settings.aspect_sigma:g})")  # fmt: skip
+                self.notes.append(
+                    f"{said}not confirmed, the pixels are taken as square (fy/fx "
+                    f"1 ± {self.settings.aspect_sigma:g})"
+                )
         if not released:
             return weighted, note
         network = aspect_ratio.release(oriented.network, released)
@@ -464,8 +508,10 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
 def _name_unused(name: str, weighted: Weighted) -> list[str]:
     if not weighted.unused:
         return []
-    return [f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
-            "measurements contradict each other, as on an object that repeats itself"]  # fmt: skip
+    return [
+        f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
+        "measurements contradict each other, as on an object that repeats itself"
+    ]
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
@@ -473,16 +519,27 @@ def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
     columns = (measured.image, measured.track, measured.level)
     level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id
-    kinds = np.array([level.get((images[i], points[p]), NAMED) for i, p in
-                      zip(rays.image.tolist(), rays.point.tolist())], int)  # fmt: skip
+    kinds = np.array(
+        [
+            level.get((images[i], points[p]), NAMED)
+            for i, p in zip(rays.image.tolist(), rays.point.tolist())
+        ],
+        int,
+    )
     kinds[(kinds > 2) & (kinds < NAMED)] = 2
-    words = {-1: "features not matched", 0: "matched in the original",
-             1: "matched at half size", 2: "matched at a quarter or smaller",
-             NAMED: "named points"}  # fmt: skip
+    words = {
+        -1: "features not matched",
+        0: "matched in the original",
+        1: "matched at half size",
+        2: "matched at a quarter or smaller",
+        NAMED: "named points",
+    }
     return kinds, words
 
 
 def _colours(measured: Measurements) -> dict[str, tuple[int, int, int]]:
     first = measured.first
-    return {track_name(t): tuple(c) for t, c in
-            zip(measured.track[first].tolist(), measured.colour[first].tolist())}  # fmt: skip
+    return {
+        track_name(t): tuple(c)
+        for t, c in zip(measured.track[first].tolist(), measured.colour[first].tolist())
+    }

@@ -56,9 +56,12 @@ class Reconstruction:
             f"{count(count_points(part.adjustment), 'point')}, "
             f"σ0 {part.adjustment.sigma0:.3f}{distances_found(part.adjustment)}"
             for part in self.parts
-        ]  # fmt: skip
-        lines += [f"warning: {part.name}: {said}" for part in self.parts
-                  for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
+        ]
+        lines += [
+            f"warning: {part.name}: {said}"
+            for part in self.parts
+            for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)
+        ]
         for part in self.parts:
             if part.control is not None:
                 lines.append(part.control.sigma)
@@ -69,15 +72,20 @@ class Reconstruction:
 
 def principal_distances(result: Adjustment) -> dict[str, dict]:
     """Value and σ, by camera."""
-    return {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
-            if "fx" in camera["parameters"]}  # fmt: skip
+    return {
+        id: camera["parameters"]["fx"]
+        for id, camera in result.cameras.items()
+        if "fx" in camera["parameters"]
+    }
 
 
 def distances_found(result: Adjustment) -> str:
     """The free principal distances, with their σ."""
-    return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
-                   for id, c in principal_distances(result).items()
-                   if c["free"] and c["sigma"])  # fmt: skip
+    return "".join(
+        f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
+        for id, c in principal_distances(result).items()
+        if c["free"] and c["sigma"]
+    )
 
 
 def misfit_in_words(part: Part) -> str:

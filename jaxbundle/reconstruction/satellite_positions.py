@@ -23,26 +23,41 @@ def find_positions(
     if control is None:
         found = map_positions(places)
         if found is None:
-            return None, [f"satellite positions of {there} photographs are not used: expected "
-                          "three or more with heights"] * bool(there)  # fmt: skip
+            return None, [
+                f"satellite positions of {there} photographs are not used: expected "
+                "three or more with heights"
+            ] * bool(there)
         if not found.define_frame:
-            return found, ["satellite positions of the photographs extend over less than 8 σ: they "
-                           "do not define the frame"]  # fmt: skip
+            return found, [
+                "satellite positions of the photographs extend over less than 8 σ: they "
+                "do not define the frame"
+            ]
         return found, [f"satellite positions of the photographs: {found.words}"]
     notes = [f"control in {control.system or 'a system that its file does not name'}"]
     if not there:
-        return None, [*notes, "no satellite positions in the photographs: control alone gives the "
-                      "frame"]  # fmt: skip
+        return None, [
+            *notes,
+            "no satellite positions in the photographs: control alone gives the frame",
+        ]
     found = map_positions(places, control.system)
     if found is None:
-        return None, [*notes, f"satellite positions of {there} photographs are not used: they need "
-                      "heights, three photographs, and a system of control in metres"]  # fmt: skip
+        return None, [
+            *notes,
+            f"satellite positions of {there} photographs are not used: they need "
+            "heights, three photographs, and a system of control in metres",
+        ]
     if not control.system:
         away = np.nanmedian(found.X, 0) - np.median(control.points.position, axis=0)
         distance = float(np.hypot(*away[:2]))
         if distance > FARTHEST_CONTROL:
-            return None, [*notes, "satellite positions of the photographs are not used: they are "
-                          f"{distance / 1000:.0f} km from control in {found.system}; name the "
-                          "system of control in the first line of gcp_list.txt"]  # fmt: skip
-    return found, [*notes, f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
-                   f"photographs with their σ, in {found.words}"]  # fmt: skip
+            return None, [
+                *notes,
+                "satellite positions of the photographs are not used: they are "
+                f"{distance / 1000:.0f} km from control in {found.system}; name the "
+                "system of control in the first line of gcp_list.txt",
+            ]
+    return found, [
+        *notes,
+        f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
+        f"photographs with their σ, in {found.words}",
+    ]

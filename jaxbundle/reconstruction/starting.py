@@ -41,9 +41,7 @@ LEAST_OF_IMAGES, OF_OTHERS = 0.5, 1
 maximum number of such start values that are adjusted."""
 
 
-def start_values(
-    network: Network, guessed: Sequence[str], pairs: NamedPairs
-) -> Iterator[Oriented]:
+def start_values(network: Network, guessed: Sequence[str], pairs: NamedPairs) -> Iterator[Oriented]:
     """The network with start values, by one method after another.
 
     **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files; `pairs`:
@@ -67,8 +65,9 @@ def start_values(
             others.append(_orient(changed, START_TOLERANCE, {}))
         except NotSolvedError:
             continue
-    enough = [one for one in others
-              if len(one.network.images) >= LEAST_OF_IMAGES * len(network.images)]  # fmt: skip
+    enough = [
+        one for one in others if len(one.network.images) >= LEAST_OF_IMAGES * len(network.images)
+    ]
     yield from sorted(enough, key=lambda one: -len(one.network.observations))[:OF_OTHERS]
     if failed is not None and not found and not enough:
         raise failed
@@ -116,9 +115,15 @@ def _with_other_distances(network: Network, guessed: Sequence[str]) -> Iterator[
 
 def _with_distances(network: Network, distances: Mapping[str, float]) -> Network:
     """The network with principal distances of some cameras, also in their observations."""
-    changed = lambda c: dataclasses.replace(c, parameters={
-        **c.parameters, "fx": distances[c.id], "fy": distances[c.id], "k1": 0.0,
-    })  # fmt: skip
+    changed = lambda c: dataclasses.replace(
+        c,
+        parameters={
+            **c.parameters,
+            "fx": distances[c.id],
+            "fy": distances[c.id],
+            "k1": 0.0,
+        },
+    )
     network = network.replace(
         cameras=tuple(changed(c) if c.id in distances else c for c in network.cameras)
     )

@@ -51,9 +51,9 @@ def adjusted_photographs(result) -> Network | None:
             kept[part.rows] = found.used[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))
     points = network.points
-    X = np.array([
-        adjusted.get(id, given) for id, given in zip(points.id, points.position)
-    ]).reshape(-1, 3)  # fmt: skip
+    X = np.array(
+        [adjusted.get(id, given) for id, given in zip(points.id, points.position)]
+    ).reshape(-1, 3)
     roles = tuple("tie" if role == "control" else role for role in points.role)
     held = network.images.sigma == 0
     return network.replace(
@@ -61,11 +61,17 @@ def adjusted_photographs(result) -> Network | None:
             dataclasses.replace(camera, parameters=parameters[camera.id], sigma={})
             for camera in network.cameras
         ),
-        images=Images(network.images.id, network.images.camera,
-                      np.asarray(poses.position) + declared.given.origin,
-                      np.asarray(angles(poses.rotation)), np.where(held, 0.0, np.nan),
-                      network.images.source),
+        images=Images(
+            network.images.id,
+            network.images.camera,
+            np.asarray(poses.position) + declared.given.origin,
+            np.asarray(angles(poses.rotation)),
+            np.where(held, 0.0, np.nan),
+            network.images.source,
+        ),
         points=Points(points.id, roles, X, np.full_like(points.sigma, np.nan), points.source),
         observations=network.observations.take(kept),
-        datum="inner", datum_points=(), warnings=("refined with scanner images",),
-    )  # fmt: skip
+        datum="inner",
+        datum_points=(),
+        warnings=("refined with scanner images",),
+    )

@@ -52,13 +52,14 @@ def choose_rays(
             "and observations"
         )
     if frames is not None and (lost := ~used[row[frames.distances.points]].all(1)).any():
-        warnings.append(
-            f"left out {count(lost.sum(), 'distance')} to an excluded point"
-        )
+        warnings.append(f"left out {count(lost.sum(), 'distance')} to an excluded point")
 
     def rays(mask):
-        return Rays(np.flatnonzero(mask[observations.point]), np.flatnonzero(mask[frame_point]),
-                    np.flatnonzero(mask))  # fmt: skip
+        return Rays(
+            np.flatnonzero(mask[observations.point]),
+            np.flatnonzero(mask[frame_point]),
+            np.flatnonzero(mask),
+        )
 
     return rays(used), rays(check), warnings
 

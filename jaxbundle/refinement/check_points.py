@@ -70,10 +70,11 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
     return CheckPoints(
         tuple(given.points.id[k] for k in rays.points),
         np.where(known, np.einsum("pki,pi->pk", axes, change), np.nan),
-        np.where(known, sigma, np.nan), checks.number_of_rays,
+        np.where(known, sigma, np.nan),
+        checks.number_of_rays,
         of_rays(here.residuals[p.set] / weight[p.set] for p in checks.parts),
         of_rays(found.sigma0 * np.sqrt(1 + spread[p.set]) / weight[p.set] for p in checks.parts),
-    )  # fmt: skip
+    )
 
 
 @compile_once

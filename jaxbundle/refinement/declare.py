@@ -82,8 +82,9 @@ def gather(images, points: GroundPoints, observations, frames: Network | None) -
     absolute = any(one.image.corrections.any for one in images)
     known = points.X[np.isfinite(points.X).all(1)]
     origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
-    return Given(images, points, observations, frames, forms, sensor,
-                 np.array(of_frames, int), origin)  # fmt: skip
+    return Given(
+        images, points, observations, frames, forms, sensor, np.array(of_frames, int), origin
+    )
 
 
 def sensor_of(one: ScannerImage) -> str:
@@ -206,8 +207,9 @@ def declare(given: Given, rays: Rays, X, values: Values | None = None) -> Declar
         tables += [t for t in photographs.tables if t.name != "point"]
         of_cameras = {
             network.cameras[c].id: (t.name, row)
-            for t in photographs.layout.cameras for row, c in enumerate(t.cameras)
-        }  # fmt: skip
+            for t in photographs.layout.cameras
+            for row, c in enumerate(t.cameras)
+        }
         columns += _columns_of_photographs(network, tables, of_cameras)
     seen = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
     table, control, at = _points(given, chosen, X, seen)
@@ -218,8 +220,7 @@ def declare(given: Given, rays: Rays, X, values: Values | None = None) -> Declar
                 observed.append(kinds.priors(t.name)((np.arange(t.rows),), sigma=prior))
         if not columns:
             raise InputError(
-                "refine: every unknown is held; free some, such as attitude = \"free\" in "
-                "[unknowns]"
+                'refine: every unknown is held; free some, such as attitude = "free" in [unknowns]'
             )
     tables = [dataclasses.replace(t, value=values.get(t.name, t.value)) for t in tables]
     eliminate = "point" if table.free.any() else None
@@ -250,8 +251,9 @@ def _corrections(given: Given):
         for row, i in enumerate(of):
             columns[i] += [
                 Column(named[i][start + k], float(sigma[row, k]), title, row, d)
-                for d, k in enumerate(moving) if free[row, d]
-            ]  # fmt: skip
+                for d, k in enumerate(moving)
+                if free[row, d]
+            ]
     return tables, [column for of_image in columns for column in of_image]
 
 
@@ -322,7 +324,8 @@ def _check_near(given: Given, rows, v) -> None:
     row, away = int(rows[far.argmax()]), v[far.argmax()]
     p, id = observations.point[row], given.images[observations.image[row]].id
     said = (
-        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away" if np.isfinite(away).all()
+        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away"
+        if np.isfinite(away).all()
         else "where the camera does not look"
     )
     raise InputError(

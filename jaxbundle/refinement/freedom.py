@@ -169,20 +169,18 @@ def pad_forms(forms: list[Form]) -> list[Form]:
 def change_of(sizes: Sizes, p: Float[AnyArray, " n"]) -> Change:
     """The unknowns of one image out of their vector."""
     parts = Change(*jnp.split(p, np.cumsum(sizes)[:-1]))
-    return parts._replace(
-        jitter=parts.jitter.reshape(3, -1), focal_length=parts.focal_length[0]
-    )
+    return parts._replace(jitter=parts.jitter.reshape(3, -1), focal_length=parts.focal_length[0])
 
 
-def change_image(
-    image: PushbroomImage, form: Form, change: Change, t: Scalar
-) -> PushbroomImage:
+def change_image(image: PushbroomImage, form: Form, change: Change, t: Scalar) -> PushbroomImage:
     """The image at the time t with its unknowns changed."""
     jitter = form.spline.at(change.jitter, t)
     return dataclasses.replace(
-        image, offsets=change_offsets(image.offsets, form.axes, change, jitter),
-        mounting=image.mounting + change.mounting, optics=change_optics(image, change),
-    )  # fmt: skip
+        image,
+        offsets=change_offsets(image.offsets, form.axes, change, jitter),
+        mounting=image.mounting + change.mounting,
+        optics=change_optics(image, change),
+    )
 
 
 def change_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "3"]) -> Offsets:
@@ -215,11 +213,19 @@ def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
     room = lambda sigma, n: np.r_[sigma, np.full(n - len(sigma), np.nan)]
     one, sizes, knots = freedom, form.sizes, form.spline.unknowns
     jitter = [room(np.repeat(s, knots), sizes.jitter // 3) for s in one.jitter]
-    return np.concatenate([
-        one.attitude, one.attitude_rate, *jitter, one.position, one.position_rate,
-        [one.focal_length], one.mounting, room(one.look_across, sizes.look_across),
-        room(one.look_along, sizes.look_along),
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            one.attitude,
+            one.attitude_rate,
+            *jitter,
+            one.position,
+            one.position_rate,
+            [one.focal_length],
+            one.mounting,
+            room(one.look_across, sizes.look_across),
+            room(one.look_along, sizes.look_along),
+        ]
+    )
 
 
 def names(sizes: Sizes, image: str, sensor: str) -> list[Name]:
@@ -230,8 +236,9 @@ def names(sizes: Sizes, image: str, sensor: str) -> list[Name]:
     found += [Name(own, f"{x} drift", "arcsec/s", arcsec, f"{x} drift") for x in TURNS]
     found += [
         Name(own, f"{x} jitter {k + 1}", "arcsec", arcsec, f"{x} jitter")
-        for x in TURNS for k in range(sizes.jitter // 3)
-    ]  # fmt: skip
+        for x in TURNS
+        for k in range(sizes.jitter // 3)
+    ]
     found += [Name(own, f"position {x}", "m", 1.0, f"position {x}") for x in TRACK]
     found += [Name(own, f"velocity {x}", "m/s", 1.0, f"velocity {x}") for x in TRACK]
     found += [Name(of, "focal length (relative)", "ppm", 1e6, "focal length")]

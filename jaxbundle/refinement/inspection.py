@@ -185,8 +185,10 @@ def _name(declared: Declared, one) -> Removed:
         part = declared.parts[number]
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
-        told = [f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
-                for r in one.rows]  # fmt: skip
+        told = [
+            f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
+            for r in one.rows
+        ]
         name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
         rows = [int(place[before + r]) for r in one.rows]
         return Removed("image", rows[0], name, one.test, tuple(rows[1:]))

@@ -144,11 +144,17 @@ def line_of(image: PushbroomImage, form: Form, origin, place: Float[AnyArray, "2
     weights = form.spline.weights(t)
     powers = lambda n: jnp.array([((place[1] - middle) / half) ** k for k in range(n)])
     return Line(
-        pose._replace(P=pose.P - origin), t - image.middle_time, image.offsets, image.mounting,
-        form.axes, jnp.pad(weights, (0, form.sizes.jitter // 3 - len(weights))),
-        jnp.stack(image.optics.slopes(place[1])), powers(form.sizes.look_across),
-        powers(form.sizes.look_along), jnp.eye(2),
-    )  # fmt: skip
+        pose._replace(P=pose.P - origin),
+        t - image.middle_time,
+        image.offsets,
+        image.mounting,
+        form.axes,
+        jnp.pad(weights, (0, form.sizes.jitter // 3 - len(weights))),
+        jnp.stack(image.optics.slopes(place[1])),
+        powers(form.sizes.look_across),
+        powers(form.sizes.look_along),
+        jnp.eye(2),
+    )
 
 
 def lines_of(

@@ -42,10 +42,15 @@ def refined_image(image: PushbroomImage, form: Form, change: Change) -> Pushbroo
     """An image without offsets that equals `image` with its changes."""
     moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
-        Trajectory(_position(moved), _attitude(image, form, change)), image.times,
-        _optics(image, change), moved.mounting, no_offsets(), image.corrections,
-        image.lines, image.pixels,
-    )  # fmt: skip
+        Trajectory(_position(moved), _attitude(image, form, change)),
+        image.times,
+        _optics(image, change),
+        moved.mounting,
+        no_offsets(),
+        image.corrections,
+        image.lines,
+        image.pixels,
+    )
 
 
 def _position(moved: PushbroomImage) -> Table:
@@ -166,8 +171,8 @@ def _sum(base, e, added):
     for own, more in ((base.across, added.across), (base.along, added.along)):
         line = np.array([float(base.middle - added.middle), float(base.half)]) / float(added.half)
         moved = np.polynomial.Polynomial(np.asarray(more))(np.polynomial.Polynomial(line)).coef
-        total.append(jnp.asarray(np.polynomial.polynomial.polyadd(
-            np.asarray(own) / (1 + float(e)), moved
-        )))  # fmt: skip
+        total.append(
+            jnp.asarray(np.polynomial.polynomial.polyadd(np.asarray(own) / (1 + float(e)), moved))
+        )
     across, along = total
     return AnglePolynomial(across, along, base.middle, base.half)

@@ -131,9 +131,7 @@ class Refinement:
         rows = [
             {"image": images[i], "point": points[p], "v": v, "r": r, "w": w, "removed": bool(gone)}
             for part in declared.parts
-            for i, p, v, r, w, gone in zip(
-                part.image, part.point, *self.inspection.rows(part.set)
-            )
+            for i, p, v, r, w, gone in zip(part.image, part.point, *self.inspection.rows(part.set))
         ]
         return [rows[k] for k in np.argsort(declared.image, kind="stable")]
 
@@ -144,10 +142,16 @@ class Refinement:
         for given in found.declared.problem.observations:
             if given.kind.name == "distances":
                 rows += [
-                    {"from": self.point_ids[a], "to": self.point_ids[b], "v": float(v[0]),
-                     "r": float(r[0]), "w": float(w[0]), "removed": bool(gone)}
+                    {
+                        "from": self.point_ids[a],
+                        "to": self.point_ids[b],
+                        "v": float(v[0]),
+                        "r": float(r[0]),
+                        "w": float(w[0]),
+                        "removed": bool(gone),
+                    }
                     for a, b, v, r, w, gone in zip(*given.rows, *found.rows(given.name))
-                ]  # fmt: skip
+                ]
         return rows
 
 

@@ -19,14 +19,24 @@ def to_json(result: Refinement) -> dict:
     factor = np.array([name.factor for name in names])
     sigma = found.sigma
     document = {
-        "sigma0": result.sigma0, "redundancy": result.redundancy, "steps": found.steps,
+        "sigma0": result.sigma0,
+        "redundancy": result.redundancy,
+        "steps": found.steps,
         "global_test": result.global_test(),
         "warnings": list(result.warnings),
         "unknowns": [
-            {"of": n.owner, "name": n.parameter, "unit": n.unit, "change": value,
-             "sigma": s, "prior_sigma": None if np.isinf(p) else p}
+            {
+                "of": n.owner,
+                "name": n.parameter,
+                "unit": n.unit,
+                "change": value,
+                "sigma": s,
+                "prior_sigma": None if np.isinf(p) else p,
+            }
             for n, value, s, p in zip(
-                names, (factor * result.estimate).tolist(), (factor * sigma).tolist(),
+                names,
+                (factor * result.estimate).tolist(),
+                (factor * sigma).tolist(),
                 (factor * prior).tolist(),
             )
         ],
@@ -37,7 +47,7 @@ def to_json(result: Refinement) -> dict:
             for row in result.image_points()
         ],
         "removed": [{"observation": b.name, "test": b.test} for b in result.removed],
-    }  # fmt: skip
+    }
     if result.distances():
         document["distances"] = result.distances()
     if result.check is not None:
@@ -53,10 +63,15 @@ def to_json(result: Refinement) -> dict:
 def _points(result):
     rows, sigma = [], result.inspection.point_sigma.tolist()
     for k, X, s in zip(result.inspection.declared.rays.points, result.positions.tolist(), sigma):
-        rows.append({
-            "id": result.points.id[k], "role": result.points.role[k], "X": X, "sigma": s,
-            "axes": list(result.points.axis_names),
-        })  # fmt: skip
+        rows.append(
+            {
+                "id": result.points.id[k],
+                "role": result.points.role[k],
+                "X": X,
+                "sigma": s,
+                "axes": list(result.points.axis_names),
+            }
+        )
     return rows
 
 
@@ -82,7 +97,7 @@ def report(result: Refinement, verdict: str = "") -> str:
     for one in [*(image.id for image in result.images), *_photographs(result)]:
         v = np.array([row["v"] for row in used if row["image"] == one])
         if len(v):
-            unit = ("lines, pixels" if one in {i.id for i in result.images} else "camera's unit")
+            unit = "lines, pixels" if one in {i.id for i in result.images} else "camera's unit"
             rms = np.sqrt((v**2).mean(0))
             lines.append(f"RMS of image {one}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
     if result.warnings:
@@ -107,9 +122,7 @@ def _photographs(result):
 def _unknowns(result):
     sigma = result.inspection.sigma
     yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
-    for name, value, s, p in zip(
-        result.names, result.estimate, sigma, result.prior_sigma
-    ):
+    for name, value, s, p in zip(result.names, result.estimate, sigma, result.prior_sigma):
         prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
         yield (
             f"  {str(name):46s} {value * name.factor:13.5f} {s * name.factor:11.5f} {prior:>10s} "
@@ -144,7 +157,8 @@ def _checks(result):
     names = ("east", "north", "up") if earth else ("X", "Y", "Z")
     yield f"Check points, computed − given ({', '.join(names)}; m)"
     for id, d, s, n in zip(c.id, c.difference, c.sigma, c.rays):
-        cells = " ".join("        – ±    – " if np.isnan(x) else f"{x:9.3f} ±{y:6.3f}"
-                         for x, y in zip(d, s))  # fmt: skip
+        cells = " ".join(
+            "        – ±    – " if np.isnan(x) else f"{x:9.3f} ±{y:6.3f}" for x, y in zip(d, s)
+        )
         yield f"  {id:12s} {cells}  {n} image{'' if n == 1 else 's'}"
     yield "  RMS          " + " ".join("–" if np.isnan(x) else f"{x:.3f}" for x in c.rms)

@@ -52,7 +52,11 @@ class GroundPoints:
 
 
 def local_points(
-    id, role, X, sigma=None, source: Source = Source("points")  # noqa: B008
+    id,
+    role,
+    X,
+    sigma=None,
+    source: Source = Source("points"),  # noqa: B008
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
     X = np.asarray(X, float)
@@ -74,12 +78,14 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     role = ["control" if theirs.role[k] == "fixed" else theirs.role[k] for k in new]
     fixed = theirs.has_role("fixed")[new, None]
     return GroundPoints(
-        (*points.id, *(theirs.id[k] for k in new)), (*points.role, *role),
+        (*points.id, *(theirs.id[k] for k in new)),
+        (*points.role, *role),
         np.concatenate([X, theirs.position[new]]),
         np.concatenate([points.sigma, np.where(fixed, 0.0, theirs.sigma[new])]),
         np.concatenate([points.axes, np.tile(np.eye(3), (len(new), 1, 1))]),
-        points.axis_names, points.source,
-    )  # fmt: skip
+        points.axis_names,
+        points.source,
+    )
 
 
 def check_points_table(points: GroundPoints) -> None:
@@ -120,15 +126,20 @@ def check_observations(
         if not (observations.sigma[row] > 0).all():
             raise InputError(f"{where}: σ must be positive, in lines and pixels")
         if (i, p) in seen:
-            raise InputError(f"{where} is measured twice, also at "
-                             f"{observations.source(seen[i, p])}; keep one")
+            raise InputError(
+                f"{where} is measured twice, also at {observations.source(seen[i, p])}; keep one"
+            )
         seen[i, p] = row
     for i, one in enumerate(images):
         rows = np.flatnonzero(observations.image == i)
         t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
-        tables = ("positions", one.image.trajectory.position), (
-            "attitude", one.image.trajectory.attitude.table,
-        )  # fmt: skip
+        tables = (
+            ("positions", one.image.trajectory.position),
+            (
+                "attitude",
+                one.image.trajectory.attitude.table,
+            ),
+        )
         for what, table in tables:
             out = ~np.asarray(covers(table, interval(table, t), t))
             if out.any():

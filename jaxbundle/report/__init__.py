@@ -46,7 +46,7 @@ def text(
     **Returns:** text that ends with a line feed.
     """
     if test not in observations.TESTS:
-        raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
+        raise ValueError(f'test must be "pope" or "baarda", not {test!r}')
     lines = head.title(adjustment, date)
     lines += [*head.settings(adjustment, verdict), *head.counts(adjustment)]
     if not adjustment.converged:

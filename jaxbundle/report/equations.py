@@ -66,7 +66,11 @@ EQUATIONS: dict[str, tuple[str, ...]] = {
     "division": ("[X, Y, Z] ∝ [m, 1 + k·ρ²],   " + _PIXEL, _LENS, _RAY, _PX),
     "kannala-brandt-tangential": (*_ANGLE, *_FISHEYE, _RAY, _PX),
     "thin-prism-fisheye": (
-        *_ANGLE, *_FISHEYE, "and sx1·t² added to a′, sy1·t² to b′", _RAY, _PX,
+        *_ANGLE,
+        *_FISHEYE,
+        "and sx1·t² added to a′, sy1·t² to b′",
+        _RAY,
+        _PX,
     ),
     "rad-tan-thin-prism-fisheye": (
         *_ANGLE,

@@ -34,8 +34,10 @@ REDUCTIONS = {
     "iterative": "conjugate gradients",
 }
 KINDS = {
-    STATED: "σ a priori", UNIT: "unit of weight", ESTIMATED: "σ estimated",
-}  # fmt: skip
+    STATED: "σ a priori",
+    UNIT: "unit of weight",
+    ESTIMATED: "σ estimated",
+}
 """How the σ of image coordinates are called by their origin."""
 DOMAINS = {
     "corrected": "corrected: the measurement freed of distortion against the ideal image",
@@ -223,9 +225,10 @@ def convergence(adjustment) -> list[str]:
         *heading("Convergence"),
         *table(("iteration", "vᵀPv", "λ (damping)", "step"), rows, "rrrl"),
         "",
-        *paragraph(f"Ended after {count(adjustment.iterations, 'iteration')}, "
-                   f"{adjustment.termination}."),
-    ]  # fmt: skip
+        *paragraph(
+            f"Ended after {count(adjustment.iterations, 'iteration')}, {adjustment.termination}."
+        ),
+    ]
     if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
         lines += paragraph(
             "The table shows the last of several adjustments: observations or parameters were "
@@ -319,9 +322,7 @@ def messages(adjustment) -> list[str]:
 
 def why_not_solved(adjustment) -> list[str]:
     """The reason why there is no result, undetermined unknowns, remedy."""
-    return [
-        *heading("Not solved"), *paragraph(NO_RESULT), "", *facts(failure_facts(adjustment))
-    ]
+    return [*heading("Not solved"), *paragraph(NO_RESULT), "", *facts(failure_facts(adjustment))]
 
 
 def failure_facts(adjustment) -> list[tuple[str, str]]:

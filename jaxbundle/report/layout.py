@@ -162,9 +162,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> l
     where the table would be wider than the page.
     """
     rows = [[clean(cell) for cell in row] for row in rows]
-    widths = [
-        max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)
-    ]
+    widths = [max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)]
     gap = 2 if sum(widths) + 2 * (len(widths) - 1) <= WIDTH else 1
     excess = sum(widths) + gap * (len(widths) - 1) - WIDTH
     names = [i for i, kind in enumerate(align) if kind == "l"]

@@ -155,10 +155,16 @@ def components(adjustment) -> list[str]:
     """Variance components: the estimated σ of every group, relative to the given ones and
     absolute."""
     rows = [
-        (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
-         significant(c.sigma, 4), span(c.estimated, 3))
+        (
+            name,
+            str(c.observations),
+            f"{c.redundancy:.2f}",
+            significant(c.vtpv, 5),
+            significant(c.sigma, 4),
+            span(c.estimated, 3),
+        )
         for name, c in adjustment.variance_components.items()
-    ]  # fmt: skip
+    ]
     header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")
     lines = [*heading("Variance components"), *table(header, rows, "lrrrrr")]
     if adjustment.sigma_factors:
@@ -166,10 +172,13 @@ def components(adjustment) -> list[str]:
             f"{clean(name)} by {significant(factor, 4)}"
             for name, factor in adjustment.sigma_factors.items()
         )
-        lines += ["", *paragraph(
-            f"Estimated: the given σ were multiplied, {names}. A priori elsewhere "
-            "in this report means these estimated σ."
-        )]  # fmt: skip
+        lines += [
+            "",
+            *paragraph(
+                f"Estimated: the given σ were multiplied, {names}. A priori elsewhere "
+                "in this report means these estimated σ."
+            ),
+        ]
     return lines
 
 
@@ -216,7 +225,7 @@ def downweighted(adjustment, most: int) -> list[str]:
         f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
         "the median of the residuals (MAD). "
         f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals above "
-            f"the critical length{', in σ times the scale (test):' if rows else '.'}"
+        f"the critical length{', in σ times the scale (test):' if rows else '.'}"
     )
     if rows:
         header = ("", "kind", "observation", "test", "weight")
@@ -253,8 +262,9 @@ def check_points(adjustment, most: int) -> list[str]:
         ("largest", lambda x: x[np.abs(x).argmax()]),
     ):
         columns = (found[f"{kind}{axis}"] for kind in "ds" for axis in "XYZ")
-        columns = (x[np.isfinite(x)] if np.isfinite(x).any() else np.full(1, np.nan)
-                   for x in columns)  # fmt: skip
+        columns = (
+            x[np.isfinite(x)] if np.isfinite(x).any() else np.full(1, np.nan) for x in columns
+        )
         rows.append((name, *(fixed(float(of(column)), places) for column in columns), ""))
     lines = [
         *heading(f"Check points: intersected − given, in {unit}"),
@@ -281,9 +291,14 @@ def distances(adjustment, most: int) -> list[str]:
         sigma = adjustment.sigma0 * found["sigma"][i] * math.sqrt(max(1 - r, 0))
         values = (adjusted - v, found["sigma"][i], adjusted, sigma, v)
         rows.append(
-            (found["image"][i], found["point"][i], *(fixed(x, places) for x in values),
-             fixed(r, 3), fixed(found["tau"][i], 2))
-        )  # fmt: skip
+            (
+                found["image"][i],
+                found["point"][i],
+                *(fixed(x, places) for x in values),
+                fixed(r, 3),
+                fixed(found["tau"][i], 2),
+            )
+        )
     header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")
     lines = [
         *heading(f"Distances in {clean(adjustment.network.object_unit)}"),

@@ -30,9 +30,12 @@ def conclude_refinement(result) -> Verdict:
     w, r = (np.concatenate([row[name] for row in used]) for name in ("w", "r"))
     found = result.global_test()
     fit = judge_fit(
-        found, describe_test(found, UNIT_OF_WEIGHT), result.sigma0,
-        bool(np.isfinite(result.prior_sigma).any()), result.redundancy,
-    )  # fmt: skip
+        found,
+        describe_test(found, UNIT_OF_WEIGHT),
+        result.sigma0,
+        bool(np.isfinite(result.prior_sigma).any()),
+        result.redundancy,
+    )
     findings = [fit, describe_reliability(r, "coordinate"), _blunders(result, found, w)]
     if result.check is not None:
         findings.append(_check_points(result.check))

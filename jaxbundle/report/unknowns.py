@@ -101,9 +101,8 @@ def _many_cameras(adjustment) -> list[str]:
     for name, model in _models(adjustment).items():
         chosen = {id: entry for id, entry in tables.items() if entry["model"] == name}
         names = [
-            p for p in model.parameters
-            if any(e["parameters"][p]["free"] for e in chosen.values())
-        ]  # fmt: skip
+            p for p in model.parameters if any(e["parameters"][p]["free"] for e in chosen.values())
+        ]
         rows = []
         for camera, entry in chosen.items():
             cells = [
@@ -178,17 +177,23 @@ def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[st
     excluded = np.flatnonzero(adjustment.problem.excluded)
     if len(excluded):
         names = list_some((adjustment.network.points.id[p] for p in excluded), 20, clean)
-        lines += ["", *paragraph(
-            f"Without coordinates, because the rays left by data snooping do not determine them: "
-            f"{names}."
-        )]  # fmt: skip
+        lines += [
+            "",
+            *paragraph(
+                "Without coordinates, because the rays left by data snooping do not determine "
+                "them: "
+                f"{names}."
+            ),
+        ]
     return [*lines, *_list_of_points(adjustment, most)]
 
 
 SUMMARY = (
-    ("median", np.median), ("95 %", lambda s: np.quantile(s, 0.95)), ("max", np.max),
+    ("median", np.median),
+    ("95 %", lambda s: np.quantile(s, 0.95)),
+    ("max", np.max),
     ("min", np.min),
-)  # fmt: skip
+)
 """Of the σ of the points. A handful of hardly determined points would make their mean and RMS."""
 
 

@@ -52,16 +52,21 @@ class Verdict(NamedTuple):
 def judge(adjustment) -> list[Finding]:
     """The findings of a solved adjustment."""
     return [
-        _fit(adjustment), _control(adjustment), *_checks(adjustment),
-        describe_reliability(adjustment.residuals["r"]), _blunders(adjustment),
+        _fit(adjustment),
+        _control(adjustment),
+        *_checks(adjustment),
+        describe_reliability(adjustment.residuals["r"]),
+        _blunders(adjustment),
         *_left_out(adjustment),
-    ]  # fmt: skip
+    ]
 
 
 def in_words(findings: list[Finding], warnings: int) -> tuple[str, str]:
     """The overall state, and a sentence for it."""
-    brief = {state: [f.brief or f.about for f in findings if f.state == state]
-             for state in (NOTED, DOUBTFUL, BAD)}  # fmt: skip
+    brief = {
+        state: [f.brief or f.about for f in findings if f.state == state]
+        for state in (NOTED, DOUBTFUL, BAD)
+    }
     doubtful = [*brief[DOUBTFUL], *([count(warnings, "warning")] if warnings else [])]
     if brief[BAD]:
         return BAD, f"The result does not meet its tests: {', '.join(brief[BAD])}."
@@ -82,8 +87,11 @@ def conclude(
 
 def _fit(adjustment) -> Finding:
     return judge_fit(
-        adjustment.global_test(), chi_squared(adjustment), adjustment.sigma0,
-        adjustment.weights_matter, adjustment.redundancy,
+        adjustment.global_test(),
+        chi_squared(adjustment),
+        adjustment.sigma0,
+        adjustment.weights_matter,
+        adjustment.redundancy,
     )
 
 
@@ -121,8 +129,10 @@ def _tested(adjustment, rows) -> tuple[float, float, str]:
     tau = tau[np.isfinite(tau)]
     largest = float(np.fmax.reduce(tau, initial=np.nan))
     limit = critical_value(adjustment, level=level_of_one(LEVEL, len(tau)))
-    words = (f"{significant(largest)}, critical value of the largest of {len(tau)} at "
-             f"{100 * LEVEL:g} % {significant(limit)}")  # fmt: skip
+    words = (
+        f"{significant(largest)}, critical value of the largest of {len(tau)} at "
+        f"{100 * LEVEL:g} % {significant(limit)}"
+    )
     return largest, limit, words
 
 
@@ -152,8 +162,10 @@ def _free_network(adjustment) -> Finding:
         words = "no control points; the datum is given by other observations (Datum)"
         brief = vague.partition(",")[0] or "no control points"
         return Finding("Control", NOTED, f"{words}; {vague}" if vague else words, brief)
-    words = (f"no control points: a free network, {open_part} are those of the start values (datum "
-             f"{adjustment.network.datum})")  # fmt: skip
+    words = (
+        f"no control points: a free network, {open_part} are those of the start values (datum "
+        f"{adjustment.network.datum})"
+    )
     return Finding("Control", NOTED, words, "free network")
 
 
@@ -198,8 +210,10 @@ def describe_reliability(r: np.ndarray, thing: str = "observation") -> Finding:
     """The finding about redundancy numbers: blunders in weakly controlled observations hardly show,
     which a design can change and an adjustment cannot."""
     weak, loose = count_weak(r)
-    words = (f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), thing)} weakly "
-             f"controlled (r < 0.1), {loose} uncontrolled")  # fmt: skip
+    words = (
+        f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), thing)} weakly "
+        f"controlled (r < 0.1), {loose} uncontrolled"
+    )
     brief = f"{weak} of {count(len(r), thing)} weakly controlled"
     return Finding("Reliability", NOTED if weak > WEAK_SHARE * len(r) else GOOD, words, brief)
 
@@ -246,14 +260,20 @@ def _left_out(adjustment) -> list[Finding]:
         if note.measured:
             thing = note.thing.removeprefix("tie ")
             number[thing] = number.get(thing, 0) + len(note.names)
-    kept = {"image": len(network.images), "point": len(network.points),
-            "image point": len(network.observations)}  # fmt: skip
-    share = {thing: f"{n} of {count(n + kept.get(thing, 0), thing)} left out"
-             for thing, n in number.items()}  # fmt: skip
+    kept = {
+        "image": len(network.images),
+        "point": len(network.points),
+        "image point": len(network.observations),
+    }
+    share = {
+        thing: f"{n} of {count(n + kept.get(thing, 0), thing)} left out"
+        for thing, n in number.items()
+    }
     doubtful = [
-        thing for thing, n in number.items()
+        thing
+        for thing, n in number.items()
         if thing == "image" or n > explained_by_chance(n + kept.get(thing, 0))
-    ]  # fmt: skip
+    ]
     few = sum(len(note.names) for note in notes if not note.measured)
     words = [*share.values(), *([f"{few} without enough rays"] if few else [])]
     brief = ", ".join(share[thing] for thing in doubtful or number) or "points without enough rays"

@@ -59,11 +59,13 @@ def image_points_removed(
     rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
     return [
         snooping.Removed(s.name, row, None, math.inf)
-        for s in problem.layout.sets if s.field == "image"
-        for row, place in enumerate(range(len(problem.image))
-                                    if s.rows is None else s.rows.tolist())
+        for s in problem.layout.sets
+        if s.field == "image"
+        for row, place in enumerate(
+            range(len(problem.image)) if s.rows is None else s.rows.tolist()
+        )
         if place in rows
-    ]  # fmt: skip
+    ]
 
 
 def either_of(names: Sequence[str]) -> str:

@@ -12,18 +12,22 @@ def groups(problem: Problem) -> list[Group]:
     """Image coordinates (by camera, if several have several images), control points by axis,
     priors, distances; further kinds by name."""
     network, layout, found = problem.network, problem.layout, []
-    of = {f: [s.name for s in layout.sets if s.field == f]
-          for f in ("image", "control", "exterior", "interior", "distance")}  # fmt: skip
+    of = {
+        f: [s.name for s in layout.sets if s.field == f]
+        for f in ("image", "control", "exterior", "interior", "distance")
+    }
     sets = [(s.name, s.cut(problem.camera)) for s in layout.sets if s.field == "image"]
     own = np.array_equal(network.images.camera, np.arange(len(network.cameras)))
     if len(network.cameras) == 1 or own:
         found.append(Group("image coordinates", [(o, np.s_[:]) for o, _ in sets]))
     else:
         found += [
-            Group(f"image coordinates, camera {given.id}",
-                  [(o, np.flatnonzero(camera == c)) for o, camera in sets])
+            Group(
+                f"image coordinates, camera {given.id}",
+                [(o, np.flatnonzero(camera == c)) for o, camera in sets],
+            )
             for c, given in enumerate(network.cameras)
-        ]  # fmt: skip
+        ]
     every = lambda field, *at: [(o, np.s_[:, *at] if at else np.s_[:]) for o in of[field]]
     for i, axis in enumerate("XYZ"):
         found.append(Group(f"control points in {axis}", every("control", i)))

@@ -52,6 +52,9 @@ def expected_precision(network: Network) -> ExpectedPrecision:
     sigma = lambda Q: np.sqrt(np.clip(np.diagonal(np.asarray(Q), axis1=1, axis2=2), 0, None))
     points = problem.network.points
     return ExpectedPrecision(
-        points.id, points.role, sigma(found.point_cofactors),
-        sigma(found.image_cofactors)[:, :3], problem.counts.redundancy,
-    )  # fmt: skip
+        points.id,
+        points.role,
+        sigma(found.point_cofactors),
+        sigma(found.image_cofactors)[:, :3],
+        problem.counts.redundancy,
+    )

@@ -58,10 +58,14 @@ def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
     sigma = along * np.sqrt(np.clip(Q[:, 2, 2], 0, None))
     ids = problem.network.points.id
     return FarPoints(
-        tuple(ids[p] for p in rows), problem.origin, X / r[:, None],
-        np.sqrt(np.clip(ellipse, 0, None)), np.where(there, 0.0, 1 / r),
-        np.where(there & (sigma == 0), np.nan, sigma), there,
-    )  # fmt: skip
+        tuple(ids[p] for p in rows),
+        problem.origin,
+        X / r[:, None],
+        np.sqrt(np.clip(ellipse, 0, None)),
+        np.where(there, 0.0, 1 / r),
+        np.where(there & (sigma == 0), np.nan, sigma),
+        there,
+    )
 
 
 def _inverse(w):

@@ -40,9 +40,7 @@ def describe_test(found: dict, unit: str, significance: float = LEVEL) -> str:
     if found["sigma_origin"] == ESTIMATED:
         return "not done: the σ were estimated from these residuals, so that σ0 is 1"
     if found["passed"] is None:
-        return (
-            f"no a priori σ was given: {unit} is a unit of weight; σ0 a posteriori estimates it"
-        )
+        return f"no a priori σ was given: {unit} is a unit of weight; σ0 a posteriori estimates it"
     vtpv, low, high = (f"{found[name]:.5g}" for name in ("vtpv", "low", "high"))
     said = (
         f"{'' if found['passed'] else 'not '}passed: vᵀPv {vtpv}, "

@@ -135,9 +135,7 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
                 place = table, row, column, of
                 (estimated if _is_free(table, row, column) else found).append(place)
     if not found and not estimated:
-        raise InputError(
-            f"{text}: there is no {parameter!r}{did_you_mean(parameter, known)}"
-        )
+        raise InputError(f"{text}: there is no {parameter!r}{did_you_mean(parameter, known)}")
     if not found:
         raise InputError(
             f"{text}: is estimated, and its σ is in the result; a budget is for held quantities"
@@ -152,9 +150,7 @@ def _tables_of(problem: Problem, kind: str) -> list[Table]:
         found = [problem.system.table(t.name) for t in problem.layout.cameras]
     if not found:
         known = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
-        raise InputError(
-            f"held: unknown kind {kind!r}; known: {list_some(known, 12, str)}"
-        )
+        raise InputError(f"held: unknown kind {kind!r}; known: {list_some(known, 12, str)}")
     return found
 
 

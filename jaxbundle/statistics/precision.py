@@ -99,7 +99,8 @@ def precision(
     return Precision(
         images=_root(
             image_variances(problem.network.images.angles, data.start.rotation, found.own["image"])
-        ) * sigma0,
+        )
+        * sigma0,
         cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
         covariance=found.covariance * jnp.square(sigma0),

@@ -62,14 +62,14 @@ def slopes_of_images(
     image over which the rotation is fitted.
     """
     if frame not in ("camera", "rotation"):
-        raise ValueError(f"frame must be \"camera\" or \"rotation\", not {frame!r}")
+        raise ValueError(f'frame must be "camera" or "rotation", not {frame!r}')
     A, B = (np.asarray(x) for x in _slopes(model, jnp.asarray(p, float), jnp.asarray(xy, float)))
     A = A[:, :, list(free)]
     if frame == "rotation":
         good = _are_finite(A, B)
-        turn = np.linalg.lstsq(
-            B[good].reshape(-1, 3), A[good].reshape(-1, A.shape[2]), rcond=None
-        )[0]
+        turn = np.linalg.lstsq(B[good].reshape(-1, 3), A[good].reshape(-1, A.shape[2]), rcond=None)[
+            0
+        ]
         A = A - B @ turn
     return A
 
@@ -118,9 +118,11 @@ def images_through_scene(
     """
     camera, X0 = np.asarray(estimate.camera), np.asarray(estimate.position)[views]
     directions = _directions(
-        model, camera[column, : len(model.parameters)], np.asarray(estimate.rotation)[views],
+        model,
+        camera[column, : len(model.parameters)],
+        np.asarray(estimate.rotation)[views],
         np.asarray(xy, float),
-    )  # fmt: skip
+    )
     near = np.asarray(1.0 / distance)
     return eqx.Partial(_images_through_scene, model, column, views, X0, directions, near)
 
@@ -130,9 +132,10 @@ def _images_through_scene(model, column, views, X0, directions, near, values: Va
     q = tuple(values.camera[column, : len(model.parameters)])
     change = near * (X0 - values.position[views])
     turned = jnp.einsum(
-        "vij,vnj->vni", jax.vmap(matrix_from_quaternion)(values.rotation[views]),
+        "vij,vnj->vni",
+        jax.vmap(matrix_from_quaternion)(values.rotation[views]),
         directions + change[:, None],
-    )  # fmt: skip
+    )
     image = jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, q, *ray))))(turned)
     return jnp.mean(image, 0).ravel()
 

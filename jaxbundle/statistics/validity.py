@@ -50,10 +50,12 @@ def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray,
     """The largest distance of a measurement of every camera from its principal point."""
     data, cameras = problem.data, problem.network.cameras
     models = [get_model(given.model) for given in cameras]
-    centre = np.array([
-        measured_centre(model, p[: len(model.parameters)])
-        for model, p in zip(models, np.asarray(values.camera))
-    ])
+    centre = np.array(
+        [
+            measured_centre(model, p[: len(model.parameters)])
+            for model, p in zip(models, np.asarray(values.camera))
+        ]
+    )
     camera = problem.camera
     used = (np.asarray(data.image_weight) > 0).any(1)
     away = np.linalg.norm(np.asarray(data.image_xy) - centre[camera], axis=1)

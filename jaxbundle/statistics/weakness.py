@@ -114,8 +114,10 @@ def weakness(inspection: Inspection, sigma0: float) -> Weakness:
     if georeference is None or sigma0 * georeference.rotation > 1 / NONLINEAR_RATIO:
         return _in_words(problem, found)
     own = find_weak(inspection.solution, extents, sigma0, {"image": georeference.of_images})
-    said = "" if own.names == found.names else georeference.in_words(
-        sigma0, problem.network.object_unit
+    said = (
+        ""
+        if own.names == found.names
+        else georeference.in_words(sigma0, problem.network.object_unit)
     )
     return dataclasses.replace(_in_words(problem, own), georeference=said)
 
@@ -147,9 +149,9 @@ def find_georeference(inspection: Inspection) -> Georeference | None:
     that Q_ττ is propagated. None for points at any distance, and for fewer than three."""
     problem, values = inspection.problem, inspection.adjusted
     tables = inspection.solution.values
-    moves = directions_of_motions(problem.system.declared, {
-        name: tables[name] for name in ("image", "point")
-    })  # fmt: skip
+    moves = directions_of_motions(
+        problem.system.declared, {name: tables[name] for name in ("image", "point")}
+    )
     X, n = np.asarray(values.point), len(problem.network.points)
     rows = np.flatnonzero(np.isfinite(X[:n]).all(1) & ~problem.at_any_distance)
     of_points = np.asarray(moves["point"])[rows]
@@ -162,9 +164,11 @@ def find_georeference(inspection: Inspection) -> Georeference | None:
     largest = lambda C: float(np.sqrt(max(np.linalg.eigvalsh(C)[-1], 0.0)))
     G = np.asarray(moves["image"])[: len(problem.network.images)]
     return Georeference(
-        largest(whole @ Q @ whole.T), largest(Q[ROTATION, ROTATION]), largest(Q[SCALE:, SCALE:]),
+        largest(whole @ Q @ whole.T),
+        largest(Q[ROTATION, ROTATION]),
+        largest(Q[SCALE:, SCALE:]),
         np.einsum("iaj,jk,iak->ia", G, Q, G),
-    )  # fmt: skip
+    )
 
 
 def _similarity_of(inverse, rows, values):
@@ -192,9 +196,7 @@ def _extents(inspection: Inspection) -> Extents:
         model = get_model(table.model)
         moving = problem.system.table(table.name).vector.moving
         at = [model.parameters.index(name) for name in model.principal_distance]
-        judged = np.array([
-            model.parameters[j] in model.core for j in moving
-        ], bool)  # fmt: skip
+        judged = np.array([model.parameters[j] in model.core for j in moving], bool)
         shortest = np.abs(np.asarray(values.camera)[table.cameras][:, at]).min(1)
         shortest = np.maximum(shortest, np.finfo(float).tiny)
         found[table.name] = judged / shortest[:, None]

@@ -26,10 +26,16 @@ def accuracy_of(cloud: Cloud) -> dict[str, Any]:
     found: dict[str, Any] = {"points": int(known.sum())}
     for k, axis in enumerate(AXES):
         s = sigma[:, k]
-        found[f"s{axis}"] = {} if not len(s) else {
-            "mean": float(s.mean()), "median": float(np.median(s)), "largest": float(s.max()),
-            "smallest": float(s.min()),
-        }  # fmt: skip
+        found[f"s{axis}"] = (
+            {}
+            if not len(s)
+            else {
+                "mean": float(s.mean()),
+                "median": float(np.median(s)),
+                "largest": float(s.max()),
+                "smallest": float(s.min()),
+            }
+        )
     largest = sigma.max(1) if len(sigma) else np.zeros(0)
     number, _ = np.histogram(largest, CLASSES)
     found["classes"] = [
@@ -57,10 +63,11 @@ def at_check_points(
             misclosure.append(np.linalg.lstsq(A, d[:, 2], rcond=None)[0][0])
     v = np.array(misclosure)
     return {
-        "points": len(v), "rms_Z": float(np.sqrt(np.mean(v**2))) if len(v) else None,
+        "points": len(v),
+        "rms_Z": float(np.sqrt(np.mean(v**2))) if len(v) else None,
         "mean_Z": float(v.mean()) if len(v) else None,
         "largest_Z": float(np.abs(v).max()) if len(v) else None,
-    }  # fmt: skip
+    }
 
 
 def to_plane(X: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
@@ -70,6 +77,7 @@ def to_plane(X: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
     distance = (X - middle) @ axes[2]
     return {
         "rms": float(np.sqrt(np.sum(distance**2) / max(len(X) - 3, 1))),
-        "largest": float(np.abs(distance).max()), "normal": axes[2].tolist(),
+        "largest": float(np.abs(distance).max()),
+        "normal": axes[2].tolist(),
         "point": middle.tolist(),
-    }  # fmt: skip
+    }

@@ -122,9 +122,10 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
         slope = bend_at(rough, uv[k]).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
         shape = windows(base, other, base.points(uv[k], here), normal)
-        ends = here[:, None] * np.array([1.0, 1.0]) + [0.0, 1e-3] / guide.rate[row[k], column[k]][
-            :, None
-        ]
+        ends = (
+            here[:, None] * np.array([1.0, 1.0])
+            + [0.0, 1e-3] / guide.rate[row[k], column[k]][:, None]
+        )
         places = positions(base, other, uv[k], ends)
         start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
         match = refine(base, other, uv[k], start, shape.A, half)
@@ -136,14 +137,17 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
         step = change[good] / guide.rate[row[moved], column[moved]]
         q[row[moved], column[moved]] = (here - np.sum(slope * shift, 1))[good] + step
         along = np.einsum("ni,nij,nj->n", rate[good], match.covariance[good], rate[good])
-        sigma[row[moved], column[moved]] = np.sqrt(along) / np.sum(rate[good]**2, 1)
+        sigma[row[moved], column[moved]] = np.sqrt(along) / np.sum(rate[good] ** 2, 1)
         left[moved] = False
     return Nodes(dataclasses.replace(guide, q=q), sigma)
 
 
 def second_differences(
-    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
-    q: Float[np.ndarray, " n"], bend: Bend,
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, " n"],
+    bend: Bend,
 ) -> Float[np.ndarray, "n 3 2"]:
     """p_uu, p_uv, p_vv: derivatives of the position in the other image by u and v of the base,
     pixels⁻¹."""
@@ -162,8 +166,11 @@ def second_differences(
 
 
 def response(
-    grey: Float[np.ndarray, "rows columns"], uv: Float[np.ndarray, "n 2"],
-    A: Float[np.ndarray, "n 2 2"], second: Float[np.ndarray, "n 3 2"], half: int,
+    grey: Float[np.ndarray, "rows columns"],
+    uv: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "n 2 2"],
+    second: Float[np.ndarray, "n 3 2"],
+    half: int,
 ) -> Float[np.ndarray, "n 2"]:
     """A·c: the error of matching with windows of 2·`half` + 1 pixels; 0 if it is not
     determined."""
@@ -190,8 +197,12 @@ def response(
 
 
 def correct_bending(
-    pair: tuple[OrientedImage, OrientedImage], nodes: Nodes, uv: Float[np.ndarray, "n 2"],
-    q: Float[np.ndarray, " n"], match, half: int,
+    pair: tuple[OrientedImage, OrientedImage],
+    nodes: Nodes,
+    uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, " n"],
+    match,
+    half: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """Matches, and their covariances, corrected for bending."""
     bend = bend_at(nodes, uv)

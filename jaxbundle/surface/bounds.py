@@ -1,5 +1,4 @@
-"""Bounds of the depth of the surface: by given heights, by tie points, or by the geometry alone.
-"""
+"""Bounds of the depth of the surface: by given heights, by tie points, or by the geometry alone."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -49,9 +48,7 @@ def bounds_from_points(
     return max(low - room, 0.2 * low if low > 0 else -np.inf), high + room
 
 
-def bounds_from_geometry(
-    view, others: Sequence
-) -> tuple[float, float] | None:
+def bounds_from_geometry(view, others: Sequence) -> tuple[float, float] | None:
     """Bounds of q of photographs for usual angles of intersection, around the point where most
     of their optical axes are nearest to each other; None for images at one position."""
     bases = [np.linalg.norm(o.X0 - view.X0) for o in others]

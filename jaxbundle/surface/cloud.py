@@ -62,9 +62,12 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     join = lambda field: np.concatenate([getattr(c, field) for c in clouds])
     colours = [c.colour for c in clouds]
     return Cloud(
-        join("X"), join("covariance"), join("rays"),
-        np.concatenate([k[c.image] for k, c in zip(number, clouds)]).astype(
-            clouds[0].image.dtype
-        ), join("uv"),
-        names, None if any(c is None for c in colours) else join("colour"), clouds[0].system,
-    )  # fmt: skip
+        join("X"),
+        join("covariance"),
+        join("rays"),
+        np.concatenate([k[c.image] for k, c in zip(number, clouds)]).astype(clouds[0].image.dtype),
+        join("uv"),
+        names,
+        None if any(c is None for c in colours) else join("colour"),
+        clouds[0].system,
+    )

@@ -39,13 +39,16 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
     middle = float(np.median(v))
     ratio = (distance / sigma)[np.isfinite(distance) & np.isfinite(sigma) & (sigma > 0)]
     return {
-        "points": len(v), "without_neighbours": int(len(cloud) - len(v)),
-        "mean": float(v.mean()), "median": middle, "rms": float(np.sqrt(np.mean(v**2))),
+        "points": len(v),
+        "without_neighbours": int(len(cloud) - len(v)),
+        "mean": float(v.mean()),
+        "median": middle,
+        "rms": float(np.sqrt(np.mean(v**2))),
         "robust_sigma": float(1.4826 * np.median(np.abs(v - middle))),
         "percentile_90": float(np.percentile(np.abs(v), 90)),
         "largest": float(np.abs(v).max()),
         "normalised_rms": float(np.sqrt(np.mean(ratio**2))) if len(ratio) else None,
-    }  # fmt: skip
+    }
 
 
 def _to_planes(cloud, other, tree, k, part, farthest):

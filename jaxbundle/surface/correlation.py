@@ -45,9 +45,13 @@ class Pyramid:
         part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
         place = (place - low).astype(np.float32)
         return cv2.remap(
-            part, place[..., 0], place[..., 1], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
-        )  # fmt: skip
+            part,
+            place[..., 0],
+            place[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )
 
 
 def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyramid:
@@ -110,10 +114,17 @@ def correlate(
 
     def of_rows(first):
         rows = slice(first, first + POINTS_AT_ONCE)
-        template = _template(pyramids[0], uv[rows], sign[rows] * shape.along[rows],
-                             np.sign(sign[rows]), half, level)  # fmt: skip
-        strip = _strip(pyramids[1], place[rows], sign[rows] * scale * shape.other_along[rows],
-                       scale * shape.other_across[rows], half, level)  # fmt: skip
+        template = _template(
+            pyramids[0], uv[rows], sign[rows] * shape.along[rows], np.sign(sign[rows]), half, level
+        )
+        strip = _strip(
+            pyramids[1],
+            place[rows],
+            sign[rows] * scale * shape.other_along[rows],
+            scale * shape.other_across[rows],
+            half,
+            level,
+        )
         return slide(template, strip)
 
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -186,9 +197,10 @@ def _template(pyramid, uv, along, sign, half, level):
     offset = 2.0**level * np.arange(-half, half + 1)
     across = sign * np.stack([-along[:, 1], along[:, 0]], 1)
     grid = (
-        uv[:, None, None] + offset[None, None, :, None] * along[:, None, None]
+        uv[:, None, None]
+        + offset[None, None, :, None] * along[:, None, None]
         + offset[None, :, None, None] * across[:, None, None]
-    )  # fmt: skip
+    )
     n, w = len(uv), len(offset)
     return pyramid.sample(level, grid.reshape(n * w, w, 2)).reshape(n, w, w)
 

@@ -86,10 +86,14 @@ def _prepare(pair: RowPair):
     if not all(len(g) for g in grey):
         return np.zeros_like(pair.left), np.zeros_like(pair.left)
     values = np.concatenate([g[:: max(1, len(g) // 200_000)] for g in grey])
-    low, high = (0.0, 255.0) if values.max() <= 260 and values.min() >= -5 else (
-        np.percentile(values, [0.2, 99.8])
+    low, high = (
+        (0.0, 255.0)
+        if values.max() <= 260 and values.min() >= -5
+        else (np.percentile(values, [0.2, 99.8]))
     )
     scale = 255 / max(high - low, 1e-9)
-    left, right = (np.where(np.isfinite(a), (a - low) * scale, 0).astype(np.float32)
-                   for a in (pair.left, pair.right))  # fmt: skip
+    left, right = (
+        np.where(np.isfinite(a), (a - low) * scale, 0).astype(np.float32)
+        for a in (pair.left, pair.right)
+    )
     return left, right

@@ -61,11 +61,14 @@ def dense_cloud(
         used.append((other.name, disparities.factor))
     if not found:
         none = np.zeros
-        empty = Cloud(none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)),
-                      (base.name,))  # fmt: skip
+        empty = Cloud(
+            none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)), (base.name,)
+        )
         return empty, used, left_out
-    parts = [_points(base, found, uv, slice(k, k + PIXELS_AT_ONCE))
-             for k in range(0, len(uv), PIXELS_AT_ONCE)]  # fmt: skip
+    parts = [
+        _points(base, found, uv, slice(k, k + PIXELS_AT_ONCE))
+        for k in range(0, len(uv), PIXELS_AT_ONCE)
+    ]
     X, covariance, rays, places = (np.concatenate(p) for p in zip(*parts))
     cloud = Cloud(X, covariance, rays, np.zeros(len(X), np.int16), places, (base.name,))
     return cloud, used, left_out
@@ -155,7 +158,8 @@ def _inverse_distance(base, d, pair: Rectified, found: Disparities):
 
 
 def combine(
-    q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"],
+    q: Float[np.ndarray, "pairs n"],
+    sigma: Float[np.ndarray, "pairs n"],
     cosine: Float[np.ndarray, "pairs pairs"] | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
     """The weighted mean of consistent values, its variance, and their number. NaN if two

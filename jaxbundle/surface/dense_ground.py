@@ -41,7 +41,10 @@ class _Matches(NamedTuple):
 
 
 def dense_ground_cloud(
-    base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, bounds: Bounds,
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    guide: Guide,
+    bounds: Bounds,
     step: int = 1,
 ) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
     """The cloud, at most one point a pixel; name and variance factor of each image used; those that
@@ -57,8 +60,10 @@ def dense_ground_cloud(
         for v0 in range(0, rows, PIECE):
             window = u0, v0, min(u0 + PIECE, columns) - 1, min(v0 + PIECE, rows) - 1
             # one grid over all pieces
-            u, v = (np.arange(-(-first // step) * step, last + 1, step)
-                    for first, last in zip(window[:2], window[2:]))  # fmt: skip
+            u, v = (
+                np.arange(-(-first // step) * step, last + 1, step)
+                for first, last in zip(window[:2], window[2:])
+            )
             uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2).astype(float)
             tried = (_match(base, other, guide, bounds, window, uv) for other in others)
             found = [one for one in tried if one is not None]
@@ -71,8 +76,9 @@ def dense_ground_cloud(
                 ]
     used = [(name, float(np.mean(values))) for name, values in factors.items() if values]
     none = np.zeros
-    empty = Cloud(none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)),
-                  (base.name,))  # fmt: skip
+    empty = Cloud(
+        none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)), (base.name,)
+    )
     return merge([*clouds, empty]), used, [name for name in factors if not factors[name]]
 
 
@@ -123,10 +129,13 @@ def _points(base, found: Sequence[_Matches], uv, rows) -> Cloud:
     n, views = len(uv), (base, *(one.other for one in found))
     start = base.points(uv, np.full(n, found[0].q0))
     # half of a match's variance is of the window in the base
-    own = np.stack([
-        0.5 * s[:, None, None] ** 2 * _to_other(base, one.other, start)
-        for one, s in zip(found, sigma)
-    ], 1)  # fmt: skip
+    own = np.stack(
+        [
+            0.5 * s[:, None, None] ** 2 * _to_other(base, one.other, start)
+            for one, s in zip(found, sigma)
+        ],
+        1,
+    )
 
     def rays(matched) -> Intersected:
         number = np.maximum(matched.sum(0), 1)
@@ -147,10 +156,13 @@ def _points(base, found: Sequence[_Matches], uv, rows) -> Cloud:
     cloud = rays(known)
     good = np.isfinite(cloud.covariance).all((1, 2)) & np.isfinite(cloud.X).all(1) & known.any(0)
     return Cloud(
-        cloud.X[good], cloud.covariance[good].astype(np.float32),
-        cloud.rays[good].astype(np.int16), np.zeros(int(good.sum()), np.int16),
-        uv[good].astype(np.float32), (base.name,),
-    )  # fmt: skip
+        cloud.X[good],
+        cloud.covariance[good].astype(np.float32),
+        cloud.rays[good].astype(np.int16),
+        np.zeros(int(good.sum()), np.int16),
+        uv[good].astype(np.float32),
+        (base.name,),
+    )
 
 
 def _to_other(base, other, X) -> Float[np.ndarray, "n 2 2"]:

@@ -60,7 +60,8 @@ class Disparities:
 
 
 def refine_disparities(
-    left: Float[np.ndarray, "rows columns"], right: Float[np.ndarray, "rows columns"],
+    left: Float[np.ndarray, "rows columns"],
+    right: Float[np.ndarray, "rows columns"],
     start: Float[np.ndarray, "rows columns"],
 ) -> Disparities:
     """Least squares at every pixel with a disparity."""
@@ -73,8 +74,10 @@ def refine_disparities(
         wide, over_step = _with_windows(left, spline, start, WIDE, weak)
         with np.errstate(invalid="ignore"):
             better = weak & ~over_step & (wide.sigma < np.nan_to_num(found.sigma, nan=MOST_SIGMA))
-        mixed = {name: np.where(better, getattr(wide, name), getattr(found, name))
-                 for name in ("disparity", "sigma", "rho")}  # fmt: skip
+        mixed = {
+            name: np.where(better, getattr(wide, name), getattr(found, name))
+            for name in ("disparity", "sigma", "rho")
+        }
         found = dataclasses.replace(found, **mixed)
     return found
 
@@ -119,8 +122,10 @@ def _with_windows(left, spline, start, half, wanted):
         inner = tuple(slice(k, k + n) for k, n in zip(corner, (height, width)))
         if not wanted[inner].any():
             return
-        v, u = (_reflect(np.arange(n) + k - margin, size)
-                for k, n, size in zip(corner, PIECE, left.shape))  # fmt: skip
+        v, u = (
+            _reflect(np.arange(n) + k - margin, size)
+            for k, n, size in zip(corner, PIECE, left.shape)
+        )
         found = _refine(left, spline, start, v, u, half)
         for out, piece in zip((d, sigma, rho, across), found):
             place = out[inner]

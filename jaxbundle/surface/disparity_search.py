@@ -65,10 +65,18 @@ def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     def of_strip(first):
         low, high = max(first - STRIP_MARGIN, 0), min(first + strip + STRIP_MARGIN, rows)
         matcher = cv2.StereoSGBM.create(
-            minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
-            P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUENESS,
-            speckleWindowSize=SMALLEST_REGION, speckleRange=2, mode=mode,
-        )  # fmt: skip
+            minDisparity=0,
+            numDisparities=number,
+            blockSize=BLOCK,
+            P1=8 * BLOCK**2,
+            P2=48 * BLOCK**2,
+            disp12MaxDiff=1,
+            preFilterCap=31,
+            uniquenessRatio=UNIQUENESS,
+            speckleWindowSize=SMALLEST_REGION,
+            speckleRange=2,
+            mode=mode,
+        )
         found = matcher.compute(*(np.ascontiguousarray(a[low:high]) for a in wide))
         return found[first - low : first - low + strip, number:]
 
@@ -89,8 +97,9 @@ def ambiguous(
     repeated = _likeness(coarse, span // COARSER) > REPETITION
     if not repeated.any():
         return np.zeros(left.shape, bool)
-    repeated = cv2.resize(repeated.astype(np.uint8), left.shape[::-1],
-                          interpolation=cv2.INTER_NEAREST) > 0  # fmt: skip
+    repeated = (
+        cv2.resize(repeated.astype(np.uint8), left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    )
     known = np.isfinite(disparity)
     whole = np.where(known, 16 * np.nan_to_num(disparity), -16).astype(np.int16)
     kept, _ = cv2.filterSpeckles(whole, -16, int(SMALL * left.size), 16)

@@ -59,16 +59,23 @@ class Dsm:
         y = self.y - (np.arange(rows) + 0.5) * self.size
         dims = ("y", "x")
         return data_set(
-            {"height": (dims, self.height, ""), "sigma": (dims, self.sigma, ""),
-             "count": (dims, self.count, "1")},
-            {"y": (y, ""), "x": (x, "")}, crs=self.system, cell_size=self.size,
-        )  # fmt: skip
+            {
+                "height": (dims, self.height, ""),
+                "sigma": (dims, self.sigma, ""),
+                "count": (dims, self.count, "1"),
+            },
+            {"y": (y, ""), "x": (x, "")},
+            crs=self.system,
+            cell_size=self.size,
+        )
 
     def centres(self) -> tuple[np.ndarray, np.ndarray]:
         """x and y of all cells."""
         rows, columns = self.height.shape
-        return np.meshgrid(self.x + (np.arange(columns) + 0.5) * self.size,
-                           self.y - (np.arange(rows) + 0.5) * self.size)  # fmt: skip
+        return np.meshgrid(
+            self.x + (np.arange(columns) + 0.5) * self.size,
+            self.y - (np.arange(rows) + 0.5) * self.size,
+        )
 
 
 def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
@@ -88,8 +95,15 @@ def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
     height, sigma, count = _means(cell, cloud.X[:, 2], cloud.sigma[:, 2], size, rows * columns)
     shape = rows, columns
-    found = Dsm(height.reshape(shape), sigma.reshape(shape), count.reshape(shape),
-                float(left * size), float(-top * size), size, cloud.system)  # fmt: skip
+    found = Dsm(
+        height.reshape(shape),
+        sigma.reshape(shape),
+        count.reshape(shape),
+        float(left * size),
+        float(-top * size),
+        size,
+        cloud.system,
+    )
     return _fill(found, fill) if fill else found
 
 
@@ -97,8 +111,12 @@ def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) 
     """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`."""
     from rasterio.transform import Affine
 
-    profile = {"transform": Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y), "nodata": NO_DATA,
-               "crs": dsm.system, "compress": "deflate"}  # fmt: skip
+    profile = {
+        "transform": Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y),
+        "nodata": NO_DATA,
+        "crs": dsm.system,
+        "compress": "deflate",
+    }
     rows, columns = dsm.height.shape
     given = ((path, dsm.height, "height"), (sigma_path, dsm.sigma, "sigma of height"))
     for target, values, name in given:

@@ -34,10 +34,12 @@ def _lines(cloud, names, part):
     short = lambda a: ("" if x != x else f"{x:.8g}" for x in a.tolist())
     C = cloud.covariance[part]
     columns = [
-        *map(exact, cloud.X[part].T), *(short(np.sqrt(C[:, k, k])) for k in range(3)),
-        map(str, cloud.rays[part].tolist()), names[cloud.image[part]].tolist(),
+        *map(exact, cloud.X[part].T),
+        *(short(np.sqrt(C[:, k, k])) for k in range(3)),
+        map(str, cloud.rays[part].tolist()),
+        names[cloud.image[part]].tolist(),
         *map(exact, cloud.uv[part].T),
-    ]  # fmt: skip
+    ]
     return "".join(",".join(row) + "\n" for row in zip(*columns))
 
 
@@ -84,34 +86,45 @@ def report_of(
         "system": cloud.system,
         "sigma_includes": ["matching", *(["orientation"] if surface.orientation else [])],
         "accuracy": accuracy_of(cloud),
-        **({} if check is None or not len(check) else
-           {"check_points": at_check_points(cloud, check)}),
+        **(
+            {}
+            if check is None or not len(check)
+            else {"check_points": at_check_points(cloud, check)}
+        ),
         "warnings": [*warnings, *surface.messages],
-    }  # fmt: skip
+    }
 
 
 def text_of(report: Mapping[str, Any]) -> str:
     """The report in lines."""
     found = report["accuracy"]
-    lines = [f"{report['points']} points, by rays: "
-             + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())]  # fmt: skip
+    lines = [
+        f"{report['points']} points, by rays: "
+        + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())
+    ]
     for row in report["images"]:
         factor = row["variance_factor"]
         said = "" if factor is None else f", variance factor {factor:.3g}"
-        lines.append(f"{row['image']} with {', '.join(row['with'])}: {row['matched']} of "
-                     f"{row['points']} points{said}")  # fmt: skip
+        lines.append(
+            f"{row['image']} with {', '.join(row['with'])}: {row['matched']} of "
+            f"{row['points']} points{said}"
+        )
         lines += [f"    {n:8} {reason}" for reason, n in row["rejected"].items()]
     for axis in "XYZ":
         s = found[f"s{axis}"]
         if s:
-            lines.append(f"σ{axis}  mean {s['mean']:.4g}  smallest {s['smallest']:.4g}  "
-                         f"largest {s['largest']:.4g}")  # fmt: skip
+            lines.append(
+                f"σ{axis}  mean {s['mean']:.4g}  smallest {s['smallest']:.4g}  "
+                f"largest {s['largest']:.4g}"
+            )
     for c in found["classes"]:
         upper = "∞" if c["to"] is None else f"{c['to']:g}"
         lines.append(f"σ from {c['from']:g} to {upper}: {c['points']} points")
     lines.append(f"σ contains: {', '.join(report['sigma_includes'])}")
     check = report.get("check_points", {})
     if check.get("points"):
-        lines.append(f"{check['points']} check points: RMS of heights {check['rms_Z']:.4g}, "
-                     f"mean {check['mean_Z']:.4g}, largest {check['largest_Z']:.4g}")  # fmt: skip
+        lines.append(
+            f"{check['points']} check points: RMS of heights {check['rms_Z']:.4g}, "
+            f"mean {check['mean_Z']:.4g}, largest {check['largest_Z']:.4g}"
+        )
     return "\n".join(lines)

@@ -54,9 +54,7 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
     return found.take(count >= least)
 
 
-def drop_isolated(
-    cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0
-) -> Cloud:
+def drop_isolated(cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0) -> Cloud:
     """Without the points whose mean distance to their nearest `neighbours` is more than the median
     of all by `limit` robust standard deviations.
 

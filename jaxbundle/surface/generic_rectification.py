@@ -46,7 +46,9 @@ class Straightened:
 
 
 def straighten(
-    base: OrientedImage, other: OrientedImage, window: tuple[int, int, int, int],
+    base: OrientedImage,
+    other: OrientedImage,
+    window: tuple[int, int, int, int],
     X: Float[np.ndarray, "n 3"],
 ) -> tuple[Straightened, int] | None:
     """A piece of the base (u₀, v₀, u₁, v₁) with what matches it, for the range of points X in it;
@@ -110,6 +112,7 @@ def _sample(view, uv):
     high = np.ceil(uv[inside].max(0)).astype(int) + 17
     piece = np.asarray(view.grey[low[1] : high[1], low[0] : high[0]], np.float32)
     place = np.where(inside[:, None], uv - low, 0.0)
-    grey = ndimage.map_coordinates(piece, [place[:, 1], place[:, 0]], output=np.float32,
-                                   order=3, mode="nearest")  # fmt: skip
+    grey = ndimage.map_coordinates(
+        piece, [place[:, 1], place[:, 0]], output=np.float32, order=3, mode="nearest"
+    )
     return np.where(inside, grey, np.nan)

@@ -100,8 +100,14 @@ class RpcView(_GroundView):
 class ScannerView(_GroundView):
     """An image of a line scanner; `around` is None in a local frame."""
 
-    def __init__(self, name: str, grey, image: PushbroomImage, earth: Ellipsoid | None,
-                 around: Neighbourhood | None):  # fmt: skip
+    def __init__(
+        self,
+        name: str,
+        grey,
+        image: PushbroomImage,
+        earth: Ellipsoid | None,
+        around: Neighbourhood | None,
+    ):
         super().__init__(name, grey, _Scanner(image, around, earth))
         self.image, self.search = image, make_search(image, earth)
 

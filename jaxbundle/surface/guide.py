@@ -143,8 +143,11 @@ def _search_all(base, others, pyramids, uv, q, level, shape):
     curves, rates = [], []
     for o, segment, shape_, good, own in parts:
         pyramid = pyramids[1][[id(x) for x in others].index(id(o))]
-        curves.append(_at_common(base, o, (pyramids[0], pyramid), uv, segment, shape_, good,
-                                 level, own, common))  # fmt: skip
+        curves.append(
+            _at_common(
+                base, o, (pyramids[0], pyramid), uv, segment, shape_, good, level, own, common
+            )
+        )
         rates.append(np.where(good, segment.length / (segment.q[:, 1] - segment.q[:, 0]), 0))
     rho = combine(curves)
     cost = (1 - np.where(np.isfinite(rho), np.maximum(rho, -0.2), 0.0)).astype(np.float32)
@@ -158,8 +161,9 @@ def _search_all(base, others, pyramids, uv, q, level, shape):
 
 def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, common):
     """ρ at common parameters, interpolated along each segment."""
-    rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF_WINDOW,
-                       steps=steps)  # fmt: skip
+    rho, q = correlate(
+        (base, other), pyramids, uv, segment, shape, level=level, half=HALF_WINDOW, steps=steps
+    )
     spacing = 2.0**level * np.linalg.norm(shape.other_along, axis=1)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         index = (segment.along(common) - segment.length[:, None] / 2) / spacing + (steps - 1) / 2
@@ -187,11 +191,13 @@ def search(base, others, pyramids, uv, q, normal, level, half):
     middle = base.points(uv, q.mean(1))
     shapes = [windows(base, o, middle, normal) for o in others]
     parts = [segments(base, o, uv, q) for o in others]
-    number = np.stack([
-        np.where(w.usable & np.isfinite(s.length), s.length, 0)
-        / (2.0**level * np.maximum(np.linalg.norm(w.other_along, axis=1), 1e-9))
-        for s, w in zip(parts, shapes)
-    ]).max(0)  # fmt: skip
+    number = np.stack(
+        [
+            np.where(w.usable & np.isfinite(s.length), s.length, 0)
+            / (2.0**level * np.maximum(np.linalg.norm(w.other_along, axis=1), 1e-9))
+            for s, w in zip(parts, shapes)
+        ]
+    ).max(0)
     number = np.nan_to_num(number)
     bucket = np.clip(2 ** np.ceil(np.log2(number + 3)), 8, MOST_STEPS).astype(int)
     out = np.full((3, len(uv)), np.nan)
@@ -202,8 +208,20 @@ def search(base, others, pyramids, uv, q, normal, level, half):
         curves = []
         for k, o in enumerate(others):
             segment, shape = _take(parts[k], rows), _take(shapes[k], rows)
-            curves.append(_at_common(base, o, (pyramids[0], pyramids[1][k]), uv[rows], segment,
-                                     shape, shape.usable, level, int(steps), common))  # fmt: skip
+            curves.append(
+                _at_common(
+                    base,
+                    o,
+                    (pyramids[0], pyramids[1][k]),
+                    uv[rows],
+                    segment,
+                    shape,
+                    shape.usable,
+                    level,
+                    int(steps),
+                    common,
+                )
+            )
         peak, best, second = top(combine(curves))
         out[0, rows] = common[:, 0] + best / (steps - 1) * (common[:, -1] - common[:, 0])
         out[1, rows], out[2, rows] = peak, second
@@ -229,8 +247,15 @@ def _smooth(base, level, uv, shape, q, rate, rho, _):
     filled = np.where(known, q, middle)
     filled = _nearest_filled(np.where(np.isfinite(filled), filled, np.nan), q)
     X = base.points(uv, filled.ravel()).reshape(*shape, 3)
-    return Guide(step, float(uv[0, 0]), filled, rate, np.nan_to_num(rho, nan=-1.0),
-                 _normals(base, uv, X, filled, rate, step), known)  # fmt: skip
+    return Guide(
+        step,
+        float(uv[0, 0]),
+        filled,
+        rate,
+        np.nan_to_num(rho, nan=-1.0),
+        _normals(base, uv, X, filled, rate, step),
+        known,
+    )
 
 
 def _median(q):

@@ -36,8 +36,9 @@ def interest_points(
     rows, columns = grey.shape
     found = [
         find(_eight_bits(grey[v : v + TILE, u : u + TILE], limits), step) + [u, v]
-        for v in range(0, rows, TILE) for u in range(0, columns, TILE)
-    ]  # fmt: skip
+        for v in range(0, rows, TILE)
+        for u in range(0, columns, TILE)
+    ]
     return np.concatenate(found)
 
 

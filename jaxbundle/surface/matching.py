@@ -134,21 +134,21 @@ def match_points(
         back = np.linalg.inv(safe)
         own[:, k] = np.where(
             good[:, None, None],
-            back @ np.where(good[:, None, None], uncertain, 0) @ np.swapaxes(back, 1, 2), 0
-        )  # fmt: skip
+            back @ np.where(good[:, None, None], uncertain, 0) @ np.swapaxes(back, 1, 2),
+            0,
+        )
         used[:, k] = good
     enough = used.sum(1) + 1 >= settings.least_rays
     lost["not confirmed by least squares matching"] += int((~enough).sum())
     take = lambda *arrays: [a[enough] for a in arrays]
-    uv, X, places, used, covariance, own, rhos = take(
-        uv, X, places, used, covariance, own, rhos
-    )
+    uv, X, places, used, covariance, own, rhos = take(uv, X, places, used, covariance, own, rhos)
     mean = own.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
     table = _Rays(
-        (base, *others), np.concatenate([uv[:, None], places], 1),
+        (base, *others),
+        np.concatenate([uv[:, None], places], 1),
         np.concatenate([mean[:, None], np.where(used[..., None, None], covariance, 1)], 1) / 2,
         np.concatenate([np.ones((len(uv), 1), bool), used], 1),
-    )  # fmt: skip
+    )
     return _accept(table, X, uv, rhos, settings, lost)
 
 
@@ -182,17 +182,24 @@ def _accept(table, X, uv, rhos, settings, lost) -> Matches:
     lost["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
     good = ~(bad | narrow | undetermined)
     with np.errstate(invalid="ignore"):
-        rho = np.nanmin(np.where(table.used[good][:, 1:], rhos[good], np.nan), axis=1) if (
-            good.any()
-        ) else np.zeros(0)
+        rho = (
+            np.nanmin(np.where(table.used[good][:, 1:], rhos[good], np.nan), axis=1)
+            if (good.any())
+            else np.zeros(0)
+        )
     covariance = factor * found.covariance[good] + shape[good]
     covariance += orientation_covariance(table.views, found.X[good], table.used[good])
     return Matches(
-        uv[good], found.X[good], covariance, found.rays[good],
-        found.angle[good], rho,
-        np.where(table.used[good][:, 1:, None], table.uv[good][:, 1:], np.nan), factor,
+        uv[good],
+        found.X[good],
+        covariance,
+        found.rays[good],
+        found.angle[good],
+        rho,
+        np.where(table.used[good][:, 1:, None], table.uv[good][:, 1:], np.nan),
+        factor,
         {reason: number for reason, number in lost.items() if number},
-    )  # fmt: skip
+    )
 
 
 def variance_factor(

@@ -43,12 +43,17 @@ def orientation_covariance(
     """The covariance of points due to that of the orientations of their images."""
     C = np.zeros((len(X), 3, 3))
     uncertain = {
-        k: view for k, view in enumerate(views)
+        k: view
+        for k, view in enumerate(views)
         if isinstance(view, FrameView) and is_uncertain(view)
-    }  # fmt: skip
+    }
     if uncertain:
-        joint = np.block([[_covariance(one, other) for other in uncertain.values()]
-                          for one in uncertain.values()])  # fmt: skip
+        joint = np.block(
+            [
+                [_covariance(one, other) for other in uncertain.values()]
+                for one in uncertain.values()
+            ]
+        )
         root = _root(joint)
 
         def add(first):
@@ -76,10 +81,13 @@ def _by_orientations(views, uncertain, X, used) -> Float[np.ndarray, "n 3 k"]:
     N = np.einsum("nkij,nkil->njl", J, J)
     scale = np.trace(N, axis1=1, axis2=2)[:, None, None]
     Q = np.linalg.inv(N / scale + SMALLEST * np.eye(3)) / scale
-    return np.concatenate([
-        Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(view, X)
-        for k, view in uncertain.items()
-    ], axis=2)  # fmt: skip
+    return np.concatenate(
+        [
+            Q @ np.swapaxes(J[:, k], 1, 2) @ derivative_by_orientation(view, X)
+            for k, view in uncertain.items()
+        ],
+        axis=2,
+    )
 
 
 def _covariance(one: FrameView, other: FrameView) -> Float[np.ndarray, "k l"]:

@@ -43,8 +43,9 @@ def orthophoto(
     d = d * np.where(d[:, 2:] < 0, -1.0, 1.0)
     seen = inside & ~_are_hidden(dsm, X[known], d)
     safe = np.where(inside[:, None], uv, 0.0)
-    grey = ndimage.map_coordinates(np.asarray(view.grey, np.float32), [safe[:, 1], safe[:, 0]],
-                                   order=1, mode="nearest")  # fmt: skip
+    grey = ndimage.map_coordinates(
+        np.asarray(view.grey, np.float32), [safe[:, 1], safe[:, 0]], order=1, mode="nearest"
+    )
     out = np.full((2, len(X)), np.nan)
     out[0, known], out[1, known] = np.where(seen, grey, np.nan), np.where(seen, d[:, 2], np.nan)
     return out[0].reshape(x.shape), out[1].reshape(x.shape)
@@ -63,9 +64,7 @@ def mosaic(
     return out
 
 
-def write_orthophoto(
-    values: Float[np.ndarray, "rows columns"], dsm: Dsm, path: str | Path
-) -> None:
+def write_orthophoto(values: Float[np.ndarray, "rows columns"], dsm: Dsm, path: str | Path) -> None:
     """A GeoTIFF of the grey values, 0: none; 8 bits where they fit, else 16."""
     from rasterio.transform import Affine
 
@@ -73,8 +72,17 @@ def write_orthophoto(
     stored = np.nan_to_num(np.clip(np.rint(values), 1, np.iinfo(dtype).max)).astype(dtype)
     rows, columns = values.shape
     transform = Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y)
-    with write_raster(path, columns, rows, 1, dtype, transform=transform, nodata=0,
-                        crs=dsm.system, compress="deflate") as raster:  # fmt: skip
+    with write_raster(
+        path,
+        columns,
+        rows,
+        1,
+        dtype,
+        transform=transform,
+        nodata=0,
+        crs=dsm.system,
+        compress="deflate",
+    ) as raster:
         raster.write(stored[None])
 
 
@@ -82,8 +90,9 @@ def _are_hidden(dsm, X, d):
     """Whether the surface rises above the lines of sight, towards their image."""
     top = np.nanmax(dsm.height)
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.minimum((top - X[:, 2]) / np.maximum(d[:, 2], 1e-9),
-                           dsm.size * max(dsm.height.shape))  # fmt: skip
+        reach = np.minimum(
+            (top - X[:, 2]) / np.maximum(d[:, 2], 1e-9), dsm.size * max(dsm.height.shape)
+        )
     height = np.where(np.isfinite(dsm.height), dsm.height, -np.inf)
     rows, columns = height.shape
     hidden = np.zeros(len(X), bool)

@@ -103,8 +103,13 @@ def _read_ply(path):
         raise InputError(f"{path}: vertices without x, y, z")
     try:
         if form == "ascii":
-            table = np.array([line.split()[: len(fields)] for line in
-                              body.decode("ascii").splitlines()[:number]], float)  # fmt: skip
+            table = np.array(
+                [
+                    line.split()[: len(fields)]
+                    for line in body.decode("ascii").splitlines()[:number]
+                ],
+                float,
+            )
             column = lambda name: table.reshape(number, -1)[:, names.index(name)]
         else:
             order = ">" if "big" in form else "<"
@@ -138,12 +143,15 @@ def _ply_head(path, lines):
 
 def _of_columns(column, names, n):
     X = np.stack([column(axis).astype(float) for axis in "xyz"], 1)
-    sigma = np.stack([column(s).astype(float) if s in names else np.full(n, np.nan)
-                      for s in SIGMAS], 1)  # fmt: skip
+    sigma = np.stack(
+        [column(s).astype(float) if s in names else np.full(n, np.nan) for s in SIGMAS], 1
+    )
     colours = ("red", "green", "blue")
-    colour = np.stack([column(c) for c in colours], 1).astype(np.uint8) if (
-        {*colours} <= {*names}
-    ) else None
+    colour = (
+        np.stack([column(c) for c in colours], 1).astype(np.uint8)
+        if ({*colours} <= {*names})
+        else None
+    )
     rays = np.asarray(column("rays")).astype(int) if "rays" in names else np.zeros(n, int)
     return _plain_cloud(X, sigma, rays, colour)
 
@@ -152,8 +160,9 @@ def _plain_cloud(X, sigma, rays, colour, system=None):
     n = len(X)
     covariance = np.zeros((n, 3, 3))
     covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
-    return Cloud(X, covariance, rays, np.zeros(n, int), np.full((n, 2), np.nan), ("",), colour,
-                 system)  # fmt: skip
+    return Cloud(
+        X, covariance, rays, np.zeros(n, int), np.full((n, 2), np.nan), ("",), colour, system
+    )
 
 
 def _laspy():
@@ -233,8 +242,9 @@ def _las_cloud(las):
     names = {*las.point_format.dimension_names}
     n = len(las.points)
     X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)
-    sigma = np.stack([np.asarray(las[s], float) if s in names else np.full(n, np.nan)
-                      for s in SIGMAS], 1)  # fmt: skip
+    sigma = np.stack(
+        [np.asarray(las[s], float) if s in names else np.full(n, np.nan) for s in SIGMAS], 1
+    )
     colour = None
     if "red" in names:
         colour = np.stack([np.asarray(las[c]) // 257 for c in ("red", "green", "blue")], 1)

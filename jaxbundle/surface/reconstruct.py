@@ -1,5 +1,4 @@
-"""From oriented images to a cloud: pairs, guides, points, matches, one base image after the other.
-"""
+"""From oriented images to a cloud: pairs, guides, points, matches, base image by base image."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -98,7 +97,7 @@ def ground_bounds(
         messages = (
             f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, the range of the "
             "coefficients; give --zmin and --zmax",
-        )  # fmt: skip
+        )
     return tuple(Bounds(view, heights) for view in views), messages
 
 
@@ -150,8 +149,9 @@ def reconstruct(
     clouds, told, messages = [], [], []
     every = step or _dense_step(views[i] for i in partners)
     if dense and not step and every > 1:
-        messages.append(f"every {every}th pixel in both directions, to limit memory; "
-                        "--step 1 takes all")  # fmt: skip
+        messages.append(
+            f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"
+        )
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
         row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others]}
@@ -161,18 +161,27 @@ def reconstruct(
             cloud, counts, left_out = _dense(views, i, others, guides[i], bounds[i], every)
             clouds.append(cloud)
             row |= counts
-            messages += [f"{views[i].name} with {name}: cannot be rectified, left out"
-                         for name in left_out]  # fmt: skip
+            messages += [
+                f"{views[i].name} with {name}: cannot be rectified, left out" for name in left_out
+            ]
         else:
             uv = interest_points(views[i].grey, points, step or _step(views[i]))
             found = match_points(
-                views[i], [views[j] for j in others],
-                (pyramids[i], [pyramids[j] for j in others]), guides[i], uv,
-                [guides.get(j) for j in others], settings or Settings(),
-            )  # fmt: skip
+                views[i],
+                [views[j] for j in others],
+                (pyramids[i], [pyramids[j] for j in others]),
+                guides[i],
+                uv,
+                [guides.get(j) for j in others],
+                settings or Settings(),
+            )
             clouds.append(_cloud(views[i], found))
-            row |= {"points": len(uv), "matched": len(found.X), "variance_factor": found.factor,
-                    "rejected": found.rejected}  # fmt: skip
+            row |= {
+                "points": len(uv),
+                "matched": len(found.X),
+                "variance_factor": found.factor,
+                "rejected": found.rejected,
+            }
         told.append(row)
     tell("matching", len(partners), len(partners))
     if not any(len(c) for c in clouds):
@@ -199,10 +208,16 @@ def _dense(views, i, others, guide, bounds, step):
     reason = "no disparity, or not confirmed by least squares"
     if len(used) > 1:
         reason += ", or pairs disagree"
-    return cloud, {
-        "points": number, "matched": len(cloud), "variance_factor": factor,
-        "rejected": {reason: number - len(cloud)},
-    }, left_out  # fmt: skip
+    return (
+        cloud,
+        {
+            "points": number,
+            "matched": len(cloud),
+            "variance_factor": factor,
+            "rejected": {reason: number - len(cloud)},
+        },
+        left_out,
+    )
 
 
 def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
@@ -217,8 +232,11 @@ def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
     for done, (i, others) in enumerate(with_whom.items()):
         tell("depths", done, len(with_whom))
         guide = make_guide(
-            views[i], [views[j] for j in others], (pyramids[i], [pyramids[j] for j in others]),
-            bounds[i], DENSE_NODES if dense else MOST_NODES,
+            views[i],
+            [views[j] for j in others],
+            (pyramids[i], [pyramids[j] for j in others]),
+            bounds[i],
+            DENSE_NODES if dense else MOST_NODES,
         )
         if guide is not None:
             guides[i] = guide
@@ -254,9 +272,14 @@ def _step(view):
 def _cloud(view, found: Matches) -> Cloud:
     n = len(found.X)
     return Cloud(
-        found.X, found.covariance, found.rays, np.zeros(n, int), found.uv, (view.name,),
+        found.X,
+        found.covariance,
+        found.rays,
+        np.zeros(n, int),
+        found.uv,
+        (view.name,),
         _colour(view, found.uv),
-    )  # fmt: skip
+    )
 
 
 def _colour(view, uv):

@@ -108,9 +108,7 @@ def rectify(
     return Rectified(left, right, origin, lowest, base.X0, R, f, length), span
 
 
-def disparity_range(
-    base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]
-) -> float | None:
+def disparity_range(base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]) -> float | None:
     """Approximate range of the disparities of points, pixels; None for cameras at one position."""
     b = other.X0 - base.X0
     length = float(np.linalg.norm(b))

@@ -63,9 +63,13 @@ def refine(
     usable &= np.isfinite(A).all((1, 2))
     rows = np.flatnonzero(usable)
     out = Refined(
-        start.astype(float), A.astype(float), np.full((n, 2, 2), np.inf), np.full(n, np.nan),
-        np.full(n, np.nan), np.full(n, int(MatchingStatus.OUTSIDE)),
-    )  # fmt: skip
+        start.astype(float),
+        A.astype(float),
+        np.full((n, 2, 2), np.inf),
+        np.full(n, np.nan),
+        np.full(n, np.nan),
+        np.full(n, int(MatchingStatus.OUTSIDE)),
+    )
     for first in range(0, len(rows), LANES):
         part = rows[first : first + LANES]
         lanes = part[np.minimum(np.arange(LANES), len(part) - 1)]
@@ -86,8 +90,10 @@ def refine(
 
 
 def has_texture(
-    grey: Shaped[np.ndarray, "rows columns"], uv: Float[np.ndarray, "n 2"],
-    sigma0: Float[np.ndarray, " n"], half: int,
+    grey: Shaped[np.ndarray, "rows columns"],
+    uv: Float[np.ndarray, "n 2"],
+    sigma0: Float[np.ndarray, " n"],
+    half: int,
 ) -> Bool[np.ndarray, " n"]:
     """Whether windows have texture on all sides of their points, by the squares of its gradients
     relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof. The row
@@ -119,9 +125,7 @@ def has_texture(
 def _pieces(grey, corner, side):
     """Pieces [n, side, side] from their upper-left pixels (u, v), and `BEYOND` on all sides."""
     k = np.arange(-BEYOND, side + BEYOND)
-    rows, columns = (
-        np.clip(c[:, None] + k, 0, n - 1) for c, n in zip(corner.T[::-1], grey.shape)
-    )
+    rows, columns = (np.clip(c[:, None] + k, 0, n - 1) for c, n in zip(corner.T[::-1], grey.shape))
     return grey[rows[:, :, None], columns[:, None]].astype(np.float32)
 
 

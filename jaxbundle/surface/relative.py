@@ -33,9 +33,7 @@ LIKELY_CORRELATION = 0.75
 """Minimum ρ of a match."""
 
 
-def align(
-    base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds
-) -> float | None:
+def align(base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds) -> float | None:
     """Shift the projections of the other image; returns the shift in pixels, None if too few points
     match."""
     grey = base.grey
@@ -58,8 +56,9 @@ def align(
         scores = []
         for t in tries:
             other.shift = tuple(first + t * across)
-            _, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, level,
-                               HALF_WINDOW)  # fmt: skip
+            _, rho, _ = search(
+                base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, level, HALF_WINDOW
+            )
             scores.append(float(np.mean(np.nan_to_num(rho) > LIKELY_CORRELATION)))
         best = float(tries[int(np.argmax(scores))])
         step /= 2
@@ -102,6 +101,8 @@ def align_all(views: Sequence, bounds: Sequence[Bounds]) -> tuple[str, ...]:
         if found is None:
             said.append(f"{pair}: too few matches to align them across the epipolar lines")
         elif abs(found) > SMALLEST_REPORTED:
-            said.append(f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
-                        "off the second")  # fmt: skip
+            said.append(
+                f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
+                "off the second"
+            )
     return tuple(said)

@@ -85,9 +85,13 @@ def _correct(left, right, half: int) -> Corrections:
     textured &= own > LEAST_CONTRAST**2 + _beyond_noise(number) * noise
     textured &= _least_of_sides(L, half) > _beyond_noise(half * (2 * half + 1)) * noise
     return Corrections(
-        delta, jnp.sqrt(variance * A / determinant),
-        epsilon / jnp.sqrt(variance * D / determinant), LR / jnp.sqrt(LL * RR), contrast, textured,
-    )  # fmt: skip
+        delta,
+        jnp.sqrt(variance * A / determinant),
+        epsilon / jnp.sqrt(variance * D / determinant),
+        LR / jnp.sqrt(LL * RR),
+        contrast,
+        textured,
+    )
 
 
 correct = compile_once(_correct, static=2)

@@ -109,9 +109,7 @@ def read_grey(path: Path) -> np.ndarray:
 
 def _luminance(values):
     values = np.nan_to_num(values.astype(np.float32))
-    return values[0] if len(values) < 3 else np.tensordot(
-        np.array(BANDS, np.float32), values, 1
-    )
+    return values[0] if len(values) < 3 else np.tensordot(np.array(BANDS, np.float32), values, 1)
 
 
 def system_of(around: Neighbourhood, crs: str | None) -> str:
@@ -125,9 +123,7 @@ def system_of(around: Neighbourhood, crs: str | None) -> str:
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
 
 
-def to_map(
-    cloud: Cloud, around: Neighbourhood, crs: str
-) -> Cloud:
+def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
     """The cloud in a map system, with its covariance rotated and scaled.
 
     **Raises:** `InputError` for a system unknown to pyproj."""
@@ -188,9 +184,7 @@ def _orientation(path: Path, folder: Path | None):
         if source is path and path.suffix.lower() not in RASTERS:
             raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
         return read_rpc(source), path
-    scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (
-        path.suffix == ".toml"
-    )
+    scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")
     if path.suffix.lower() == ".xml":
         try:
             return read_rpc(path), _raster_of(path, folder)
@@ -218,8 +212,10 @@ def _raster_of(path: Path, folder: Path | None) -> Path:
 def _middle(orientation) -> Neighbourhood:
     """The neighbourhood of the middle of the first image."""
     if isinstance(orientation, Rpc):
-        return neighbourhood(np.radians(float(orientation.longitude_offset)),
-                             np.radians(float(orientation.latitude_offset)))  # fmt: skip
+        return neighbourhood(
+            np.radians(float(orientation.longitude_offset)),
+            np.radians(float(orientation.latitude_offset)),
+        )
     image: PushbroomImage = orientation[0]
     earth = orientation[1] or WGS84
     X = locate_point(image, Ground(earth), (image.lines - 1) / 2, (image.pixels - 1) / 2)

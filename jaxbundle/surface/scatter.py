@@ -30,8 +30,11 @@ def robust_factor(ratio: Float[np.ndarray, " n"], otherwise: float = 1.0) -> flo
 
 
 def scatter_factor(
-    d: Float[np.ndarray, "rows columns"], sigma: Float[np.ndarray, "rows columns"],
-    step: int, side: int, quantile: float,
+    d: Float[np.ndarray, "rows columns"],
+    sigma: Float[np.ndarray, "rows columns"],
+    step: int,
+    side: int,
+    quantile: float,
 ) -> list[float]:
     """The variance factor of values on a grid (NaN: none), along columns and rows, by differences
     over `step`, of blocks of `side`; none if no block has enough values."""
@@ -52,8 +55,12 @@ def scatter_factor(
 
 
 def missing_sigma(
-    d: Float[np.ndarray, "rows columns"], sigma: Float[np.ndarray, "rows columns"],
-    unit: Float[np.ndarray, "rows columns"], step: int, side: int, quantile: float,
+    d: Float[np.ndarray, "rows columns"],
+    sigma: Float[np.ndarray, "rows columns"],
+    unit: Float[np.ndarray, "rows columns"],
+    step: int,
+    side: int,
+    quantile: float,
 ) -> float | None:
     """The s for which the variances σ² + (s·unit)² of values on a grid agree with their scatter; 0
     if σ² alone is enough, None if no block has enough values."""

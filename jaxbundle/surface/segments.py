@@ -63,8 +63,11 @@ class Segments:
 
 
 def visible_range(
-    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
-    q: Float[np.ndarray, "n 2"], margin: float = 0.0,
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, "n 2"],
+    margin: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
     """The part of a range of q visible in the other image, to about 1/`SIGHT_POINTS` of it; NaN:
     none."""
@@ -80,7 +83,9 @@ def visible_range(
 
 
 def segments(
-    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, "n 2"],
 ) -> Segments:
     """The segments of lines of sight between two parameters."""
@@ -94,7 +99,9 @@ def segments(
 
 
 def positions(
-    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, "n k 2"]:
     """Positions in the other image of points along lines of sight."""
@@ -102,7 +109,9 @@ def positions(
 
 
 def windows(
-    base: OrientedImage, other: OrientedImage, X: Float[np.ndarray, "n 3"],
+    base: OrientedImage,
+    other: OrientedImage,
+    X: Float[np.ndarray, "n 3"],
     normal: Float[np.ndarray, "n 3"] | None = None,
 ) -> Windows:
     """Windows around points X in both images, on planes with these normals; None: planes

@@ -76,15 +76,14 @@ def stereo_pair(left: FrameView, right: FrameView, ground: float) -> StereoPair:
     return StereoPair(c, float(np.linalg.norm(across)), float(h))
 
 
-def expected_and_obtained(
-    pair: StereoPair, cloud: Cloud, sigma_image: float
-) -> dict[str, float]:
+def expected_and_obtained(pair: StereoPair, cloud: Cloud, sigma_image: float) -> dict[str, float]:
     """σ of plan and height: by the formulas, and the medians of a cloud."""
     obtained = np.nanmedian(cloud.sigma, axis=0)
     return {
         "base_to_height": pair.base_to_height,
         "expected_sigma_plan": pair.sigma_plan(sigma_image),
         "expected_sigma_height": pair.sigma_height(sigma_image),
-        "obtained_sigma_X": float(obtained[0]), "obtained_sigma_Y": float(obtained[1]),
+        "obtained_sigma_X": float(obtained[0]),
+        "obtained_sigma_Y": float(obtained[1]),
         "obtained_sigma_height": float(obtained[2]),
-    }  # fmt: skip
+    }

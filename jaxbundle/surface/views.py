@@ -83,10 +83,16 @@ class FrameView:
     `colours()`: its red, green, blue."""
 
     def __init__(
-        self, name: str, grey, camera: Camera, X0, M, sigma=None,
+        self,
+        name: str,
+        grey,
+        camera: Camera,
+        X0,
+        M,
+        sigma=None,
         colours: Callable[[], UInt8[np.ndarray, "rows columns 3"]] | None = None,
         joint: OrientationCovariance | None = None,
-    ):  # fmt: skip
+    ):
         self.name, self.grey, self.colours, self.joint = name, grey, colours, joint
         self.sigma = np.nan_to_num(np.zeros(6) if sigma is None else np.asarray(sigma, float))
         self.size = (grey.shape[1], grey.shape[0])
@@ -149,7 +155,9 @@ class _Frame(eqx.Module):
 
 
 def frame_views(
-    network, greys: Sequence[np.ndarray], colours: Sequence[Callable | None] | None = None,
+    network,
+    greys: Sequence[np.ndarray],
+    colours: Sequence[Callable | None] | None = None,
     joint: OrientationCovariance | None = None,
 ) -> tuple[FrameView, ...]:
     """The oriented photographs of a network, a view for each image."""
@@ -183,9 +191,11 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
     columns, rows = view.size
     with np.errstate(invalid="ignore"):
         return (
-            (uv[:, 0] >= margin) & (uv[:, 0] <= columns - 1 - margin)
-            & (uv[:, 1] >= margin) & (uv[:, 1] <= rows - 1 - margin)
-        )  # fmt: skip
+            (uv[:, 0] >= margin)
+            & (uv[:, 0] <= columns - 1 - margin)
+            & (uv[:, 1] >= margin)
+            & (uv[:, 1] <= rows - 1 - margin)
+        )
 
 
 def run_in_lanes(program: Callable, frame, *arrays):

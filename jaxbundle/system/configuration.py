@@ -166,9 +166,12 @@ def join_processes(
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
-            address, processes, process,
-            heartbeat_timeout_seconds=lost_after_seconds, initialization_timeout=wait_seconds,
-        )  # fmt: skip
+            address,
+            processes,
+            process,
+            heartbeat_timeout_seconds=lost_after_seconds,
+            initialization_timeout=wait_seconds,
+        )
     except (ValueError, TypeError, RuntimeError) as error:
         why = " ".join(str(error).split())[:300]
         if address is None and not any(name.startswith("SLURM_") for name in os.environ):

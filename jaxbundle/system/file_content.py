@@ -130,9 +130,11 @@ def _beyond(document: Any) -> str:
         if any(isinstance(v, int) and abs(v) > LARGEST_INTEGER for v in level):
             return TOO_LARGE
         level = [
-            part for value in level if isinstance(value, dict | list)
+            part
+            for value in level
+            if isinstance(value, dict | list)
             for part in (value.values() if isinstance(value, dict) else value)
-        ]  # fmt: skip
+        ]
         if not level:
             return ""
     return f"nested too deeply: more than {DEEPEST_NESTING} levels"

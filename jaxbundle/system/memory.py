@@ -9,9 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 
 SHORTAGES = (
-    "failed to allocate", "resource_exhausted", "bad_alloc", "cannot allocate memory",
-    "can't start new thread", "failed to map segment",
-)  # fmt: skip
+    "failed to allocate",
+    "resource_exhausted",
+    "bad_alloc",
+    "cannot allocate memory",
+    "can't start new thread",
+    "failed to map segment",
+)
 """What OpenCV, XLA, C++, the system, Python and the dynamic linker say without memory."""
 SMALLEST_ADDRESS_SPACE = {"": 1.7e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
 """Bytes of address space, most of it never used, with which a command, or any other, compiles its

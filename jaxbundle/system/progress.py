@@ -28,9 +28,12 @@ class show_progress:
 
             console = Console(file=sys.stderr)
             self.bars = Progress(
-                *Progress.get_default_columns(), MofNCompleteColumn(), console=console,
-                transient=True, disable=not console.is_terminal,
-            )  # fmt: skip
+                *Progress.get_default_columns(),
+                MofNCompleteColumn(),
+                console=console,
+                transient=True,
+                disable=not console.is_terminal,
+            )
         self.bars.start()
         return self.tell
 

@@ -59,8 +59,13 @@ def _list_flags() -> str:
     environment = os.environ | {"XLA_FLAGS": "--help"}
     try:
         return subprocess.run(
-            [sys.executable, "-c", code], env=environment, timeout=60, encoding="utf-8",
-            errors="replace", stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        ).stdout  # fmt: skip
+            [sys.executable, "-c", code],
+            env=environment,
+            timeout=60,
+            encoding="utf-8",
+            errors="replace",
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        ).stdout
     except (OSError, subprocess.SubprocessError):
         return ""

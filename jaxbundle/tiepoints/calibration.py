@@ -63,13 +63,17 @@ def start_cameras(
             stated = first.parameters["fx"]
             if told and not 1 / BELIEVED_RATIO < p["fx"] / stated < BELIEVED_RATIO:
                 better = with_lens(better, own, _without_distortion(first))
-                notes.append(f"camera {name}: {said}, but {stated:.0f} px by the files: that of "
-                             "the files is used")  # fmt: skip
+                notes.append(
+                    f"camera {name}: {said}, but {stated:.0f} px by the files: that of "
+                    "the files is used"
+                )
             else:
                 notes.append(f"camera {name}: {said}, k1 {p['k1']:.3f}")
         elif not told:
-            notes.append(f"camera {name}: the principal distance is a guess: no two of its "
-                         "photographs agree on one")  # fmt: skip
+            notes.append(
+                f"camera {name}: the principal distance is a guess: no two of its "
+                "photographs agree on one"
+            )
     return better, notes
 
 

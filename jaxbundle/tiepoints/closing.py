@@ -106,9 +106,17 @@ def _search(oriented: Oriented, first: Interior, middle: float) -> Minimum | Non
         return misclosure + ((x[0] - middle) / SIGMA_C) ** 2 + (x[1] / SIGMA_K1) ** 2
 
     simplex = first + np.array([[0, 0], [STEP_C, 0], [0, STEP_K1]])
-    found = minimize(total, first, method="Nelder-Mead", options={
-        "initial_simplex": simplex, "xatol": LAST_STEP, "fatol": LAST_STEP, "maxfev": EVALUATIONS,
-    })  # fmt: skip
+    found = minimize(
+        total,
+        first,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": simplex,
+            "xatol": LAST_STEP,
+            "fatol": LAST_STEP,
+            "maxfev": EVALUATIONS,
+        },
+    )
     return Minimum(found.x, float(found.fun) / independent, independent)
 
 
@@ -132,6 +140,9 @@ def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:
     after: dict[int, set[int]] = {}
     for i, j in pairs:
         after.setdefault(i, set()).add(j)
-    found = [(row[i, j], row[j, k], row[i, k]) for i, j in pairs
-             for k in sorted(after[i] & after.get(j, set()))]  # fmt: skip
+    found = [
+        (row[i, j], row[j, k], row[i, k])
+        for i, j in pairs
+        for k in sorted(after[i] & after.get(j, set()))
+    ]
     return np.array(found, int).reshape(-1, 3)

@@ -72,8 +72,9 @@ def _count_still(m: Matches, features, sizes) -> int:
     i, j = m.images
     one, other = (_places(features[k].xy, sizes[k]) for k in (i, j))
     a, b = one[m.rows[:, 0]], other[m.rows[:, 1]]
-    blur = [OF_FEATURE * features[k].size[rows] / max(sizes[k])
-            for k, rows in zip((i, j), m.rows.T)]  # fmt: skip
+    blur = [
+        OF_FEATURE * features[k].size[rows] / max(sizes[k]) for k, rows in zip((i, j), m.rows.T)
+    ]
     limit = LARGEST_MOTION + np.maximum(*blur)
     for turns in range(4):
         still = _are_still(a, b, sizes[i], limit, turns, sizes[j])

@@ -150,8 +150,9 @@ def _in_tile(detector, grey, top, left, bottom, right):
 
 def _columns(points):
     xy = np.array([p.pt for p in points], float)
-    return xy, *(np.array([getattr(p, name) for p in points]) for name in
-                 ("size", "angle", "response"))  # fmt: skip
+    return xy, *(
+        np.array([getattr(p, name) for p in points]) for name in ("size", "angle", "response")
+    )
 
 
 def _spread(xy, size, response, shape, number):

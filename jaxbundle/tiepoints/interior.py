@@ -105,9 +105,7 @@ def prepare() -> None:
 
 
 def _with(camera, f, k1=0.0):
-    return dataclasses.replace(
-        camera, parameters={**camera.parameters, "fx": f, "fy": f, "k1": k1}
-    )
+    return dataclasses.replace(camera, parameters={**camera.parameters, "fx": f, "fy": f, "k1": k1})
 
 
 def _orient(cameras, xy1, xy2, limit):

@@ -60,8 +60,11 @@ def split_contradicted(
     group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
         i, j = pair.images
-        found = [loops.closes((i, j), k) for k in loops.thirds((i, j))
-                 if {_pair(i, k), _pair(j, k)} <= taken]  # fmt: skip
+        found = [
+            loops.closes((i, j), k)
+            for k in loops.thirds((i, j))
+            if {_pair(i, k), _pair(j, k)} <= taken
+        ]
         needed = pair.sure or group[i] != group[j]
         if found.count(False) <= found.count(True) and (needed or any(found)):
             taken.add((i, j))
@@ -165,8 +168,10 @@ def _is_between(one, other, b) -> bool:
 
 def _depths(pair: Pair, ideal):
     """Depths of the matches in both photographs for base 1."""
-    a, c = (np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
-            for k, rows in zip(pair.images, pair.matches.T))  # fmt: skip
+    a, c = (
+        np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
+        for k, rows in zip(pair.images, pair.matches.T)
+    )
     c = c @ pair.M
     aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
     determinant = aa * cc - dot * dot

@@ -45,9 +45,7 @@ class Matches(NamedTuple):
 
     def take(self, chosen) -> "Matches":
         """The chosen matches."""
-        return Matches(
-            self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen]
-        )
+        return Matches(self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen])
 
 
 def match_features(

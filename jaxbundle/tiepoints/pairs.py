@@ -61,6 +61,9 @@ def _alike(features, run):
         if found >= FEWEST_MATCHES:
             of[i].append((found, j))
             of[j].append((found, i))
-    pairs = {(min(i, j), max(i, j)) for i, best in enumerate(of)
-             for _, j in sorted(best, reverse=True)[:NEIGHBOURS]}  # fmt: skip
+    pairs = {
+        (min(i, j), max(i, j))
+        for i, best in enumerate(of)
+        for _, j in sorted(best, reverse=True)[:NEIGHBOURS]
+    }
     return sorted(pairs)

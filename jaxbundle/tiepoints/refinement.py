@@ -234,6 +234,4 @@ def _collect(track, image, xy, size, first, level, corner, colour, others, start
     place_of[w] = (corner[w] + WINDOW // 2) * scale[w, None]
     sigma[w] = np.sqrt(square[use] / number[use, None]) * scale[w, None]
     matched[w] = True
-    return Measurements(
-        track, image, place_of, sigma, np.where(matched, level, -1), first, colour
-    )
+    return Measurements(track, image, place_of, sigma, np.where(matched, level, -1), first, colour)

@@ -50,8 +50,7 @@ def detect(
             store.save_features(fingerprints[k], found)
         return found
 
-    return map_in_threads(one, range(len(read)), workers,
-                          lambda n: tell("features", n, len(read)))  # fmt: skip
+    return map_in_threads(one, range(len(read)), workers, lambda n: tell("features", n, len(read)))
 
 
 def match(
@@ -105,16 +104,29 @@ def verify(
         for m, pair in zip(some, found):
             if pair is not None:
                 good, M, b, angle, kind, sure = pair
-                kept.append(Pair(m.images, m.rows[good], m.clarity[good], M, b, angle, kind,
-                                 len(m.rows), sure))  # fmt: skip
+                kept.append(
+                    Pair(
+                        m.images,
+                        m.rows[good],
+                        m.clarity[good],
+                        M,
+                        b,
+                        angle,
+                        kind,
+                        len(m.rows),
+                        sure,
+                    )
+                )
         tell("verification", min(first + portion, len(matches)), len(matches))
     return kept
 
 
 def without_contradicted(
-    cameras: Sequence[Camera], of: Sequence[int], features: Sequence[Features],
+    cameras: Sequence[Camera],
+    of: Sequence[int],
+    features: Sequence[Features],
     pairs: Sequence[Pair],
-) -> tuple[list[Pair], list[Pair]]:  # fmt: skip
+) -> tuple[list[Pair], list[Pair]]:
     """The pairs consistent in loops of three, and the others."""
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
     return split_contradicted(pairs, ideal)

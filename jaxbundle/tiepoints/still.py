@@ -59,9 +59,7 @@ def without_marks(
     return kept, len(seen)
 
 
-def _still(
-    m: Matches, features, sizes
-) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _still(m: Matches, features, sizes) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Which matches are still, and the motion of all, relative to the limit."""
     i, j = m.images
     if sizes[i] != sizes[j] or not len(m.rows):

@@ -49,9 +49,12 @@ class Store:
     def save_features(self, fingerprint: str, features: Features) -> None:
         """Store the features of a photograph."""
         self._save(
-            self.name(fingerprint), xy=features.xy, size=features.size, angle=features.angle,
+            self.name(fingerprint),
+            xy=features.xy,
+            size=features.size,
+            angle=features.angle,
             descriptor=features.descriptor,
-        )  # fmt: skip
+        )
 
     def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
         """The stored rows of matching features of two photographs, their clarity, and which are

@@ -19,9 +19,7 @@ MERGING_DISTANCE = 0.0015
 """Tracks nearer than this part of the longer side, in two photographs, are one point."""
 
 
-def make_tracks(
-    features: Sequence[Features], pairs: Sequence[Pair]
-) -> list[list[tuple[int, int]]]:
+def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[list[tuple[int, int]]]:
     """Tracks as lists of (photograph, feature), two photographs at least."""
     first = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
     same = np.concatenate([_first_at_a_place(f.xy) + k for f, k in zip(features, first)] or [[]])

@@ -106,20 +106,23 @@ def verify_pairs(
     if not usable:
         return found
     sure = _find_agreeing({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
-    others = {k: np.arange(len(xy1[k])) for k in usable
-              if k not in sure and (~single[k]).sum() >= LEAST}  # fmt: skip
+    others = {
+        k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~single[k]).sum() >= LEAST
+    }
     agreed = {**_find_agreeing(others, xy1, xy2, tolerance), **sure}
     for k in sure:
         good, M, b = agreed[k]
         if (good & single[k]).sum() >= SUFFICIENT_MATCHES:
             agreed[k] = good & single[k], M, b
     turned = {
-        k: turn for k in usable if k not in agreed
-        and (turn := _by_rotation(xy1[k], xy2[k], tolerance[k])) is not None
-    }  # fmt: skip
+        k: turn
+        for k in usable
+        if k not in agreed and (turn := _by_rotation(xy1[k], xy2[k], tolerance[k])) is not None
+    }
     left = sorted(agreed)
-    kinds = _kinds([agreed[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left],
-                   tolerance[left])  # fmt: skip
+    kinds = _kinds(
+        [agreed[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left], tolerance[left]
+    )
     for k, (good, angle, kind) in zip(left, kinds):
         _, M, b = agreed[k]
         found[k] = Verified(good, M, b, angle, kind, k in sure)
@@ -145,9 +148,10 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
     keys = np.array(list(rows))
     few = [rows[k][clear(len(rows[k]))] for k in rows]
     M, b, part, _ = many.orient_pairs(
-        [xy1[k][r] for k, r in zip(rows, few)], [xy2[k][r] for k, r in zip(rows, few)],
+        [xy1[k][r] for k, r in zip(rows, few)],
+        [xy2[k][r] for k, r in zip(rows, few)],
         FIRST_TOLERANCE * tolerance[keys],
-    )  # fmt: skip
+    )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
     for limit in (FIRST_TOLERANCE, 1.0):
         poses = _improve(poses, rows, xy1, xy2, tolerance, limit)
@@ -289,9 +293,7 @@ def _kinds(found, xy1, xy2, tolerance):
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
     weights = _used_slots(rows)
     M, b = (np.stack([f[i] for f in found]) for i in (1, 2))
-    angle, turn, plane = many.run_in_lanes(
-        _simpler, LANES, M, b, filled(xy1), filled(xy2), weights
-    )  # fmt: skip
+    angle, turn, plane = many.run_in_lanes(_simpler, LANES, M, b, filled(xy1), filled(xy2), weights)
     kinds = []
     for k, (good, *_) in enumerate(found):
         number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]

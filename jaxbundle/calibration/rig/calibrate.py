@@ -56,14 +56,18 @@ def calibrate_rig(
     """
     check_test(snooping, significance)
     if not isinstance(calibrations, Mapping):
-        raise InputError(f"calibrations are {show(calibrations)}; expected a mapping from the "
-                         "name of each camera to its Calibration")  # fmt: skip
+        raise InputError(
+            f"calibrations are {show(calibrations)}; expected a mapping from the "
+            "name of each camera to its Calibration"
+        )
     if len(calibrations) < 2:
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
         if not isinstance(one, Calibration):
-            raise InputError(f"calibrations: {name!r} is {show(one)}; expected the Calibration "
-                             "that calibrate returns for this camera")  # fmt: skip
+            raise InputError(
+                f"calibrations: {name!r} is {show(one)}; expected the Calibration "
+                "that calibrate returns for this camera"
+            )
         if not one.converged:
             why = one.adjustment.termination
             raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
@@ -73,20 +77,32 @@ def calibrate_rig(
     base, turn = _start_of_mountings(list(calibrations), poses)
     rig = _start(calibrations, keys, poses, base, turn, epochs)
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
-    size = {name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
-            for name, one in calibrations.items()}  # fmt: skip
+    size = {
+        name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
+        for name, one in calibrations.items()
+    }
     left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
     while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
-        left_out += [(rig.epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs "
-                      "not simultaneous?") for e, rms in bad.items()]  # fmt: skip
+        left_out += [
+            (
+                rig.epochs[e],
+                f"does not fit the mounting (RMS {rms:.1f} px): photographs not simultaneous?",
+            )
+            for e, rms in bad.items()
+        ]
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
     return RigCalibration(
-        dict(calibrations), rig, found, left_out,
-        [(rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
-         for e, rms in bad.items()],
-    )  # fmt: skip
+        dict(calibrations),
+        rig,
+        found,
+        left_out,
+        [
+            (rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
+            for e, rms in bad.items()
+        ],
+    )
 
 
 def require_solved(found: Result) -> Result:
@@ -100,7 +116,7 @@ def require_solved(found: Result) -> Result:
             f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
             "that share too few epochs, or photographs that are not simultaneous",
             list(names),
-        )  # fmt: skip
+        )
     return found
 
 
@@ -152,15 +168,25 @@ def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
     place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
     rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
     epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
-    free = {name: one.adjustment.problem.network.cameras[0].free
-            for name, one in calibrations.items()}  # fmt: skip
+    free = {
+        name: one.adjustment.problem.network.cameras[0].free for name, one in calibrations.items()
+    }
     return Rig(
-        tuple(dataclasses.replace(one.camera, id=name, free=free[name])
-              for name, one in calibrations.items()),
-        place([base[n] for n in names], [turn[n] for n in names]), tuple(epochs),
-        place(centre, rotation), board.ids, board.points - middle, epoch,
-        np.repeat(np.arange(len(names)), [len(ray[0]) for ray in rays]), point, xy, sigma,
-    )  # fmt: skip
+        tuple(
+            dataclasses.replace(one.camera, id=name, free=free[name])
+            for name, one in calibrations.items()
+        ),
+        place([base[n] for n in names], [turn[n] for n in names]),
+        tuple(epochs),
+        place(centre, rotation),
+        board.ids,
+        board.points - middle,
+        epoch,
+        np.repeat(np.arange(len(names)), [len(ray[0]) for ray in rays]),
+        point,
+        xy,
+        sigma,
+    )
 
 
 @partial(compile_once, static=())
@@ -175,8 +201,12 @@ def _rays(calibration: Calibration, keys, epochs):
     row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
     epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
     epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[kept]]
-    return (epoch, np.array([point[id] for id in network.points.id])[rays.point[kept]],
-            rays.xy[kept], rays.sigma[kept])  # fmt: skip
+    return (
+        epoch,
+        np.array([point[id] for id in network.points.id])[rays.point[kept]],
+        rays.xy[kept],
+        rays.sigma[kept],
+    )
 
 
 def _contradictions(rig: Rig, found, size):

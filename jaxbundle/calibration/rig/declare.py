@@ -42,9 +42,7 @@ def _scale(motion, mounting: PoseValue) -> PoseValue:
 
 
 _OF_OBJECT = similarity(("point",), ("epoch",))
-FLOATING = Motions(
-    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved
-)
+FLOATING = Motions(_OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scale)), _OF_OBJECT.curved)
 """A similarity of the object that also transforms poses and bases."""
 
 
@@ -99,11 +97,16 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
     names = [camera.id for camera in rig.cameras]
     tables = [
         Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR),
-        Table("mounting", rig.mounting, free=np.arange(len(names)) > 0, labels=names,
-              parameters=("bx", "by", "bz", "omega", "phi", "kappa")),
+        Table(
+            "mounting",
+            rig.mounting,
+            free=np.arange(len(names)) > 0,
+            labels=names,
+            parameters=("bx", "by", "bz", "omega", "phi", "kappa"),
+        ),
         *(t.unknowns(rig.cameras) for t, _ in rig.sets),
         Table("point", rig.points, free=free, labels=rig.ids, parameters=("X", "Y", "Z")),
-    ]  # fmt: skip
+    ]
     observations = []
     for table, rows in rig.sets:
         k = rig.camera[rows]
@@ -126,9 +129,12 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
     """
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
     return adjust(
-        *declare_rig(rig), eliminate="epoch", max_iterations=max_iterations,
-        **(free if rig.points_free else {}), **options,
-    )  # fmt: skip
+        *declare_rig(rig),
+        eliminate="epoch",
+        max_iterations=max_iterations,
+        **(free if rig.points_free else {}),
+        **options,
+    )
 
 
 def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
@@ -141,8 +147,9 @@ def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result
     with too few are excluded."""
     removed = [
         Removed(table.image_set, row, None, 0.0)
-        for table, of_set in rig.sets for row in np.flatnonzero(rays[of_set]).tolist()
-    ]  # fmt: skip
+        for table, of_set in rig.sets
+        for row in np.flatnonzero(rays[of_set]).tolist()
+    ]
     problem = without(found.problem, removed)
     return Result(problem, find_minimum(problem, max_steps=max_iterations + 1))
 

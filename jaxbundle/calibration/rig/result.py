@@ -72,9 +72,13 @@ class RigCalibration:
     eliminated = ()
 
     def __init__(
-        self, cameras: dict[str, Calibration], rig: Rig, result: Result,
-        left_out: Sequence[tuple[str, str]], contradicting: Sequence[tuple[str, str]] = (),
-    ):  # fmt: skip
+        self,
+        cameras: dict[str, Calibration],
+        rig: Rig,
+        result: Result,
+        left_out: Sequence[tuple[str, str]],
+        contradicting: Sequence[tuple[str, str]] = (),
+    ):
         self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
         self._covariances: dict[tuple[str, ...], np.ndarray] = {}
@@ -130,17 +134,30 @@ class RigCalibration:
         ids = np.array(rig.ids, dtype=object)
         photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
         rows = rig.in_order
-        parts = [result_tables.residual_rows(
-            self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
-            rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
-            Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
-        )]  # fmt: skip
+        parts = [
+            result_tables.residual_rows(
+                self,
+                "image",
+                np.array(photographs, dtype=object),
+                ids[rig.point],
+                ("x", "y"),
+                rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
+                Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
+            )
+        ]
         if rig.point_sigma is not None:
             blank = np.full(len(ids), "", dtype=object)
-            parts.append(result_tables.residual_rows(
-                self, "control", blank, ids, tuple("XYZ"), weight("control"),
-                Tested(*(getattr(found, name)["control"] for name in Tested._fields)),
-            ))  # fmt: skip
+            parts.append(
+                result_tables.residual_rows(
+                    self,
+                    "control",
+                    blank,
+                    ids,
+                    tuple("XYZ"),
+                    weight("control"),
+                    Tested(*(getattr(found, name)["control"] for name in Tested._fields)),
+                )
+            )
         return result_tables.concatenate(parts)
 
     def pope(self, w):
@@ -204,8 +221,9 @@ class RigCalibration:
         are free in some camera of its model; zero for held ones."""
         if names not in self._covariances:
             problem = self.result.problem
-            places = [(self.names.index(name), *self.rig.place(self.names.index(name)))
-                      for name in names]  # fmt: skip
+            places = [
+                (self.names.index(name), *self.rig.place(self.names.index(name))) for name in names
+            ]
             widths = [POSE + problem.table(table).space.width for _, table, _ in places]
             number, starts = sum(widths), np.cumsum([0, *widths])
             rows = {t.name: np.zeros((number, t.rows, t.space.width)) for t in problem.tables}
@@ -235,9 +253,11 @@ class RigCalibration:
         cameras = [dataclasses.replace(self.camera(name), id=name) for name in self.names]
         mountings = self.mountings.values()
         return network_of_rig(
-            Path("rig"), cameras, [np.eye(3), *(one.rotation for one in mountings)],
+            Path("rig"),
+            cameras,
+            [np.eye(3), *(one.rotation for one in mountings)],
             [np.zeros(3), *(one.base for one in mountings)],
-        )  # fmt: skip
+        )
 
     @property
     def distance(self) -> float:
@@ -261,8 +281,12 @@ class RigCalibration:
 
     def reported_maps(self, name: str) -> list[UncertaintyMap]:
         """At the distance of the board, at ten times that, at infinity; and without mounting."""
-        chosen = (("rig", self.distance), ("rig", 10 * self.distance), ("rig", np.inf),
-                  ("rotation", np.inf))  # fmt: skip
+        chosen = (
+            ("rig", self.distance),
+            ("rig", 10 * self.distance),
+            ("rig", np.inf),
+            ("rotation", np.inf),
+        )
         return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
 
     def plot_coverage(self, name: str, ax=None):
@@ -277,8 +301,10 @@ class RigCalibration:
         return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
 
     def __str__(self) -> str:
-        lines = [f"Rig of {len(self.cameras)} cameras, {len(self.epochs)} epochs, σ0 "
-                 f"{self.sigma0:.3f}, reference {self.names[0]}"]  # fmt: skip
+        lines = [
+            f"Rig of {len(self.cameras)} cameras, {len(self.epochs)} epochs, σ0 "
+            f"{self.sigma0:.3f}, reference {self.names[0]}"
+        ]
         for name, m in self.mountings.items():
             lines.append(f"{name}: base {m.length:.6g} ± {m.length_sigma:.2g}")
         return "\n".join(lines)
@@ -300,6 +326,10 @@ def _mounting(at: PoseValue, C) -> Mounting:
     J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
     along = base / length if length else np.zeros(3)
     return Mounting(
-        base, R, np.degrees(angles), J @ C @ J.T, length,
+        base,
+        R,
+        np.degrees(angles),
+        J @ C @ J.T,
+        length,
         float(np.sqrt(along @ C[:3, :3] @ along)),
-    )  # fmt: skip
+    )

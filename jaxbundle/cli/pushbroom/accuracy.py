@@ -97,19 +97,26 @@ def accuracy(
         errors = ground_errors(file.image, open_scanner(truth).image, surface, line, pixel)
         length = np.hypot(*errors.T)
         columns |= {
-            "east": mean(by_cell(errors[:, 0])), "north": mean(by_cell(errors[:, 1])),
+            "east": mean(by_cell(errors[:, 0])),
+            "north": mean(by_cell(errors[:, 1])),
             "error": rms(by_cell(length)),
-        }  # fmt: skip
+        }
         if not np.isfinite(length).any():
             raise InputError("no ray meets the surface: check attitude, mounting and height")
-        head = {"rms": float(np.sqrt(np.nanmean(length**2))),
-                "ce90": float(np.nanquantile(length, 0.9))}  # fmt: skip
+        head = {
+            "rms": float(np.sqrt(np.nanmean(length**2))),
+            "ce90": float(np.nanquantile(length, 0.9)),
+        }
     else:
         degree = np.pi / 180
         noise = Noise(
-            degree * attitude_bias, degree * attitude_drift, degree * attitude_white,
-            position_bias, position_drift, position_white,
-        )  # fmt: skip
+            degree * attitude_bias,
+            degree * attitude_drift,
+            degree * attitude_white,
+            position_bias,
+            position_drift,
+            position_white,
+        )
         if not any(noise):
             raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
         if isinstance(surface, Terrain):
@@ -122,10 +129,12 @@ def accuracy(
             columns |= {
                 "drawn_rms": rms(by_cell(counted.rms)),
                 "drawn_ce90": mean(by_cell(counted.ce90)),
-            }  # fmt: skip
+            }
             head |= {
-                "drawn_rms": counted.overall, "drawn_ce90": counted.overall_ce90, "draws": draws
-            }  # fmt: skip
+                "drawn_rms": counted.overall,
+                "drawn_ce90": counted.overall_ce90,
+                "draws": draws,
+            }
     head["positions"] = len(line)
     if map_ is not None:
         _write_map(map_, columns, head)
@@ -154,8 +163,9 @@ def _write_map(path: Path, columns: dict, head: dict) -> None:
     lines, pixels = (np.unique(columns[name]) for name in ("line", "pixel"))
     bands = {
         f"{name} [m]": values.reshape(len(lines), len(pixels))
-        for name, values in columns.items() if name not in ("line", "pixel")
-    }  # fmt: skip
+        for name, values in columns.items()
+        if name not in ("line", "pixel")
+    }
     if path.suffix.lower() != ".png":
         write_image_raster(path, lines, pixels, bands)
         return

@@ -35,19 +35,37 @@ def write_table(table: AccuracyTable, csv: Path | None, json: str) -> None:
     if csv is None and not json:
         print(set_out(table))
         return
-    rows = [(cell.trajectory, 0.0, cell.interpolation, cell.rms, cell.ce90, *[np.nan] * 4)
-            for cell in table.error_free]  # fmt: skip
+    rows = [
+        (cell.trajectory, 0.0, cell.interpolation, cell.rms, cell.ce90, *[np.nan] * 4)
+        for cell in table.error_free
+    ]
     rows += [
-        (cell.trajectory, _degrees(cell.sigma), "", cell.drawn_rms, cell.drawn_ce90,
-         cell.propagated_rms, cell.propagated_ce90, cell.closed_rms, cell.closed_ce90)
+        (
+            cell.trajectory,
+            _degrees(cell.sigma),
+            "",
+            cell.drawn_rms,
+            cell.drawn_ce90,
+            cell.propagated_rms,
+            cell.propagated_ce90,
+            cell.closed_rms,
+            cell.closed_ce90,
+        )
         for cell in table.erring
-    ]  # fmt: skip
+    ]
     names = ["trajectory", "sigma", "interpolation", "rms", "ce90"]
     names += [f"{way}_{value}" for way in WAYS[1:] for value in names[3:5]]
-    write_rows(dict(zip(names, zip(*rows))), csv, json, {
-        "altitude": table.altitude, "field_of_view": _degrees(table.field_of_view),
-        "kind": table.kind, "draws": table.draws,
-    })  # fmt: skip
+    write_rows(
+        dict(zip(names, zip(*rows))),
+        csv,
+        json,
+        {
+            "altitude": table.altitude,
+            "field_of_view": _degrees(table.field_of_view),
+            "kind": table.kind,
+            "draws": table.draws,
+        },
+    )
 
 
 def set_out(table: AccuracyTable) -> str:

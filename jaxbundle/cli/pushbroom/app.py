@@ -21,8 +21,10 @@ Level = Annotated[
 Dem = Annotated[Path | None, typer.Option(help="terrain raster, heights like --height")]
 Geoid = Annotated[
     Path | None,
-    typer.Option(help="geoid heights, for a --dem of orthometric heights: "
-                 "a raster, or the name of a PROJ grid"),
-]  # fmt: skip
+    typer.Option(
+        help="geoid heights, for a --dem of orthometric heights: "
+        "a raster, or the name of a PROJ grid"
+    ),
+]
 Csv = Annotated[Path | None, typer.Option(help="file for the table; default: standard output")]
 Json = Annotated[str, typer.Option(help="the table as JSON; - for standard output")]

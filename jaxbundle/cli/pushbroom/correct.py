@@ -69,15 +69,30 @@ def correct(
     with counting(quiet) as bar:
         task = bar.add_task("blocks", total=None)
         write_corrected(
-            image, out, file.image, search, surface, system, grid, kind,
-            lambda _, done, total: bar.update(task, completed=done, total=total), occlusion,
-        )  # fmt: skip
+            image,
+            out,
+            file.image,
+            search,
+            surface,
+            system,
+            grid,
+            kind,
+            lambda _, done, total: bar.update(task, completed=done, total=total),
+            occlusion,
+        )
         if truth is not None and error_map is not None:
             task = bar.add_task("errors", total=None)
             rms = write_error_map(
-                error_map, file.image, search, true, make_search(true, file.earth), surface, system,
-                grid, lambda _, done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
+                error_map,
+                file.image,
+                search,
+                true,
+                make_search(true, file.earth),
+                surface,
+                system,
+                grid,
+                lambda _, done, total: bar.update(task, completed=done, total=total),
+            )
     if not quiet:
         print(f"{out}: {grid.rows} × {grid.columns} pixels of {grid.size:g}")
         if truth is not None:

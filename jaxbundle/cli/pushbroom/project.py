@@ -53,8 +53,15 @@ def project(
     order = np.lexsort((solution, point))
     solution, point = solution[order], point[order]
     ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(status))]
-    write_rows({
-        "id": [ids[p] for p in point], "line": line[solution, point],
-        "pixel": pixel[solution, point], "count": count[point],
-        "status": [Status(int(status[p])).meaning for p in point],
-    }, csv, json, {"scanner": file.name})  # fmt: skip
+    write_rows(
+        {
+            "id": [ids[p] for p in point],
+            "line": line[solution, point],
+            "pixel": pixel[solution, point],
+            "count": count[point],
+            "status": [Status(int(status[p])).meaning for p in point],
+        },
+        csv,
+        json,
+        {"scanner": file.name},
+    )

@@ -53,13 +53,21 @@ def refine(
     check_writable(json, out, "pushbroom refine", names, files, force, html)
     origin = UNKNOWN
     if html or out is not None:
-        origin = trace_files(files, {
-            "snooping": file.snooping, "significance": file.significance,
-        })  # fmt: skip
+        origin = trace_files(
+            files,
+            {
+                "snooping": file.snooping,
+                "significance": file.significance,
+            },
+        )
     result = refine_images(
-        file.images, file.points, file.observations, file.frames,
-        snooping=file.snooping, significance=file.significance,
-    )  # fmt: skip
+        file.images,
+        file.points,
+        file.observations,
+        file.frames,
+        snooping=file.snooping,
+        significance=file.significance,
+    )
     result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
     verdict = conclude_refinement(result)
     text = head_line(origin) + report(result, verdict.words)

@@ -56,9 +56,14 @@ def simulate(
             with counting(quiet) as bar:
                 task = bar.add_task("lines", total=None)
                 write_taken(
-                    new / IMAGE, truth, surface, jnp.asarray(shown.bands), shown.place,
-                    np.dtype(shown.dtype), kind,
+                    new / IMAGE,
+                    truth,
+                    surface,
+                    jnp.asarray(shown.bands),
+                    shown.place,
+                    np.dtype(shown.dtype),
+                    kind,
                     lambda _, done, total: bar.update(task, completed=done, total=total),
-                )  # fmt: skip
+                )
     if not quiet:
         print(out / path.name)

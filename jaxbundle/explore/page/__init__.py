@@ -57,11 +57,16 @@ def _control(one: Control, dead: str) -> str:
         shown = f"{one.value:.{WITHOUT_SIGMA}g}"
         exact = f' data-exact="{one.value!r}"' if float(shown) != one.value else ""
         field = f'<input type="number" step="any" value="{shown}"{exact} {key}>'
-        slider = "" if one.low is None else (
-            f'<input type="range" step="any" min="{one.low!r}" max="{one.high!r}" '
-            f'value="{one.value!r}" data-slides="{text(one.key)}" aria-label="{text(one.label)}"'
-            f"{dead}>"
-        )  # fmt: skip
+        slider = (
+            ""
+            if one.low is None
+            else (
+                f'<input type="range" step="any" min="{one.low!r}" max="{one.high!r}" '
+                f'value="{one.value!r}" data-slides="{text(one.key)}" '
+                f'aria-label="{text(one.label)}"'
+                f"{dead}>"
+            )
+        )
         unit = f"<span>{text(one.unit)}</span>"
         return f"<label><span>{text(one.label)}</span>{slider}{field}{unit}</label>\n"
     if isinstance(one, Switch):
@@ -69,7 +74,7 @@ def _control(one: Control, dead: str) -> str:
         box = f'<input type="checkbox"{ticked} {key}>'
         return f"<label><span></span>{box}{text(one.label)}</label>\n"
     options = "".join(
-        f'<option{" selected" if word == one.value else ""}>{text(word)}</option>'
+        f"<option{' selected' if word == one.value else ''}>{text(word)}</option>"
         for word in one.words
     )
     return f"<label><span>{text(one.label)}</span><select {key}>{options}</select></label>\n"
@@ -91,18 +96,31 @@ def draw_tools(live: bool, exports: Mapping[str, str] = NOTHING) -> str:
 
 
 def make_page(
-    title: str, sections: Iterable[Section], origin: Origin, live: bool, kind: str,
-    answer: Mapping[str, Any], settings: Sequence[tuple[str, object]] = (),
-    tables: Mapping[str, Listing] = NOTHING, drawings: Mapping[str, Any] = NOTHING,
+    title: str,
+    sections: Iterable[Section],
+    origin: Origin,
+    live: bool,
+    kind: str,
+    answer: Mapping[str, Any],
+    settings: Sequence[tuple[str, object]] = (),
+    tables: Mapping[str, Listing] = NOTHING,
+    drawings: Mapping[str, Any] = NOTHING,
     given: Mapping[str, Any] = NOTHING,
-) -> Page:  # fmt: skip
+) -> Page:
     """A page of the explorer with the answer to the values `given`."""
     state = {"live": live, "kind": kind, "given": dict(given), "answer": dict(answer)}
     state = without_nan(state)
     return Page(
-        title, sections, origin, settings, tables, {**drawings, "explore": state},
-        tuple(_read(name) for name in SCRIPTS), _read(STYLE), live,
-    )  # fmt: skip
+        title,
+        sections,
+        origin,
+        settings,
+        tables,
+        {**drawings, "explore": state},
+        tuple(_read(name) for name in SCRIPTS),
+        _read(STYLE),
+        live,
+    )
 
 
 def place(id: str) -> str:

@@ -52,8 +52,11 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
         views.setdefault(given["filename"], []).append(_point(row, given))
         if given.get("level", "0").isdigit() and int(given.get("level", "0")) > 0:
             reduced[given["filename"]] = None
-    failed = [name for name, points in views.items()
-              if len(points) == 1 < number and np.isnan(points).all()]  # fmt: skip
+    failed = [
+        name
+        for name, points in views.items()
+        if len(points) == 1 < number and np.isnan(points).all()
+    ]
     for name, points in views.items():
         if name not in failed and len(points) != number:
             raise InputError(
@@ -63,10 +66,22 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     names = [name for name in views if name not in failed]
     xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
     w, h = (int(n) for n in image_size)
-    told = [f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
-            f"less precise: {list_some(reduced)}"] if reduced else []  # fmt: skip
-    return BoardViews(board, tuple(names), (w, h), xy,
-                      tuple((name, "no board found") for name in failed), tuple(told))  # fmt: skip
+    told = (
+        [
+            f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
+            f"less precise: {list_some(reduced)}"
+        ]
+        if reduced
+        else []
+    )
+    return BoardViews(
+        board,
+        tuple(names),
+        (w, h),
+        xy,
+        tuple((name, "no board found") for name in failed),
+        tuple(told),
+    )
 
 
 def _legend(row: Row) -> list[str]:

@@ -82,8 +82,9 @@ class KeptCorners:
         """The search result of a board in a photograph of this content; None: not searched."""
         found = self._first(
             "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
-            content, _key(board),
-        )  # fmt: skip
+            content,
+            _key(board),
+        )
         if found is None:
             return None
         columns, rows, xy, why = found
@@ -97,8 +98,13 @@ class KeptCorners:
         points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
         self._write(
             "INSERT OR REPLACE INTO boards VALUES (?, ?, ?, ?, ?, ?)",
-            content, _key(board), columns, rows, points, look if xy is None else None,
-        )  # fmt: skip
+            content,
+            _key(board),
+            columns,
+            rows,
+            points,
+            look if xy is None else None,
+        )
 
     def _first(self, question: str, *given) -> tuple | None:
         try:

@@ -68,9 +68,17 @@ def write_target(board: Board, path: str | Path) -> None:
         return
     lines = [f"targetCols: {board.columns}", f"targetRows: {board.rows}"]
     if board.kind == "chessboard":
-        lines = ["target_type: 'checkerboard'", *lines, f"rowSpacingMeters: {board.square!r}",
-                 f"colSpacingMeters: {board.square!r}"]  # fmt: skip
+        lines = [
+            "target_type: 'checkerboard'",
+            *lines,
+            f"rowSpacingMeters: {board.square!r}",
+            f"colSpacingMeters: {board.square!r}",
+        ]
     else:
-        lines = ["target_type: 'circlegrid'", *lines, f"spacingMeters: {board.square!r}",
-                 f"asymmetricGrid: {board.kind == CIRCLES[True]}"]  # fmt: skip
+        lines = [
+            "target_type: 'circlegrid'",
+            *lines,
+            f"spacingMeters: {board.square!r}",
+            f"asymmetricGrid: {board.kind == CIRCLES[True]}",
+        ]
     write_text(Path(path), "\n".join(lines) + "\n")

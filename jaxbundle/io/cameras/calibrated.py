@@ -23,9 +23,11 @@ Calibrated = tuple[Camera, tuple[list[str], Float[np.ndarray, "k k"]]]
 def is_result(path: Path) -> bool:
     """Whether a file may be the result of an adjustment or a calibration, ours or of Kalibr."""
     return is_kalibr_results(path) or (
-        path.suffix.lower() == ".json" and path.is_file() and not is_camera_file(path)
+        path.suffix.lower() == ".json"
+        and path.is_file()
+        and not is_camera_file(path)
         and not any(recognises(path) for recognises in (is_openmvg, is_opensfm, is_transforms))
-    )  # fmt: skip
+    )
 
 
 def read_calibrated(path: str | Path) -> list[Calibrated]:
@@ -42,7 +44,8 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
         parts = document.get("calibrations", {"": document})
         return [
             _calibrate(path, id, entry, part.get("calibration", {}))
-            for part in parts.values() for id, entry in part["cameras"].items()
+            for part in parts.values()
+            for id, entry in part["cameras"].items()
         ]
     except InputError:
         raise
@@ -63,9 +66,9 @@ def _calibrate(path, id, entry, about) -> Calibrated:
     sigma = np.array([float(parameters[name]["sigma"]) for name in free])
     known = entry["correlations"]
     one = {name: _find_tied(name, parameters, known) for name in free}
-    R = np.array([
-        [1.0 if one[a] == one[b] else float(known[one[a]][one[b]]) for b in free] for a in free
-    ]).reshape(len(free), len(free))  # fmt: skip
+    R = np.array(
+        [[1.0 if one[a] == one[b] else float(known[one[a]][one[b]]) for b in free] for a in free]
+    ).reshape(len(free), len(free))
     if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
         raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
     return camera, (free, sigma[:, None] * R * sigma)

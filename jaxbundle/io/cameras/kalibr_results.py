@@ -55,8 +55,10 @@ def _camera(path: Path, id: str, text: str):
     if line is None:
         raise InputError(f"{where}: type is missing")
     name = line[1]
-    kind = (next((k for word, k in CAMERAS.items() if word in name), name),
-            next(k for word, k in DISTORTIONS.items() if word in name))  # fmt: skip
+    kind = (
+        next((k for word, k in CAMERAS.items() if word in name), name),
+        next(k for word, k in DISTORTIONS.items() if word in name),
+    )
     if kind not in MODELS:
         raise InputError(f"{where}: cameras of type {name} are not known here")
     model, core, coefficients = MODELS[kind]
@@ -77,9 +79,7 @@ def _values(where: str, what: str, text: str, names) -> tuple[dict, dict]:
     for part in found.groups():
         words = part.replace(",", " ").split()
         if len(words) != len(names):
-            raise InputError(
-                f"{where}: {what} has {len(words)} numbers; {len(names)} are expected"
-            )
+            raise InputError(f"{where}: {what} has {len(words)} numbers; {len(names)} are expected")
         row = Row(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))

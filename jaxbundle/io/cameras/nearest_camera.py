@@ -45,9 +45,13 @@ ROUNDS, LONGEST = 60, 0.2
 OPENCV = fitted_parameters(get_model("opencv"))
 RATIONAL = (*OPENCV, "k4", "k5", "k6")
 PRISM = (*OPENCV, "s1", "s2", "s3", "s4")
-PERSPECTIVE = (("opencv", OPENCV), ("opencv", RATIONAL), ("opencv", PRISM),
-               ("opencv", (*RATIONAL, *PRISM[-4:])),
-               ("brown-projected", fitted_parameters(get_model("brown-projected"))))  # fmt: skip
+PERSPECTIVE = (
+    ("opencv", OPENCV),
+    ("opencv", RATIONAL),
+    ("opencv", PRISM),
+    ("opencv", (*RATIONAL, *PRISM[-4:])),
+    ("brown-projected", fitted_parameters(get_model("brown-projected"))),
+)
 FISHEYE = (("kannala-brandt", fitted_parameters(get_model("kannala-brandt"))),)
 NARROW_COSINE = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
@@ -137,9 +141,13 @@ def fit_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
     pixel = entry.pop("pixel_size", None)
     model, size = entry.pop("model"), camera.image_size
     return FittedCamera(
-        id, model, entry, image_size=(int(size[0]), int(size[1])),
-        pixel_size=pixel and tuple(pixel), told=f"camera {id!r} {why}: {told}",
-    )  # fmt: skip
+        id,
+        model,
+        entry,
+        image_size=(int(size[0]), int(size[1])),
+        pixel_size=pixel and tuple(pixel),
+        told=f"camera {id!r} {why}: {told}",
+    )
 
 
 def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:

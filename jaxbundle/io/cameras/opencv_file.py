@@ -137,8 +137,13 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
     parameters = {"camera": p, "skew": skew, "H": _tilt(*tilt) if tilt else np.eye(3)}
     has = [f"skew {skew:g}"] if skew else []
     has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
-    foreign = Foreign(FORMULAS[str(camera.model)], parameters, p, camera.image_size,
-                      fisheye=camera.model == "kannala-brandt")  # fmt: skip
+    foreign = Foreign(
+        FORMULAS[str(camera.model)],
+        parameters,
+        p,
+        camera.image_size,
+        fisheye=camera.model == "kannala-brandt",
+    )
     return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
 
 
@@ -207,9 +212,10 @@ def write_opencv(camera: Camera, path: str | Path) -> None:
 
 
 def ros_text(
-    camera: Camera, R: Float[np.ndarray, "3 3"] | None = None,
+    camera: Camera,
+    R: Float[np.ndarray, "3 3"] | None = None,
     P: Float[np.ndarray, "3 4"] | None = None,
-) -> str:  # fmt: skip
+) -> str:
     """The text of a camera_info file of ROS for a camera of model `opencv` or `kannala-brandt`;
     with the rectification R and projection P of a pair.
 
@@ -224,12 +230,19 @@ def ros_text(
     K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
     turn = np.eye(3) if R is None else R
     projection = np.c_[np.reshape(K, (3, 3)), np.zeros(3)] if P is None else P
-    return _as_yaml({
-        "image_width": w, "image_height": h, "camera_name": camera.id, "camera_matrix": (3, 3, K),
-        "distortion_model": kind, "distortion_coefficients": (1, len(values), values),
-        "rectification_matrix": (3, 3, turn.ravel()),
-        "projection_matrix": (3, 4, projection.ravel()),
-    }, ros=True)  # fmt: skip
+    return _as_yaml(
+        {
+            "image_width": w,
+            "image_height": h,
+            "camera_name": camera.id,
+            "camera_matrix": (3, 3, K),
+            "distortion_model": kind,
+            "distortion_coefficients": (1, len(values), values),
+            "rectification_matrix": (3, 3, turn.ravel()),
+            "projection_matrix": (3, 4, projection.ravel()),
+        },
+        ros=True,
+    )
 
 
 def write_ros(camera: Camera, path: str | Path) -> None:
@@ -244,8 +257,13 @@ def _as_yaml(entries: Mapping, ros: bool = False) -> str:
         if isinstance(value, tuple):
             rows, columns, data = value
             numbers = ", ".join(map(repr, map(float, data)))
-            lines += [f"{key}:{tag}", f"   rows: {rows}", f"   cols: {columns}", *dt,
-                      f"   data: [ {numbers} ]"]  # fmt: skip
+            lines += [
+                f"{key}:{tag}",
+                f"   rows: {rows}",
+                f"   cols: {columns}",
+                *dt,
+                f"   data: [ {numbers} ]",
+            ]
         else:
             lines.append(f"{key}: {json.dumps(value)}")
     return "\n".join(lines) + "\n"
@@ -253,10 +271,17 @@ def _as_yaml(entries: Mapping, ros: bool = False) -> str:
 
 def _as_json(entries: Mapping) -> str:
     document = {
-        key: {"type_id": "opencv-matrix", "rows": value[0], "cols": value[1], "dt": "d",
-              "data": [float(x) for x in value[2]]} if isinstance(value, tuple) else value
+        key: {
+            "type_id": "opencv-matrix",
+            "rows": value[0],
+            "cols": value[1],
+            "dt": "d",
+            "data": [float(x) for x in value[2]],
+        }
+        if isinstance(value, tuple)
+        else value
         for key, value in entries.items()
-    }  # fmt: skip
+    }
     return json.dumps(document, indent=4) + "\n"
 
 

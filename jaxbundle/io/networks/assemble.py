@@ -35,8 +35,13 @@ RIG, MOMENT = "rig", "0"
 
 def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
     """The project document of a network of another program: measured in pixels, free."""
-    settings = {"name": name, "datum": "inner", "image_unit": "px", "residuals": "measured",
-                "object_unit": "model"}  # fmt: skip
+    settings = {
+        "name": name,
+        "datum": "inner",
+        "image_unit": "px",
+        "residuals": "measured",
+        "object_unit": "model",
+    }
     return {"project": settings | project, "camera": [dict(camera) for camera in cameras]}
 
 
@@ -80,13 +85,17 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     return Network(
         cameras=tuple(cameras),
         images=Images(
-            ids, images.indices("camera", "camera", index, "cameras"), exterior[:, :3],
-            exterior[:, 3:], np.full((len(ids), 6), np.nan), images.source,
+            ids,
+            images.indices("camera", "camera", index, "cameras"),
+            exterior[:, :3],
+            exterior[:, 3:],
+            np.full((len(ids), 6), np.nan),
+            images.source,
         ),
         points=Points((), (), np.zeros((0, 3)), np.zeros((0, 3))),
         observations=Observations(none, none, np.zeros((0, 2)), np.zeros((0, 2))),
         **settings,
-    )  # fmt: skip
+    )
 
 
 def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
@@ -118,9 +127,12 @@ def rig_network(
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
     source = Source(str(path), None, "camera")
     network = assemble(
-        path, foreign_document(path.stem, map(entry_of, cameras), object_unit=unit), overrides,
-        image_columns(source, names, names, M, X0), warnings=warnings,
-    )  # fmt: skip
+        path,
+        foreign_document(path.stem, map(entry_of, cameras), object_unit=unit),
+        overrides,
+        image_columns(source, names, names, M, X0),
+        warnings=warnings,
+    )
     if not mounted:
         return network
     columns = {"rig": [RIG] * len(names), "epoch": [MOMENT] * len(names), "image": names}

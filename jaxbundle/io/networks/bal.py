@@ -82,14 +82,23 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
                 f"announces {count}, counted from 0"
             )
     document = {
-        "project": {"name": path.name.split(".")[0], "datum": "inner", "image_unit": "px",
-                    "residuals": "measured", "object_unit": "model"},
+        "project": {
+            "name": path.name.split(".")[0],
+            "datum": "inner",
+            "image_unit": "px",
+            "residuals": "measured",
+            "object_unit": "model",
+        },
         "camera": [
-            {"id": str(c), "model": MODEL.name, "free": list(MODEL.parameters),
-             **dict(zip(MODEL.parameters, map(float, row)))}
+            {
+                "id": str(c),
+                "model": MODEL.name,
+                "free": list(MODEL.parameters),
+                **dict(zip(MODEL.parameters, map(float, row))),
+            }
             for c, row in enumerate(given[:, 6:])
         ],
-    }  # fmt: skip
+    }
     document = apply_overrides(document, overrides)
     project = document["project"]
     check_settings(project, f"{path}: ")
@@ -97,19 +106,26 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     return make_network(
         make_cameras(document["camera"], f"{path}, "),
         _table(path, "camera", _images(given[:, :6])),
-        _table(path, "point", {
-            "id": np.arange(points), "role": np.full(points, "tie"),
-            **dict(zip("XYZ", position.reshape(-1, 3).T)),
-        }),
+        _table(
+            path,
+            "point",
+            {
+                "id": np.arange(points),
+                "role": np.full(points, "tie"),
+                **dict(zip("XYZ", position.reshape(-1, 3).T)),
+            },
+        ),
         Columns(
             {
-                "image": observed[:, 0].astype(np.int64), "point": observed[:, 1].astype(np.int64),
-                "x": observed[:, 2], "y": observed[:, 3],
+                "image": observed[:, 0].astype(np.int64),
+                "point": observed[:, 1].astype(np.int64),
+                "x": observed[:, 2],
+                "y": observed[:, 3],
             },
             Source(str(path), np.arange(rows) + 2, "line"),
         ),
         **project,
-    ).replace(angle_unit=angle_unit)  # fmt: skip
+    ).replace(angle_unit=angle_unit)
 
 
 def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:

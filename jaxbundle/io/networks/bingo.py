@@ -82,7 +82,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     images = Columns(
         {"id": [photo for photo, *_ in photos], "camera": chosen, **dict.fromkeys(EXTERIOR, none)},
         Source(str(files[IMAGE]), lines, "line"),
-    )  # fmt: skip
+    )
     ids = dict.fromkeys(rays.values["point"])
     known = {row["id"]: row for row in points}
     tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
@@ -90,16 +90,21 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     network = assemble(
         folder,
         foreign_document(
-            folder.resolve().name, cameras.values(), object_unit="m", image_unit="mm",
-            residuals="corrected", datum="control" if points else "inner",
+            folder.resolve().name,
+            cameras.values(),
+            object_unit="m",
+            image_unit="mm",
+            residuals="corrected",
+            datum="control" if points else "inner",
         ),
-        overrides, images,
+        overrides,
+        images,
         Columns(
             {key: [row.get(key) for row in table] for key in ("id", "role", "X", "Y", "Z")},
             Source(str(files[GEO]), np.array([row.get("line", 0) for row in table]), "line"),
         ),
         rays,
-    )  # fmt: skip
+    )
     unseen = [row["id"] for row in points if row["id"] not in ids]
     if unseen:
         network = network.note(f"no photograph shows the points {list_some(unseen)}: left out")
@@ -129,8 +134,9 @@ def _image_coordinates(path: Path):
             begun = True
         else:
             if not begun:
-                raise row.error(f"{len(row)} values where a photograph (PHOTO [CAMERA]) is "
-                                "expected")  # fmt: skip
+                raise row.error(
+                    f"{len(row)} values where a photograph (PHOTO [CAMERA]) is expected"
+                )
             images.append(photos[-1][0])
             points.append(row.words[0])
             values.append(row.numbers("xy", 1))
@@ -161,8 +167,16 @@ def _geo_input(path: Path):
             if len(row) < 2:
                 raise row.error(f"{keyword}: POINT X Y Z are expected")
             X, Y, Z = row.numbers("XYZ", 2).tolist()
-            points.append({"id": row.words[1], "role": ROLES[keyword], "X": X, "Y": Y, "Z": Z,
-                           "line": row.number})  # fmt: skip
+            points.append(
+                {
+                    "id": row.words[1],
+                    "role": ROLES[keyword],
+                    "X": X,
+                    "Y": Y,
+                    "Z": Z,
+                    "line": row.number,
+                }
+            )
         else:
             raise row.error(
                 f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "

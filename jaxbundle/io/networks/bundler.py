@@ -76,19 +76,30 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ids = np.arange(points)
     return assemble(
         path,
-        foreign_document(path.stem, [
-            {"id": names[i], "model": "snavely", "free": FREE, **dict(zip(FREE, interior[i]))}
-            for i in oriented.tolist()
-        ]),
-        overrides, images,
-        Columns({"id": ids, "role": ["tie"] * points, **dict(zip("XYZ", position.T))},
-                Source(str(path), lines, "line")),
-        Columns({"image": [names[i] for i in image[good]],
-                 "point": observed[good, 1].astype(np.int64),
-                 "x": observed[good, 2], "y": observed[good, 3]},
-                Source(str(path), observed[good, 4].astype(np.int64), "line")),
+        foreign_document(
+            path.stem,
+            [
+                {"id": names[i], "model": "snavely", "free": FREE, **dict(zip(FREE, interior[i]))}
+                for i in oriented.tolist()
+            ],
+        ),
+        overrides,
+        images,
+        Columns(
+            {"id": ids, "role": ["tie"] * points, **dict(zip("XYZ", position.T))},
+            Source(str(path), lines, "line"),
+        ),
+        Columns(
+            {
+                "image": [names[i] for i in image[good]],
+                "point": observed[good, 1].astype(np.int64),
+                "x": observed[good, 2],
+                "y": observed[good, 3],
+            },
+            Source(str(path), observed[good, 4].astype(np.int64), "line"),
+        ),
         warnings if left else (),
-    )  # fmt: skip
+    )
 
 
 def _cameras(rows: Rows, number: int):
@@ -104,8 +115,12 @@ def _cameras(rows: Rows, number: int):
         t.append(rows.take(f"t of {thing}").numbers(["t"] * 3))
         if interior[-1][0] != 0:
             check_rotations(R[-1], f"{row.place}: R of {thing}")
-    return (np.array(interior).reshape(-1, 3), np.array(R).reshape(-1, 3, 3),
-            np.array(t).reshape(-1, 3), np.array(lines, np.int64))  # fmt: skip
+    return (
+        np.array(interior).reshape(-1, 3),
+        np.array(R).reshape(-1, 3, 3),
+        np.array(t).reshape(-1, 3),
+        np.array(lines, np.int64),
+    )
 
 
 def _points(rows: Rows, number: int, cameras: int):

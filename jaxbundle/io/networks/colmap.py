@@ -25,8 +25,9 @@ FILES = tuple(f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIX
 
 def is_colmap(path: Path) -> bool:
     """Whether a folder holds cameras.bin or cameras.txt with images beside it."""
-    return any((path / f"cameras{s}").is_file() and (path / f"images{s}").is_file()
-               for s in SUFFIXES)  # fmt: skip
+    return any(
+        (path / f"cameras{s}").is_file() and (path / f"images{s}").is_file() for s in SUFFIXES
+    )
 
 
 def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -36,9 +37,13 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     suffix, read = next(
-        ((s, r) for s, r in ((".bin", read_binary_model), (".txt", read_text_model))
-         if (path / f"cameras{s}").is_file()), ("", None),
-    )  # fmt: skip
+        (
+            (s, r)
+            for s, r in ((".bin", read_binary_model), (".txt", read_text_model))
+            if (path / f"cameras{s}").is_file()
+        ),
+        ("", None),
+    )
     if read is None:
         raise InputError(f"{path}: there is no cameras.bin or cameras.txt in it")
     for part in PARTS:

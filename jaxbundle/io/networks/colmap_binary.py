@@ -132,10 +132,18 @@ def _images(path: Path) -> list[ColmapImage]:
         if (points["point"][~none] >= 2**63).any():
             raise file.error("an image point has an impossible object point")
         point = np.where(none, 0, points["point"]).astype(np.int64) - none
-        images.append(ColmapImage(
-            id, camera, name, pose[:4], pose[4:], points["xy"].reshape(-1, 2), point,
-            f"{path}, image {k + 1}",
-        ))  # fmt: skip
+        images.append(
+            ColmapImage(
+                id,
+                camera,
+                name,
+                pose[:4],
+                pose[4:],
+                points["xy"].reshape(-1, 2),
+                point,
+                f"{path}, image {k + 1}",
+            )
+        )
     file.end()
     check_unique([image.id for image in images], lambda k: images[k].place, "image")
     return images
@@ -175,8 +183,10 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
         points["xy"], points["point"] = image.xy, image.point
         images += [
             struct.pack("<I7dI", image.id, *image.q, *image.t, image.camera),
-            image.name.encode() + b"\0", struct.pack("<Q", len(points)), points.tobytes(),
-        ]  # fmt: skip
+            image.name.encode() + b"\0",
+            struct.pack("<Q", len(points)),
+            points.tobytes(),
+        ]
     points = [struct.pack("<Q", len(model.points))]
     of_point = tracks(model)
     for id, position, error in rows_of_points(model):

@@ -102,11 +102,16 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             Source(str(path), numbers, "image"), names, [i.camera for i in images], M, X0
         ),
         Columns(
-            {"id": model.point_ids, "role": ["tie"] * len(model.points),
-             **dict(zip("XYZ", model.points.T))}, model.points_source,
+            {
+                "id": model.point_ids,
+                "role": ["tie"] * len(model.points),
+                **dict(zip("XYZ", model.points.T)),
+            },
+            model.points_source,
         ),
-        observed, warnings,
-    )  # fmt: skip
+        observed,
+        warnings,
+    )
 
 
 def _observations(path: Path, model: ColmapModel):
@@ -133,7 +138,7 @@ def _observations(path: Path, model: ColmapModel):
     warnings = (
         f"left out {count(len(repeated), 'image point')} of object points that have another in "
         f"the same image: {list_some(dict.fromkeys(repeated))}",
-    )  # fmt: skip
+    )
     columns = {"image": index, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
     source = Source(str(path), np.arange(1, len(xy) + 1), "image point")
     return Columns(columns, source), warnings if repeated else ()
@@ -157,17 +162,29 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
     order = np.argsort(rays.image, kind="stable")
     parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
     for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
-        made.append(ColmapImage(
-            number, camera_numbers[images.camera[i]], images.id[i], q[i], t[i],
-            rays.xy[mine] + HALF, point_numbers[rays.point[mine]], f"image {images.id[i]!r}",
-        ))  # fmt: skip
+        made.append(
+            ColmapImage(
+                number,
+                camera_numbers[images.camera[i]],
+                images.id[i],
+                q[i],
+                t[i],
+                rays.xy[mine] + HALF,
+                point_numbers[rays.point[mine]],
+                f"image {images.id[i]!r}",
+            )
+        )
     lost = describe_losses(network)
     if list(point_numbers.astype(str)) != list(points.id):
         lost = (*lost, "names of points, which are numbered from 1")
     return ColmapModel(
-        cameras, made, point_numbers, points.position, points.source,
+        cameras,
+        made,
+        point_numbers,
+        points.position,
+        points.source,
         np.nan_to_num(point_errors(network)[0], nan=NO_ERROR),
-    ), lost  # fmt: skip
+    ), lost
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:

@@ -45,16 +45,17 @@ MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "RADIAL_FISHEYE": (9, "kannala-brandt", _RADIAL),
     "OPENCV_FISHEYE": (5, "kannala-brandt", _FISHEYE),
     "FOV": (7, "fov", (*_OPENCV[:4], "omega")),
-    "THIN_PRISM_FISHEYE": (
-        10, "thin-prism-fisheye", (*_OPENCV[:8], "k3", "k4", "sx1", "sy1")),
+    "THIN_PRISM_FISHEYE": (10, "thin-prism-fisheye", (*_OPENCV[:8], "k3", "k4", "sx1", "sy1")),
     "RAD_TAN_THIN_PRISM_FISHEYE": (
-        11, "rad-tan-thin-prism-fisheye",
-        (*_OPENCV[:4], "k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3")),
+        11,
+        "rad-tan-thin-prism-fisheye",
+        (*_OPENCV[:4], "k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    ),
     "SIMPLE_DIVISION": (12, "division", ("f", "cx", "cy", "k")),
     "DIVISION": (13, "division", (*_OPENCV[:4], "k")),
     "EUCM": (16, "eucm", (*_OPENCV[:4], "alpha", "beta")),
     "EQUIRECTANGULAR": (17, "equirectangular", ("w", "h")),
-}  # fmt: skip
+}
 """Number in binary files, our model, parameters in their order."""
 NAMES = {number: name for name, (number, *_) in MODELS.items()}
 COLMAP_MODELS = tuple(dict.fromkeys(ours for _, ours, _ in MODELS.values()))
@@ -91,9 +92,11 @@ def from_colmap(id: str, model: str, size: Sequence[int], values: Iterable[float
 
 def _panorama(width: float, height: float) -> dict[str, float]:
     return {
-        "fx": width / (2 * np.pi), "fy": height / np.pi,
-        "cx": width / 2 - HALF, "cy": height / 2 - HALF,
-    }  # fmt: skip
+        "fx": width / (2 * np.pi),
+        "fy": height / np.pi,
+        "cx": width / 2 - HALF,
+        "cy": height / 2 - HALF,
+    }
 
 
 def to_colmap(camera: Camera) -> tuple[str, list[float]]:
@@ -103,8 +106,9 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     and for an incomplete panorama.
     """
     where = f"camera {camera.id!r}"
-    candidates = [(name, names) for name, (_, ours, names) in MODELS.items()
-                  if ours == camera.model]  # fmt: skip
+    candidates = [
+        (name, names) for name, (_, ours, names) in MODELS.items() if ours == camera.model
+    ]
     if not candidates:
         raise InputError(
             f"{where}: COLMAP has no model {str(camera.model)!r}; convert it with --model opencv"

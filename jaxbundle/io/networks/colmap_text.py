@@ -66,22 +66,32 @@ def _images(path: Path) -> list[ColmapImage]:
         if not head.words:
             continue
         if len(head) < 10:
-            raise head.error(f"{len(head)} values where an image is expected: IMAGE_ID, "
-                             f"{', '.join(QT)}, CAMERA_ID, NAME")  # fmt: skip
+            raise head.error(
+                f"{len(head)} values where an image is expected: IMAGE_ID, "
+                f"{', '.join(QT)}, CAMERA_ID, NAME"
+            )
         pose = head.numbers(QT, 1, more=True)
         points = rows.take("the image points of an image") if rows.more() else Row(path, 0, "")
         numbers = points.all_numbers("an image point")
         if len(numbers) % 3:
-            raise points.error(f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each "
-                               "image point")  # fmt: skip
+            raise points.error(
+                f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each image point"
+            )
         numbers = numbers.reshape(-1, 3)
         if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
             raise points.error("a POINT3D_ID is not a whole number")
-        images.append(ColmapImage(
-            head.integer(0, "IMAGE_ID"), head.integer(8, "CAMERA_ID"), " ".join(head.words[9:]),
-            pose[:4], pose[4:7], numbers[:, :2], numbers[:, 2].astype(np.int64),
-            f"{path}, line {head.number}",
-        ))  # fmt: skip
+        images.append(
+            ColmapImage(
+                head.integer(0, "IMAGE_ID"),
+                head.integer(8, "CAMERA_ID"),
+                " ".join(head.words[9:]),
+                pose[:4],
+                pose[4:7],
+                numbers[:, :2],
+                numbers[:, 2].astype(np.int64),
+                f"{path}, line {head.number}",
+            )
+        )
     check_unique([image.id for image in images], lambda k: images[k].place, "image")
     return images
 
@@ -104,8 +114,10 @@ def _points(path: Path, images: set[int]):
 
 def text_files(model: ColmapModel) -> dict[str, bytes]:
     """The three text files by name."""
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-              "# POINTS2D[] as (X, Y, POINT3D_ID)"]  # fmt: skip
+    images = [
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "# POINTS2D[] as (X, Y, POINT3D_ID)",
+    ]
     for image in model.images:
         if any(character.isspace() for character in image.name):
             raise InputError(
@@ -114,17 +126,23 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
             )
         pose = _join([*image.q, *image.t])
         images.append(f"{image.id} {pose} {image.camera} {image.name}")
-        images.append(" ".join(
-            f"{x!r} {y!r} {point}" for (x, y), point in zip(image.xy.tolist(), image.point.tolist())
-        ))  # fmt: skip
+        images.append(
+            " ".join(
+                f"{x!r} {y!r} {point}"
+                for (x, y), point in zip(image.xy.tolist(), image.point.tolist())
+            )
+        )
     points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     of_point = tracks(model)
     for id, position, error in rows_of_points(model):
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
         colour = " ".join(map(str, GREY))
         points.append(f"{id} {_join(position)} {colour} {error!r} {track}".rstrip())
-    texts = {"cameras.txt": camera_lines(model.cameras), "images.txt": images,
-             "points3D.txt": points}  # fmt: skip
+    texts = {
+        "cameras.txt": camera_lines(model.cameras),
+        "images.txt": images,
+        "points3D.txt": points,
+    }
     return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()}
 
 

@@ -58,8 +58,17 @@ from jaxbundle.network.tables import Network, Source
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.system.file_content import read_content
 
-KEYS = ("file", "columns", "separator", "decimal", "comment", "skip", "scale", "constant",
-        "rotation")  # fmt: skip
+KEYS = (
+    "file",
+    "columns",
+    "separator",
+    "decimal",
+    "comment",
+    "skip",
+    "scale",
+    "constant",
+    "rotation",
+)
 SEPARATORS = {"blanks": None, "tab": "\t"}
 UNUSED, REST = "-", "..."
 IDS = ("id", "camera", "role", "image", "point", "from", "to")
@@ -154,8 +163,9 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         if row.number <= skip:
             continue
         if len(row) < len(names) or (len(row) > len(names) and not more):
-            raise row.error(f"{len(row)} columns where {where} has {len(names)}: "
-                            f"{', '.join(names)}")  # fmt: skip
+            raise row.error(
+                f"{len(row)} columns where {where} has {len(names)}: {', '.join(names)}"
+            )
         for name, k in used.items():
             text = row.words[k]
             swap = decimal == "," and name not in IDS

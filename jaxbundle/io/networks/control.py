@@ -84,9 +84,12 @@ def read_control(path: str | Path) -> Points:
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
     if separator != ",":
-        columns = {name: column if name in ("id", "role", "name") else
-                   [cell.replace(",", ".") for cell in column]
-                   for name, column in columns.items()}  # fmt: skip
+        columns = {
+            name: column
+            if name in ("id", "role", "name")
+            else [cell.replace(",", ".") for cell in column]
+            for name, column in columns.items()
+        }
     return _points(Columns(columns, source))
 
 
@@ -203,8 +206,11 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     points = network.points
     named = np.zeros(len(points), bool)
     named[at] = True
-    dropped = [id for id, role, there in zip(points.id, points.role, named)
-               if role in ("control", "fixed") and not there]  # fmt: skip
+    dropped = [
+        id
+        for id, role, there in zip(points.id, points.role, named)
+        if role in ("control", "fixed") and not there
+    ]
     roles = np.array(points.role, dtype=object)
     roles[points.has_role("control", "fixed") & ~named] = "tie"
     roles[at] = [control.role[k] for k in rows]
@@ -218,8 +224,10 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     warnings, notes = [], []
     if dropped:
         points = count(len(dropped), "control point")
-        warnings.append(f"{points} of the input not in {control.source.name} became tie points: "
-                        f"{list_some(dropped)}")  # fmt: skip
+        warnings.append(
+            f"{points} of the input not in {control.source.name} became tie points: "
+            f"{list_some(dropped)}"
+        )
     if lost:
         notes.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
     return network.warn(*warnings).note(*notes)
@@ -267,13 +275,19 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     return network.replace(
-        images=Images(images.id, images.camera, images.position @ A.T + t, angles_of(M),
-                      images.sigma, images.source),
+        images=Images(
+            images.id,
+            images.camera,
+            images.position @ A.T + t,
+            angles_of(M),
+            images.sigma,
+            images.source,
+        ),
         points=dataclasses.replace(points, position=position),
     ).note(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
-    )  # fmt: skip
+    )
 
 
 def _intersect(network: Network, at):
@@ -285,8 +299,9 @@ def _intersect(network: Network, at):
     roles[at] = "tie"
     start = network.replace(
         points=Points(points.id, tuple(roles.tolist()), position, free, points.source),
-        datum="inner", datum_points=(),
-    )  # fmt: skip
+        datum="inner",
+        datum_points=(),
+    )
     try:
         found = find_start_values(start).network.points
     except (InputError, NotSolvedError):

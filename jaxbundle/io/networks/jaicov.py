@@ -40,9 +40,12 @@ CAP = 0
 NOT_ORIENTED = 1
 """State of an image; 2: approximately, 3: by bundle adjustment."""
 INTERIOR = (
-    ("number", "parameter", "c", "x0", "y0", "K1", "K2", "r0"), ("K3",), ("P1", "P2"),
-    ("b1", "b2"), ("width", "height", "columns", "rows"),
-)  # fmt: skip
+    ("number", "parameter", "c", "x0", "y0", "K1", "K2", "r0"),
+    ("K3",),
+    ("P1", "P2"),
+    ("b1", "b2"),
+    ("width", "height", "columns", "rows"),
+)
 
 
 def is_jaicov(path: Path) -> bool:
@@ -73,15 +76,20 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     where[: len(at)] = at
     network = assemble(
         path,
-        foreign_document(path.stem, cameras.values(), image_unit="mm", object_unit="mm",
-                         datum_points=datum),
+        foreign_document(
+            path.stem, cameras.values(), image_unit="mm", object_unit="mm", datum_points=datum
+        ),
         overrides,
-        image_columns(Source(str(beside[".eor"]), None, "image"), list(images), of,
-                      matrices_of(turned), none),
-        Columns({"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", where.T))},
-                Source(str(beside[".obc"]), None, "point")),
-        Columns(rays, Source(str(path), np.array(lines, np.int64), "line")), (*told, *more),
-    )  # fmt: skip
+        image_columns(
+            Source(str(beside[".eor"]), None, "image"), list(images), of, matrices_of(turned), none
+        ),
+        Columns(
+            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", where.T))},
+            Source(str(beside[".obc"]), None, "point"),
+        ),
+        Columns(rays, Source(str(path), np.array(lines, np.int64), "line")),
+        (*told, *more),
+    )
     return _with_distances(network, beside[".scale"])
 
 
@@ -101,13 +109,18 @@ def _cameras(file: Path) -> dict[str, dict]:
         id = first.words[0]
         if id in cameras:
             raise first.error(f"camera {id} occurs twice")
-        values = {name: given[name] for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1",
-                                                 "b2", "r0")}  # fmt: skip
+        values = {
+            name: given[name]
+            for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2", "r0")
+        }
         cameras[id] = {
-            "id": id, "model": "brown-projected", "c": -given["c"], **values,
+            "id": id,
+            "model": "brown-projected",
+            "c": -given["c"],
+            **values,
             "image_size": list(size),
             "pixel_size": [given["width"] / size[0], given["height"] / size[1]],
-        }  # fmt: skip
+        }
     if not cameras:
         raise InputError(f"{file}: there is no camera in it")
     return cameras
@@ -130,8 +143,14 @@ def _images(file: Path):
         position.append(values[:3])
         angles.append(values[3:])
         camera.append(row.words[1])
-    told = [f"{count(len(other), 'image')} whose rotation is of another order than 0: without "
-            f"orientation: {list_some(other)}"] if other else []  # fmt: skip
+    told = (
+        [
+            f"{count(len(other), 'image')} whose rotation is of another order than 0: without "
+            f"orientation: {list_some(other)}"
+        ]
+        if other
+        else []
+    )
     return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, told)
 
 
@@ -184,8 +203,11 @@ def _with_distances(network: Network, file: Path) -> Network:
     index, lines = {id: k for k, id in enumerate(network.points.id)}, []
     ends, values = [], []
     for row in Rows(file, comment="#") if file.is_file() else ():
-        rest = Row(row.path, row.number, row.text.rpartition('"')[2] if '"' in row.text
-                   else " ".join(row.words[1:]))  # fmt: skip
+        rest = Row(
+            row.path,
+            row.number,
+            row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
+        )
         length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
         if active == 0 or not {*rest.words[:2]} <= {*index}:
             continue
@@ -235,16 +257,17 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
         ],
         path.with_suffix(".scale"): [
             f'{k} "" {points.id[a]} {points.id[b]} {_join((value, sigma))} 1'
-            for k, ((a, b), value, sigma) in enumerate(zip(
-                network.distances.points, network.distances.value, network.distances.sigma
-            ))
+            for k, ((a, b), value, sigma) in enumerate(
+                zip(network.distances.points, network.distances.value, network.distances.sigma)
+            )
         ],
-    }  # fmt: skip
+    }
     with replace_files(*content) as temporary:
         for place, lines in zip(temporary, content.values()):
             place.write_bytes("".join(f"{line}\n" for line in lines).encode())
-    lost = [what for what in describe_losses(network)
-            if what not in ("distances", "σ of image points")]  # fmt: skip
+    lost = [
+        what for what in describe_losses(network) if what not in ("distances", "σ of image points")
+    ]
     renamed = image_ids != list(images.id) or camera_ids != [c.id for c in network.cameras]
     return (*lost, *(("names of images and cameras, which are numbered",) if renamed else ()))
 

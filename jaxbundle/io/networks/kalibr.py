@@ -78,8 +78,11 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     chain = JsonFields(path, {"": parse_yaml(path, read_text(path))}).objects("")
-    chain = {id: JsonFields(f"{path}, {id}", chain[id].document)
-             for id in sorted(chain, key=_number) if re.fullmatch(r"cam\d+", id)}  # fmt: skip
+    chain = {
+        id: JsonFields(f"{path}, {id}", chain[id].document)
+        for id in sorted(chain, key=_number)
+        if re.fullmatch(r"cam\d+", id)
+    }
     if not chain:
         raise InputError(f"{path}: there is no camera cam0")
     cameras = [_camera(id, fields) for id, fields in chain.items()]
@@ -96,8 +99,11 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         poses.append((R, t))
     if 0 < len(mounted) < len(chain) - 1:
         raise InputError(f"{path}: T_cn_cnm1 is missing at some of the cameras")
-    unread = [key for key in ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
-              if any(fields.get(key) is not None for fields in chain.values())]  # fmt: skip
+    unread = [
+        key
+        for key in ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
+        if any(fields.get(key) is not None for fields in chain.values())
+    ]
     if unread:
         told.append(f"not read: {', '.join(unread)}")
     turns, shifts = [R for R, _ in poses], [t for _, t in poses]
@@ -124,8 +130,9 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     w, h = fields.array("resolution", (2,))
     size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
     parameters = dict(zip((*core, *coefficients), map(float, (*values, *more))))
-    return Camera(id, model, parameters,
-                  image_size=(size.integer("w", least=1), size.integer("h", least=1)))  # fmt: skip
+    return Camera(
+        id, model, parameters, image_size=(size.integer("w", least=1), size.integer("h", least=1))
+    )
 
 
 def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -164,9 +171,11 @@ def _fit(camera: Camera) -> tuple[Camera, list[str]]:
     size, found, refused = size_of(camera, "Kalibr"), [], ""
     for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
         try:
-            found.append(convert_camera(
-                get_model("opencv"), p, get_model(target), image_size=size, free=free
-            ))  # fmt: skip
+            found.append(
+                convert_camera(
+                    get_model("opencv"), p, get_model(target), image_size=size, free=free
+                )
+            )
         except ValueError as error:
             refused = refused or str(error)
     if not found:
@@ -189,10 +198,13 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
         if model == camera.model and not any(p[name] for name in p if name not in named):
             values = _list(p[name] for name in coefficients)
             return [
-                f"camera_model: {kind}", f"intrinsics: {_list(p[name] for name in core)}",
-                f"distortion_model: {distortion}", f"distortion_coeffs: {values}",
-                f"resolution: [{w}, {h}]", f"rostopic: /cam{k}/image_raw",
-            ]  # fmt: skip
+                f"camera_model: {kind}",
+                f"intrinsics: {_list(p[name] for name in core)}",
+                f"distortion_model: {distortion}",
+                f"distortion_coeffs: {values}",
+                f"resolution: [{w}, {h}]",
+                f"rostopic: /cam{k}/image_raw",
+            ]
     known = [names for model, *names in MODELS.values() if model == camera.model]
     if not known:
         raise InputError(
@@ -217,8 +229,11 @@ def mountings_of(network: Network) -> tuple[np.ndarray | None, list[str]]:
             moments.setdefault((rig, epoch), []).append(row[image])
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
-    whole = [rows for rows in moments.values()
-             if len({*images.camera[rows].tolist()}) == number == len(rows)]  # fmt: skip
+    whole = [
+        rows
+        for rows in moments.values()
+        if len({*images.camera[rows].tolist()}) == number == len(rows)
+    ]
     if not whole or not np.isfinite(images.position[whole[0]]).all():
         return None, ["mountings of the cameras"]
     need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)

@@ -25,9 +25,11 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
                 f"with --model {model}"
             )
     images, given = network.images, network.points
-    tables = [(images, images.position, "image", "orientation"),
-              (images, images.angles, "image", "orientation"),
-              (given, given.position, "point", "coordinates")]  # fmt: skip
+    tables = [
+        (images, images.position, "image", "orientation"),
+        (images, images.angles, "image", "orientation"),
+        (given, given.position, "point", "coordinates"),
+    ]
     for table, values, thing, what in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
@@ -51,10 +53,10 @@ def describe_losses(
         "distances": len(network.distances) > 0,
         **{one.TABLE: True for one in network.further},
         "that images share a camera": shared_cameras and len(network.cameras) < len(images),
-        "names of images and points, which are numbered from 0":
-            names and not _numbered(images.id, points.id),
+        "names of images and points, which are numbered from 0": names
+        and not _numbered(images.id, points.id),
         "image points": rays and len(network.observations) > 0,
-    }  # fmt: skip
+    }
     return tuple(what for what, there in found.items() if there)
 
 
@@ -72,8 +74,7 @@ def check_others_zero(camera: Camera, format: str, coefficients: Sequence[str]) 
     if camera.model not in PIXEL_MODELS:
         raise InputError(f"{where} model {str(camera.model)!r}; convert it with --model opencv")
     p = all_parameters(camera)
-    rest = [name for name, value in p.items()
-            if value and name not in (*CORE, *coefficients)]  # fmt: skip
+    rest = [name for name, value in p.items() if value and name not in (*CORE, *coefficients)]
     if rest:
         raise InputError(f"{where} {', '.join(rest)}; adjust the camera without")
     return p

@@ -70,28 +70,29 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     chunk = _chunk(path)
-    sensors = {
-        sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")
-    }
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
-    used = [c for c in cameras if _true(c.get("enabled"))
-            and c.find("transform") is not None]  # fmt: skip
+    used = [c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None]
     left = [label_of(c) for c in cameras if not any(c is u for u in used)]
     if not used:
         raise InputError(f"{path}: no camera is enabled and aligned")
     entries, told = _entries(path, sensors, used)
     used = [camera for camera in used if camera.get("sensor_id") in entries]
     labels = unique_labels([label_of(c) for c in used], [c.get("id", "") for c in used])
-    poses = [_pose(f"{path}, camera {label!r}", camera, chunk)
-             for label, camera in zip(labels, used)]  # fmt: skip
+    poses = [
+        _pose(f"{path}, camera {label!r}", camera, chunk) for label, camera in zip(labels, used)
+    ]
     names = unique_labels([e["id"] for e in entries.values()], list(entries))
     for entry, name in zip(entries.values(), names):
         entry["id"] = name
     M, X0 = (np.stack(part) for part in zip(*poses))
     images = image_columns(
-        Source(str(path), None, "camera"), labels,
-        [entries[c.get("sensor_id")]["id"] for c in used], M, X0,
-    )  # fmt: skip
+        Source(str(path), None, "camera"),
+        labels,
+        [entries[c.get("sensor_id")]["id"] for c in used],
+        M,
+        X0,
+    )
     by_id = {c.get("id"): label for c, label in zip(used, labels)}
     points, rays, control = _markers(path, chunk, by_id)
     document = foreign_document(path.stem, entries.values(), object_unit="m")
@@ -145,8 +146,9 @@ def _pose(where: str, camera: ET.Element, chunk: ET.Element):
     T = numbers_of(f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
     to_chunk, centre = T[:3, :3], T[:3, 3]
     component = camera.get("component_id")
-    holder = next((c for c in chunk.iterfind("components/component")
-                   if c.get("id") == component), None)  # fmt: skip
+    holder = next(
+        (c for c in chunk.iterfind("components/component") if c.get("id") == component), None
+    )
     transform = None if holder is None else holder.find("transform")
     transform = chunk.find("transform") if transform is None else transform
     if transform is not None and (transform.text or "").strip():
@@ -182,12 +184,22 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
     none = [None] * len(seen)
     image, point, x, y = zip(*rows)
     return (
-        Columns({"id": list(names.values()), "role": ["tie"] * len(seen), "X": none, "Y": none,
-                 "Z": none}, Source(str(path), None, "marker")),
-        Columns({"image": image, "point": [names[id] for id in point], "x": x, "y": y},
-                Source(str(path), None, "location")),
+        Columns(
+            {
+                "id": list(names.values()),
+                "role": ["tie"] * len(seen),
+                "X": none,
+                "Y": none,
+                "Z": none,
+            },
+            Source(str(path), None, "marker"),
+        ),
+        Columns(
+            {"image": image, "point": [names[id] for id in point], "x": x, "y": y},
+            Source(str(path), None, "location"),
+        ),
         _references(path, chunk, {names[id]: markers[id] for id in seen}),
-    )  # fmt: skip
+    )
 
 
 def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
@@ -204,8 +216,12 @@ def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
         ids.append(id)
         roles.append("control" if _true(reference.get("enabled")) else "check")
         position.append([number_in(reference.get(k), f"{where}, {k}") for k in "xyz"])
-        sigma.append([number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
-                      for k in ("sx", "sy", "sz")])  # fmt: skip
+        sigma.append(
+            [
+                number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
+                for k in ("sx", "sy", "sz")
+            ]
+        )
     if roles.count("control") < LEAST_CONTROL:
         return None
     sigma = np.where(np.array(sigma) > 0, sigma, _accuracy(chunk))
@@ -215,13 +231,17 @@ def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
 def _about_references(chunk: ET.Element, control: Points | None):
     """Messages about the references of markers."""
     if control is not None:
-        yield (f"{count(len(control), 'marker')} with reference coordinates: control points with "
-               f"σ as the file gives it, else {_accuracy(chunk):g} m; those not enabled are check "
-               "points")  # fmt: skip
+        yield (
+            f"{count(len(control), 'marker')} with reference coordinates: control points with "
+            f"σ as the file gives it, else {_accuracy(chunk):g} m; those not enabled are check "
+            "points"
+        )
     elif not _is_local(chunk) and chunk.find("markers//marker/reference") is not None:
-        yield ("the reference coordinates of markers are not in a local system and are not read; "
-               "the cameras are in geocentric coordinates: --control FILE gives control in a "
-               "rectangular frame")  # fmt: skip
+        yield (
+            "the reference coordinates of markers are not in a local system and are not read; "
+            "the cameras are in geocentric coordinates: --control FILE gives control in a "
+            "rectangular frame"
+        )
 
 
 def _is_local(chunk: ET.Element) -> bool:

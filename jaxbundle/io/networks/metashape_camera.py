@@ -69,10 +69,14 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     p, ignored = _coefficients(where, calibration, w, h)
     told = (f"sensor {label!r}: not known here and not applied: {ignored}",) if ignored else ()
     values = {
-        "fx": p["f"] + p["b1"], "fy": p["f"],
-        "cx": w / 2 + p["cx"] - 0.5, "cy": h / 2 + p["cy"] - 0.5,
-        "k1": p["k1"], "k2": p["k2"], "k3": p["k3"],
-    }  # fmt: skip
+        "fx": p["f"] + p["b1"],
+        "fy": p["f"],
+        "cx": w / 2 + p["cx"] - 0.5,
+        "cy": h / 2 + p["cy"] - 0.5,
+        "k1": p["k1"],
+        "k2": p["k2"],
+        "k3": p["k3"],
+    }
     if not (np.array([w, h, values["fx"], values["fy"]]) > 0).all():
         raise NoPlaceError(f"{where}: sizes and f must be positive")
     entry = {"id": label, "image_size": [w, h]}
@@ -87,9 +91,13 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     if not rest and "equisolid" not in kind:
         return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, told
     foreign = Foreign(
-        FORMULAS[kind], p | {"w": w, "h": h}, values, (w, h), _pixel_size(where, sensor),
+        FORMULAS[kind],
+        p | {"w": w, "h": h},
+        values,
+        (w, h),
+        _pixel_size(where, sensor),
         kind != "frame",
-    )  # fmt: skip
+    )
     found, fit = nearest_camera(foreign, where)
     has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
     why = f"has {has}" if has else "is equisolid"
@@ -113,9 +121,15 @@ def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
     p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in given.items() if k in known}
     if old:
         fy = p.pop("fy")
-        p |= {"f": fy, "b1": p.pop("fx", fy) - fy, "b2": p.pop("skew", 0.0),
-              "cx": given.get("cx", w / 2) - w / 2, "cy": given.get("cy", h / 2) - h / 2,
-              "p1": p["p2"], "p2": p["p1"]}  # fmt: skip
+        p |= {
+            "f": fy,
+            "b1": p.pop("fx", fy) - fy,
+            "b2": p.pop("skew", 0.0),
+            "cx": given.get("cx", w / 2) - w / 2,
+            "cy": given.get("cy", h / 2) - h / 2,
+            "p1": p["p2"],
+            "p2": p["p1"],
+        }
     return p, ", ".join(ignored)
 
 

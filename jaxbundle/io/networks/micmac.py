@@ -66,8 +66,13 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         used.append(cameras[where].id)
         rotations.append(C2W.T)
         centres.append(X0)
-    images = image_columns(Source(str(path), None, "file"), names, used,
-                           flip_rows(np.array(rotations)), np.array(centres))  # fmt: skip
+    images = image_columns(
+        Source(str(path), None, "file"),
+        names,
+        used,
+        flip_rows(np.array(rotations)),
+        np.array(centres),
+    )
     made = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
     return assemble(path, made, overrides, images, warnings=fit_messages(cameras.values()))
 
@@ -94,8 +99,10 @@ def _pose(xml: XmlFields) -> tuple[np.ndarray, np.ndarray]:
         raise xml.missing("Externe")
     own = XmlFields(xml.path, external, xml.kind)
     convention = own.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
-    for name, value, known in (("TypeProj", kind, ("eProjStenope",)),
-                               ("KnownConv", convention, (*M2C, *C2M))):  # fmt: skip
+    for name, value, known in (
+        ("TypeProj", kind, ("eProjStenope",)),
+        ("KnownConv", convention, (*M2C, *C2M)),
+    ):
         if value not in known:
             raise InputError(f"{xml.path}: {name} is {value}; {', '.join(known)} is expected")
     if xml.find("OrIntImaM2C") is not None:
@@ -147,12 +154,24 @@ def _orientation(file: str, C2W: np.ndarray, X0: np.ndarray) -> list[str]:
     text = lambda values: " ".join(repr(float(value)) for value in values)
     rows = [f"<L{i}>{text(row)}</L{i}>" for i, row in enumerate(C2W, 1)]
     return [
-        "<OrientationConique>", "<OrIntImaM2C>",
+        "<OrientationConique>",
+        "<OrIntImaM2C>",
         *(f"<{name}>{text(values)}</{name}>" for name, values in IDENTITY.items()),
-        "</OrIntImaM2C>", "<TypeProj>eProjStenope</TypeProj>",
+        "</OrIntImaM2C>",
+        "<TypeProj>eProjStenope</TypeProj>",
         f"<FileInterne>{html.escape(file, quote=False)}</FileInterne>",
         "<RelativeNameFI>true</RelativeNameFI>",
-        "<Externe>", f"<KnownConv>{M2C[0]}</KnownConv>", f"<Centre>{text(X0)}</Centre>",
-        "<ParamRotation>", "<CodageMatr>", *rows, "</CodageMatr>", "</ParamRotation>", "</Externe>",
-        "<ConvOri>", f"<KnownConv>{M2C[0]}</KnownConv>", "</ConvOri>", "</OrientationConique>",
-    ]  # fmt: skip
+        "<Externe>",
+        f"<KnownConv>{M2C[0]}</KnownConv>",
+        f"<Centre>{text(X0)}</Centre>",
+        "<ParamRotation>",
+        "<CodageMatr>",
+        *rows,
+        "</CodageMatr>",
+        "</ParamRotation>",
+        "</Externe>",
+        "<ConvOri>",
+        f"<KnownConv>{M2C[0]}</KnownConv>",
+        "</ConvOri>",
+        "</OrientationConique>",
+    ]

@@ -97,15 +97,18 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
     kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
     if [kind.tag for kind in kinds if kind.tag != "ModNoDist"] == ["ModUnif"]:
         if direction in C2M:
-            raise InputError(f"{path}: ModUnif with KnownConv {direction} is not supported; "
-                             f"{M2C[0]} is expected")  # fmt: skip
+            raise InputError(
+                f"{path}: ModUnif with KnownConv {direction} is not supported; {M2C[0]} is expected"
+            )
         unified = next(kind for kind in kinds if kind.tag == "ModUnif")
         return unified_camera(id, xml, unified, core, (int(w), int(h)), PIXEL)
     p = core | _distortion(xml, core)
     start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
-    odd = {"more than three coefficients": p["R4"] or p["R5"],
-           "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"])}
+    odd = {
+        "more than three coefficients": p["R4"] or p["R5"],
+        "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
+    }
     has = " and ".join(what for what, there in odd.items() if there)
     size = int(w), int(h)
     if has:
@@ -115,7 +118,11 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
     model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {PIXEL:g} mm"
     return FittedCamera(
-        id, model, _in_mm(p, size), image_size=size, pixel_size=(PIXEL, PIXEL),
+        id,
+        model,
+        _in_mm(p, size),
+        image_size=size,
+        pixel_size=(PIXEL, PIXEL),
         told=f"camera {id!r} is {model}, which is in mm: {told}; in pixels it changes nothing",
     )
 
@@ -125,8 +132,13 @@ def _in_mm(p: Mapping[str, float], size: tuple[int, int]) -> dict[str, float]:
     found = {f"K{i}": p[f"R{i}"] / PIXEL ** (2 * i) for i in (1, 2, 3)}
     x0, y0 = (PIXEL * (p[c] - (n - 1) / 2) for c, n in zip(("cx", "cy"), size))
     return found | {
-        "c": p["fx"] * PIXEL, "x0": x0, "y0": -y0, "P1": p["P1"] / PIXEL, "P2": -p["P2"] / PIXEL,
-        "b1": p["b1"], "b2": -p["b2"],
+        "c": p["fx"] * PIXEL,
+        "x0": x0,
+        "y0": -y0,
+        "P1": p["P1"] / PIXEL,
+        "P2": -p["P2"] / PIXEL,
+        "b1": p["b1"],
+        "b2": -p["b2"],
     }
 
 
@@ -192,14 +204,26 @@ def calibration_lines(camera: Camera) -> list[str]:
     radial += ["<PPaEqPPs>true</PPaEqPPs>"]
     kind = ["<ModRad>", *radial, "</ModRad>"]
     if any(p[name] for name in AFFINE):
-        kind = ["<ModPhgrStd>", "<RadialePart>", *radial, "</RadialePart>",
-                *(f"<{name}>{p[name]!r}</{name}>" for name in AFFINE), "</ModPhgrStd>"]  # fmt: skip
+        kind = [
+            "<ModPhgrStd>",
+            "<RadialePart>",
+            *radial,
+            "</RadialePart>",
+            *(f"<{name}>{p[name]!r}</{name}>" for name in AFFINE),
+            "</ModPhgrStd>",
+        ]
     direction = C2M[0] if camera.model == "brown" else M2C[0]
     return [
-        f"<{CALIBRATION}>", f"<KnownConv>{direction}</KnownConv>", f"<PP>{centre}</PP>",
-        f"<F>{p['fx']!r}</F>", f"<SzIm>{w} {h}</SzIm>", "<CalibDistortion>", *kind,
-        "</CalibDistortion>", f"</{CALIBRATION}>",
-    ]  # fmt: skip
+        f"<{CALIBRATION}>",
+        f"<KnownConv>{direction}</KnownConv>",
+        f"<PP>{centre}</PP>",
+        f"<F>{p['fx']!r}</F>",
+        f"<SzIm>{w} {h}</SzIm>",
+        "<CalibDistortion>",
+        *kind,
+        "</CalibDistortion>",
+        f"</{CALIBRATION}>",
+    ]
 
 
 def _of_opencv(camera: Camera) -> dict[str, float]:
@@ -218,8 +242,13 @@ def _of_brown(camera: Camera, w: int, h: int) -> dict[str, float]:
             f"camera {camera.id!r}: MicMac needs square pixels (pixel_size) and r0 = 0"
         )
     return {f"R{i}": p[f"K{i}"] * px ** (2 * i) for i in (1, 2, 3)} | {
-        "fx": p["c"] / px, "cx": (w - 1) / 2 + p["x0"] / px, "cy": (h - 1) / 2 - p["y0"] / px,
-        "P1": p["P1"] * px, "P2": -p["P2"] * px, "b1": p["b1"], "b2": -p["b2"],
+        "fx": p["c"] / px,
+        "cx": (w - 1) / 2 + p["x0"] / px,
+        "cy": (h - 1) / 2 - p["y0"] / px,
+        "P1": p["P1"] * px,
+        "P2": -p["P2"] * px,
+        "b1": p["b1"],
+        "b2": -p["b2"],
     }
 
 

@@ -37,18 +37,23 @@ def unified_camera(
 
     **Raises:** `InputError` for another kind."""
     kind = (part.findtext("TypeModele") or "").strip()
-    V, S = ([number_in(e.text or "", f"{xml.path}: {name}") for e in part.iter(name)]
-            for name in ("Params", "Etats"))  # fmt: skip
+    V, S = (
+        [number_in(e.text or "", f"{xml.path}: {name}") for e in part.iter(name)]
+        for name in ("Params", "Etats")
+    )
     if kind not in FORMULAS:
-        raise InputError(f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; "
-                         f"one of {', '.join(FORMULAS)} is expected: calibrate again with one of "
-                         "them, or with Fraser")  # fmt: skip
+        raise InputError(
+            f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; "
+            f"one of {', '.join(FORMULAS)} is expected: calibrate again with one of "
+            "them, or with Fraser"
+        )
     formula, states, most = FORMULAS[kind]
     if len(S) < states:
         raise InputError(f"{xml.path}: {kind} needs {states} Etats, but has {len(S)}")
     if any(V[most:]):
-        raise InputError(f"{xml.path}: {kind}: only the first {most} Params are supported, but "
-                         f"others are not 0")  # fmt: skip
+        raise InputError(
+            f"{xml.path}: {kind}: only the first {most} Params are supported, but others are not 0"
+        )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
     V = (V + [0.0] * most)[:most]
@@ -138,11 +143,15 @@ def _length(degree: int) -> int:
 
 
 FORMULAS = {
-    **{f"eModelePolyDeg{n}": (partial(_polynomial, n), 3 if n > 1 else 0, _length(n))
-       for n in range(8)},
-    "eModeleEbner": (_ebner, 1, 12), "eModeleDCBrown": (_brown, 1, 14),
-    "eModele_DRad_PPaEqPPs": (_fraser, 0, 5), "eModele_Fraser_PPaEqPPs": (_fraser, 0, 9),
+    **{
+        f"eModelePolyDeg{n}": (partial(_polynomial, n), 3 if n > 1 else 0, _length(n))
+        for n in range(8)
+    },
+    "eModeleEbner": (_ebner, 1, 12),
+    "eModeleDCBrown": (_brown, 1, 14),
+    "eModele_DRad_PPaEqPPs": (_fraser, 0, 5),
+    "eModele_Fraser_PPaEqPPs": (_fraser, 0, 9),
     "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, FISHEYE_PARAMS),
     "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, FISHEYE_PARAMS),
-}  # fmt: skip
+}
 """By kind: the formula, the number of Etats, the number of Params."""

@@ -94,16 +94,22 @@ def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: there is no {FILES[0]} in it")
     models = {file.stem: _fields(file) for file in files}
     cameras = [_camera(id, fields) for id, fields in models.items()]
-    rt = np.array([
-        fields.array("rt_cam_ref" if fields.get("rt_cam_ref") is not None else "extrinsics", (6,))
-        for fields in models.values()
-    ])  # fmt: skip
+    rt = np.array(
+        [
+            fields.array(
+                "rt_cam_ref" if fields.get("rt_cam_ref") is not None else "extrinsics", (6,)
+            )
+            for fields in models.values()
+        ]
+    )
     M, X0 = exterior_from_cv(matrices_of_rotation_vectors(rt[:, :3]), rt[:, 3:])
     return assemble(
-        path, foreign_document(path.stem, map(entry_of, cameras), object_unit="m"), overrides,
+        path,
+        foreign_document(path.stem, map(entry_of, cameras), object_unit="m"),
+        overrides,
         image_columns(Source(str(path), None, "file"), list(models), list(models), M, X0),
         warnings=fit_messages(cameras),
-    )  # fmt: skip
+    )
 
 
 def _fields(file: Path) -> JsonFields:
@@ -113,8 +119,13 @@ def _fields(file: Path) -> JsonFields:
         document = None
     if not isinstance(document, dict) or not all(isinstance(key, str) for key in document):
         raise InputError(f"{file}: a dictionary of Python, {{'lensmodel': …, …}}, is expected")
-    return JsonFields(file, {key: list(value) if isinstance(value, tuple) else value
-                             for key, value in document.items()})  # fmt: skip
+    return JsonFields(
+        file,
+        {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in document.items()
+        },
+    )
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
@@ -137,8 +148,18 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if model:
         return Camera(id, model, p, image_size=(w, h))
     s = 1 + p["r0"]
-    exact = {"fx": p["fx"] * s, "fy": p["fy"] * s, "cx": p["cx"], "cy": p["cy"],
-             "k1": p["r1"] / s, "k2": p["r2"] / s} if s > 0 else {}  # fmt: skip
+    exact = (
+        {
+            "fx": p["fx"] * s,
+            "fy": p["fy"] * s,
+            "cx": p["cx"],
+            "cy": p["cy"],
+            "k1": p["r1"] / s,
+            "k2": p["r2"] / s,
+        }
+        if s > 0
+        else {}
+    )
     if not exact:
         raise InputError(f"{fields.path}: r0 of the intrinsics is {p['r0']:g}; 1 + r0 must be > 0")
     if p["alpha"] == 0 == p["beta"]:
@@ -174,14 +195,17 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
             f"camera {camera.id!r}: mrcal has no model {str(camera.model)!r}; convert it with "
             "--model opencv"
         )
-    kind = next(kind for kind, more in kinds.items()
-                if not any(p[name] for name in p if name not in (*CORE, *more)))  # fmt: skip
+    kind = next(
+        kind
+        for kind, more in kinds.items()
+        if not any(p[name] for name in p if name not in (*CORE, *more))
+    )
     numbers = lambda values: f"[ {', '.join(repr(float(value)) for value in values)} ]"
     return (
         f"{{\n    'lensmodel':  '{PREFIX}{kind}',\n"
         f"    'intrinsics': {numbers(p[name] for name in (*CORE, *kinds[kind]))},\n"
         f"    'extrinsics': {numbers(rt)},\n    'imagersize': [ {w}, {h} ],\n}}\n"
-    )  # fmt: skip
+    )
 
 
 def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:

@@ -108,10 +108,14 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     views = {key: view for key, view in views.items() if key in posed or key in seen}
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
-    told = [f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}" for ids, why in (
-        (left, "of spherical cameras or without intrinsics"),
-        (lost, "without pose and image points"),
-    ) if ids]  # fmt: skip
+    told = [
+        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
+        for ids, why in (
+            (left, "of spherical cameras or without intrinsics"),
+            (lost, "without pose and image points"),
+        )
+        if ids
+    ]
     if any(view.get("use_pose_center_prior") for view in views.values()):
         told.append("priors of projection centres (use_pose_center_prior) are not read")
     if mirror is MIRROR:
@@ -119,23 +123,33 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     labels = unique_labels([_name(view) for view in views.values()], list(views))
     image_ids = dict(zip(views, labels))
     network = assemble(
-        path, foreign_document(path.stem, cameras.values()), overrides,
+        path,
+        foreign_document(path.stem, cameras.values()),
+        overrides,
         _images(path, views, image_ids, poses, mirror),
         _points(path, tie, [names[key] for key in control], mirror),
-        Columns({
-            "image": [image_ids[view] for view, *_ in (*rays, *clicks)],
-            "point": [*(str(key) for _, key, _ in rays), *(names[key] for _, key, _ in clicks)],
-            **dict(zip("xy", _image_points(path, (*rays, *clicks)).T)),
-        }, Source(str(path), None, "observation")),
+        Columns(
+            {
+                "image": [image_ids[view] for view, *_ in (*rays, *clicks)],
+                "point": [*(str(key) for _, key, _ in rays), *(names[key] for _, key, _ in clicks)],
+                **dict(zip("xy", _image_points(path, (*rays, *clicks)).T)),
+            },
+            Source(str(path), None, "observation"),
+        ),
         told,
-    )  # fmt: skip
+    )
     if control and len(network.points):
         at = stack_rows(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
         at = at * mirror
         datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
         unknown = np.full((len(control), 3), np.nan)
-        table = Points(tuple(names.values()), ("control",) * len(control), at, unknown,
-                       Source(str(path), None, "control point"))  # fmt: skip
+        table = Points(
+            tuple(names.values()),
+            ("control",) * len(control),
+            at,
+            unknown,
+            Source(str(path), None, "control point"),
+        )
         network = with_control(network, table, datum=not datum)
     return network
 
@@ -183,10 +197,16 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
         f, (cx, cy) = data.number("focal_length"), data.array("principal_point", (2,))
         given = data.array(field, (len(coefficients),)).tolist() if field else ()
         cameras[key] = {
-            "id": str(key), "model": model, "tie": [["fx", "fy"]],
+            "id": str(key),
+            "model": model,
+            "tie": [["fx", "fy"]],
             "image_size": [data.integer("width", least=1), data.integer("height", least=1)],
-            "fx": f, "fy": f, "cx": float(cx), "cy": float(cy), **dict(zip(coefficients, given)),
-        }  # fmt: skip
+            "fx": f,
+            "fy": f,
+            "cx": float(cx),
+            "cy": float(cy),
+            **dict(zip(coefficients, given)),
+        }
     return cameras, spherical
 
 
@@ -194,8 +214,15 @@ def _sphere(key: int, data: JsonFields) -> dict:
     """The entry of a spherical camera."""
     w, h = data.integer("width", least=1), data.integer("height", least=1)
     f = max(w, h) / (2 * np.pi)
-    return {"id": str(key), "model": "equirectangular", "image_size": [w, h], "fx": f, "fy": f,
-            "cx": w / 2, "cy": h / 2}  # fmt: skip
+    return {
+        "id": str(key),
+        "model": "equirectangular",
+        "image_size": [w, h],
+        "fx": f,
+        "fy": f,
+        "cx": w / 2,
+        "cy": h / 2,
+    }
 
 
 def _views(scene: JsonFields, cameras: Mapping, spherical: Mapping):
@@ -253,9 +280,7 @@ def _image_points(path: Path, rays: Sequence) -> np.ndarray:
     return stack_rows([x for *_, x in rays], 2, place).reshape(-1, 2)
 
 
-def _points(
-    path: Path, tie: Mapping, control: Sequence[str], mirror: np.ndarray
-) -> Columns:
+def _points(path: Path, tie: Mapping, control: Sequence[str], mirror: np.ndarray) -> Columns:
     place = lambda k: (f"{path}, structure[{k}]", "X")
     known = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
     position = np.concatenate([known, np.full((len(control), 3), np.nan)])
@@ -277,11 +302,26 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     images, points, rays = network.images, network.points, network.observations
     sizes = [network.cameras[c].image_size or (0, 0) for c in images.camera.tolist()]
     views = [
-        _entry(i, {"polymorphic_id": ALIKE, "ptr_wrapper": {"id": FIRST + i + 1, "data": {
-            "local_path": "", "filename": id, "width": w, "height": h, "id_view": i,
-            "id_intrinsic": c, "id_pose": i,
-        }}}) for i, (id, c, (w, h)) in enumerate(zip(images.id, images.camera.tolist(), sizes))
-    ]  # fmt: skip
+        _entry(
+            i,
+            {
+                "polymorphic_id": ALIKE,
+                "ptr_wrapper": {
+                    "id": FIRST + i + 1,
+                    "data": {
+                        "local_path": "",
+                        "filename": id,
+                        "width": w,
+                        "height": h,
+                        "id_view": i,
+                        "id_intrinsic": c,
+                        "id_pose": i,
+                    },
+                },
+            },
+        )
+        for i, (id, c, (w, h)) in enumerate(zip(images.id, images.camera.tolist(), sizes))
+    ]
     R = flip_rows(matrices_of(images.angles))
     extrinsics = [
         _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
@@ -295,14 +335,21 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     held = points.has_role("control", "fixed")
     numbers = _numbers(points.id)
     tables = [
-        [_entry(numbers[p], {"X": points.position[p].tolist(), "observations": seen[p]})
-         for p in np.flatnonzero(mask).tolist()] for mask in (~held, held)
-    ]  # fmt: skip
+        [
+            _entry(numbers[p], {"X": points.position[p].tolist(), "observations": seen[p]})
+            for p in np.flatnonzero(mask).tolist()
+        ]
+        for mask in (~held, held)
+    ]
     scene = {
-        "sfm_data_version": "0.3", "root_path": "", "views": views,
+        "sfm_data_version": "0.3",
+        "root_path": "",
+        "views": views,
         "intrinsics": _intrinsics(network.cameras, FIRST + len(images) + 1),
-        "extrinsics": extrinsics, "structure": tables[0], "control_points": tables[1],
-    }  # fmt: skip
+        "extrinsics": extrinsics,
+        "structure": tables[0],
+        "control_points": tables[1],
+    }
     write_text(Path(path), json.dumps(scene, indent=1) + "\n")
     lost = [what for what in describe_losses(network) if not what.startswith("roles")]
     lost += ["σ of control points, check points"] if held.any() or "check" in points.role else []

@@ -64,8 +64,11 @@ from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
 
 RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
-    "reconstruction.json", "tracks.csv", "camera_models.json", "reference_lla.json",
-)  # fmt: skip
+    "reconstruction.json",
+    "tracks.csv",
+    "camera_models.json",
+    "reference_lla.json",
+)
 FILES = (RECONSTRUCTION, TRACKS, MODELS)
 HEAD = "OPENSFM_TRACKS_VERSION_v"
 VERSION = 2
@@ -144,8 +147,11 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{why}; left out {count(len(lost), 'shot')}: {list_some(lost)}")
     gps = _positions(shots)
     points = scene.objects("points")
-    at = stack_rows([p.get("coordinates") for p in points.values()], 3,
-                 lambda k: (str([*points.values()][k].path), "coordinates")).reshape(-1, 3)
+    at = stack_rows(
+        [p.get("coordinates") for p in points.values()],
+        3,
+        lambda k: (str([*points.values()][k].path), "coordinates"),
+    ).reshape(-1, 3)
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
         told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
@@ -154,13 +160,18 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     datum = {"datum": "control"} if gps else {}
     network = assemble(
         file,
-        foreign_document(file.parent.name, map(entry_of, cameras.values()), object_unit="m",
-                         **datum),
-        overrides, _images(file, shots),
-        Columns({"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
-                Source(str(file), None, "point")),
-        rays, (*told, *fit_messages(cameras.values())),
-    )  # fmt: skip
+        foreign_document(
+            file.parent.name, map(entry_of, cameras.values()), object_unit="m", **datum
+        ),
+        overrides,
+        _images(file, shots),
+        Columns(
+            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
+            Source(str(file), None, "point"),
+        ),
+        rays,
+        (*told, *fit_messages(cameras.values())),
+    )
     return network.replace(further=gps)
 
 
@@ -175,8 +186,10 @@ def _largest(file: Path) -> tuple[JsonFields, list[str]]:
     others = sum(sizes) - sizes[largest]
     if len(scenes) == 1:
         return scene, []
-    return scene, [f"the largest of {len(scenes)} reconstructions is read; the others have "
-                   f"{count(others, 'shot')}"]  # fmt: skip
+    return scene, [
+        f"the largest of {len(scenes)} reconstructions is read; the others have "
+        f"{count(others, 'shot')}"
+    ]
 
 
 def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceError]]:
@@ -202,9 +215,12 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
     one = kind in ("perspective", "fisheye", "dual")
     f = [max(size) * fields.number(name) for name in ("focal", "focal") if one] or [
-        max(size) * fields.number(name) for name in TWO]  # fmt: skip
-    c = [max(size) * (0.0 if one else fields.number(name, 0.0)) + (n - 1) / 2
-         for name, n in zip(("c_x", "c_y"), size)]  # fmt: skip
+        max(size) * fields.number(name) for name in TWO
+    ]
+    c = [
+        max(size) * (0.0 if one else fields.number(name, 0.0)) + (n - 1) / 2
+        for name, n in zip(("c_x", "c_y"), size)
+    ]
     core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (*f, *c)))
     if kind in KINDS:
         model, _, names = KINDS[kind]
@@ -271,8 +287,11 @@ def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
     at = np.array([shot.array("gps_position", (3,)) for shot in given.values()])
     sigma = np.array([shot.number("gps_dop", DOP) for shot in given.values()])
     sigma = np.where(sigma > 0, sigma, DOP)
-    columns = {"image": list(given), **dict(zip("XYZ", at.T)),
-               **{f"s{axis}": sigma for axis in "XYZ"}}  # fmt: skip
+    columns = {
+        "image": list(given),
+        **dict(zip("XYZ", at.T)),
+        **{f"s{axis}": sigma for axis in "XYZ"},
+    }
     return (Antennas.of(Columns(columns, Source("shots", None, "gps_position")), {}, 1.0),)
 
 
@@ -307,8 +326,9 @@ def _tracks(file: Path, cameras: Mapping, shots: Mapping, points: Mapping):
 
 def _reference(file: Path) -> str:
     fields = JsonFields(file, read_object(file, read_text(file), "a reference"))
-    at = ", ".join(f"{name} {fields.number(name):.9g}"
-                   for name in ("latitude", "longitude", "altitude"))  # fmt: skip
+    at = ", ".join(
+        f"{name} {fields.number(name):.9g}" for name in ("latitude", "longitude", "altitude")
+    )
     return f"coordinates are topocentric about {at} ({REFERENCE})"
 
 
@@ -344,10 +364,14 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     for one in measured:
         for id, at, C in zip(one.image, one.position.tolist(), one.covariance):
             shots[id] |= {"gps_position": at, "gps_dop": float(np.sqrt(np.trace(C) / 3))}
-    scene = {"cameras": cameras, "shots": shots, "points": {
-        id: {"coordinates": at, "color": [128.0, 128.0, 128.0]}
-        for id, at in zip(points.id, points.position.tolist())
-    }}  # fmt: skip
+    scene = {
+        "cameras": cameras,
+        "shots": shots,
+        "points": {
+            id: {"coordinates": at, "color": [128.0, 128.0, 128.0]}
+            for id, at in zip(points.id, points.position.tolist())
+        },
+    }
     folder.mkdir(exist_ok=True)
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
@@ -367,8 +391,9 @@ def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable
     ):
         (w, h), s = sizes[i], max(sizes[i])
         x, y = (u - (w - 1) / 2) / s, (v - (h - 1) / 2) / s
-        yield (f"{images.id[i]}\t{points.id[p]}\t{k}\t{x!r}\t{y!r}\t{1 / s!r}\t128\t128\t128"
-               "\t-1\t-1\n")  # fmt: skip
+        yield (
+            f"{images.id[i]}\t{points.id[p]}\t{k}\t{x!r}\t{y!r}\t{1 / s!r}\t128\t128\t128\t-1\t-1\n"
+        )
 
 
 def write_opensfm_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
@@ -387,9 +412,10 @@ def _camera_fields(camera: Camera) -> dict:
     c = [(p["cx"] - (w - 1) / 2) / s, (p["cy"] - (h - 1) / 2) / s]
     centred = c == [0, 0] and p["fx"] == p["fy"]
     name = next(
-        name for name, (focal, names) in kinds.items()
+        name
+        for name, (focal, names) in kinds.items()
         if (centred or focal == TWO) and not any(p[k] for k in most if k not in names)
-    )  # fmt: skip
+    )
     focal, names = kinds[name]
     fields = {"projection_type": name, "width": w, "height": h}
     if focal == ONE:

@@ -49,8 +49,9 @@ def write_orientation_covariance(
     """Write the file; `radians`: the unit of angles."""
     sigma = np.sqrt(np.diagonal(found.matrix))
     R = found.matrix / np.outer(sigma, sigma)
-    unit = np.array([radians if name in ANGLES and kind == "image" else 1.0
-                     for kind, _, name in found.unknowns])  # fmt: skip
+    unit = np.array(
+        [radians if name in ANGLES and kind == "image" else 1.0 for kind, _, name in found.unknowns]
+    )
     n = len(sigma)
     rows = (
         (*unknown, s, *R[k, : k + 1].tolist(), *[""] * (n - k - 1))
@@ -73,12 +74,14 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
             if j == 0 or k >= j - 1:
                 numbers[k, j] = _number(table.source(k), name, text)
     kinds, ids, names = (table.values[name] for name in HEAD[:3])
-    unit = np.array([radians if name in ANGLES and kind == "image" else 1.0
-                     for kind, name in zip(kinds, names)])  # fmt: skip
+    unit = np.array(
+        [radians if name in ANGLES and kind == "image" else 1.0 for kind, name in zip(kinds, names)]
+    )
     sigma, lower = numbers[:, 0] * unit, np.tril(np.nan_to_num(numbers[:, 1:]), -1)
     R = lower + lower.T + np.eye(n)
-    unknowns = tuple((str(a).strip(), str(b).strip(), str(c).strip())
-                     for a, b, c in zip(kinds, ids, names))  # fmt: skip
+    unknowns = tuple(
+        (str(a).strip(), str(b).strip(), str(c).strip()) for a, b, c in zip(kinds, ids, names)
+    )
     return OrientationCovariance(unknowns, np.outer(sigma, sigma) * R)
 
 

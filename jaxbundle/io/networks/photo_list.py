@@ -43,11 +43,15 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     focal, photos, image_points, object_points = _Parser(path).parse()
     document = {
         "project": {
-            "name": path.stem, "datum": "inner", "residuals": "corrected",
-            "angle_unit": "rad", "image_unit": "mm", "object_unit": "model",
+            "name": path.stem,
+            "datum": "inner",
+            "residuals": "corrected",
+            "angle_unit": "rad",
+            "image_unit": "mm",
+            "object_unit": "model",
         },
         "camera": [{"id": "cam", "model": "brown", "c": focal}],
-    }  # fmt: skip
+    }
     document = apply_overrides(document, overrides)
     project = document["project"]
     given = "sigma_image" in project or project.get("sigma_origin") == UNIT
@@ -57,10 +61,13 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         "images": _columns(path, photos, PHOTO, camera=["cam"] * len(photos)),
         "points": _columns(path, object_points, OBJECT_POINT, role=["tie"] * len(object_points)),
         "observations": _columns(
-            path, image_points, IMAGE_POINT if given else (*IMAGE_POINT, "sx", "sy"), id="point",
+            path,
+            image_points,
+            IMAGE_POINT if given else (*IMAGE_POINT, "sx", "sy"),
+            id="point",
             image=[row.photo for row in image_points],
         ),
-    }  # fmt: skip
+    }
     network = network_of(document, tables, str(path))
     if given:
         return network.note("the σ of the file are ignored, also those of photographs and points")
@@ -94,7 +101,7 @@ class _Row:
 
 def _check_sigmas(path: Path, rows: Sequence[_Row]) -> None:
     for row in sorted(rows, key=lambda row: row.line):
-        for axis, sigma in zip(row.names, row.values[len(row.names):]):
+        for axis, sigma in zip(row.names, row.values[len(row.names) :]):
             if not (math.isfinite(sigma) and sigma > 0):
                 raise InputError(
                     f"{path}, line {row.line}: σ of {axis} of {row} is {sigma:g}; it must be "
@@ -123,9 +130,10 @@ class _Parser:
             number, words = self.lines[self.next]
             if len(words) < 13:
                 raise self._error(
-                    number, f"{count(len(words), 'value')} where a photograph (name, 6 values, "
-                    f"6 σ) or an object point (id, 3 values, 3 σ) is expected; {counted}"
-                )  # fmt: skip
+                    number,
+                    f"{count(len(words), 'value')} where a photograph (name, 6 values, "
+                    f"6 σ) or an object point (id, 3 values, 3 σ) is expected; {counted}",
+                )
             photo = self._row(" ".join(words[:-12]), words[-12:], PHOTO)
             count_line, size = self._count(photo)
             counted = f"line {count_line} announces {size} image points of {photo}"
@@ -138,9 +146,10 @@ class _Parser:
             number, words = self.lines[self.next]
             if len(words) != 7:
                 raise self._error(
-                    number, f"{count(len(words), 'value')} where an object point (id, X, Y, Z "
-                    "and their σ) is expected"
-                )  # fmt: skip
+                    number,
+                    f"{count(len(words), 'value')} where an object point (id, X, Y, Z "
+                    "and their σ) is expected",
+                )
             object_points.append(self._row(words[0], words[1:], OBJECT_POINT))
         if not object_points:
             raise self._error(
@@ -163,9 +172,9 @@ class _Parser:
         number, words = self.lines[self.next]
         if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
-                number, f"{show(' '.join(words))} where the number of image points of {photo} is "
-                "expected"
-            )  # fmt: skip
+                number,
+                f"{show(' '.join(words))} where the number of image points of {photo} is expected",
+            )
         self.next += 1
         return number, int(words[0])
 
@@ -177,9 +186,10 @@ class _Parser:
         number, words = self.lines[self.next]
         if len(words) != 5:
             raise self._error(
-                number, f"{count(len(words), 'value')} where an image point (id, x, y, σx, σy) is "
-                f"expected; {counted}, this is number {done + 1}"
-            )  # fmt: skip
+                number,
+                f"{count(len(words), 'value')} where an image point (id, x, y, σx, σy) is "
+                f"expected; {counted}, this is number {done + 1}",
+            )
         return self._row(words[0], words[1:], IMAGE_POINT, photo.id)
 
     def _row(self, id: str, words: Sequence[str], names: tuple[str, ...], photo: str = "") -> _Row:

@@ -89,8 +89,10 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     while rows.more() and not rows.next_words():
         rows.take("the title")
     rows.take("the title")
-    head = [_take(rows, what) for what in ("tolerance and iterations", "default σ",
-                                           "the default camera", "its σ")]  # fmt: skip
+    head = [
+        _take(rows, what)
+        for what in ("tolerance and iterations", "default σ", "the default camera", "its σ")
+    ]
     given = head[0].all_numbers("tolerance, iterations, width, height")
     size = given[2:4].tolist() if len(given) >= 4 else None
     photos = _photos(rows, header_camera(head[2]))
@@ -110,12 +112,14 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
         outer[nowhere] = np.nan
     images = image_columns(
         Source(str(path), np.array([photo.line for photo in photos]), "line"),
-        list(names.values()), cameras, matrices_of(np.radians(outer[:, :2:-1])), outer[:, :3],
-    )  # fmt: skip
+        list(names.values()),
+        cameras,
+        matrices_of(np.radians(outer[:, :2:-1])),
+        outer[:, :3],
+    )
     rest = [override for override in overrides if override not in of_camera]
     network = assemble(path, document, rest, images, points, ray_table(path, marks, names))
-    return network.warn(*_warnings(points, renumbered),
-                        *rounding_warnings(network.cameras, half))  # fmt: skip
+    return network.warn(*_warnings(points, renumbered), *rounding_warnings(network.cameras, half))
 
 
 def _warnings(points: Columns, renumbered: str):
@@ -134,9 +138,11 @@ def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[s
     )
     names = ["cam"] if len(distinct) == 1 else [f"cam{k + 1}" for k in range(len(distinct))]
     document = foreign_document(
-        path.stem, [camera_entry(id, values, size) for id, values in zip(names, distinct)],
-        object_unit="m", residuals="corrected",
-    )  # fmt: skip
+        path.stem,
+        [camera_entry(id, values, size) for id, values in zip(names, distinct)],
+        object_unit="m",
+        residuals="corrected",
+    )
     # the pixel size follows from an image size that may come from the command line
     of_camera = [override for override in overrides if override.startswith("camera.")]
     document = apply_overrides(document, of_camera)
@@ -214,8 +220,10 @@ def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
     for row in _block(rows):
         photo = row.integer(0, "the number of a photograph")
         if photo not in names:
-            raise row.error(f"photograph {photo} does not exist; there are {len(names)}, "
-                            f"{min(names)} to {max(names)}")  # fmt: skip
+            raise row.error(
+                f"photograph {photo} does not exist; there are {len(names)}, "
+                f"{min(names)} to {max(names)}"
+            )
         photos.append(photo)
         ids.append(str(row.integer(1, "the number of a point")))
         values.append(row.numbers(RAY, 2))

@@ -58,8 +58,18 @@ def _decimals(word: str) -> int:
 def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:
     """The entry of a document; `size` of the image in pixels."""
     c, xp, yp, xs, ys, K1, K2, K3, P1, P2 = values.tolist()
-    entry = {"id": id, "model": "brown", "c": c, "x0": xp - xs / 2, "y0": ys / 2 - yp,
-             "K1": K1, "K2": K2, "K3": K3, "P1": P1, "P2": P2}  # fmt: skip
+    entry = {
+        "id": id,
+        "model": "brown",
+        "c": c,
+        "x0": xp - xs / 2,
+        "y0": ys / 2 - yp,
+        "K1": K1,
+        "K2": K2,
+        "K3": K3,
+        "P1": P1,
+        "P2": P2,
+    }
     return entry if size is None else entry | {"image_size": size}
 
 
@@ -75,12 +85,19 @@ def rounding_warnings(
     for camera, open in zip(cameras, half):
         size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
         r = float(np.linalg.norm(size * pixel)) / 2
-        slopes = {"c": r / camera.parameters["c"], "K1": r**3, "K2": r**5, "K3": r**7,
-                  "P1": 3 * r**2, "P2": 3 * r**2}  # fmt: skip
+        slopes = {
+            "c": r / camera.parameters["c"],
+            "K1": r**3,
+            "K2": r**5,
+            "K3": r**7,
+            "P1": 3 * r**2,
+            "P2": 3 * r**2,
+        }
         costs = {
-            name: open[INNER.index(name)] * slope / pixel.min() for name, slope in slopes.items()
+            name: open[INNER.index(name)] * slope / pixel.min()
+            for name, slope in slopes.items()
             if camera.parameters[name] != 0 and name not in camera.free
-        }  # fmt: skip
+        }
         coarse = {name: cost for name, cost in costs.items() if cost > LARGEST_ROUNDING}
         if coarse:
             costs = (f"{name} to {cost:.2g} px" for name, cost in coarse.items())

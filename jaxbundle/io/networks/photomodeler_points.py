@@ -77,12 +77,20 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
     of_smart, of_others = of
     once = [at[0] for id, at in listed.items() if id in repeated and len(at) == 1]
     only = lambda ids: [k for id in ids for k in listed.get(id, ())]
-    first_smart = min([at[1] for at in twice.values()] + only(of_smart - of_others - repeated),
-                      default=len(objects))  # fmt: skip
+    first_smart = min(
+        [at[1] for at in twice.values()] + only(of_smart - of_others - repeated),
+        default=len(objects),
+    )
     last_other = max([at[0] for at in twice.values()] + only(of_others - of_smart), default=-1)
     numbers = [int(id) for id in objects.id]
-    descent = next((k for k in range(max(last_other, 0) + 1, min(first_smart + 1, len(objects)))
-                    if numbers[k] < numbers[k - 1]), None)  # fmt: skip
+    descent = next(
+        (
+            k
+            for k in range(max(last_other, 0) + 1, min(first_smart + 1, len(objects)))
+            if numbers[k] < numbers[k - 1]
+        ),
+        None,
+    )
     found = [at[1] for at in twice.values()]
     for k in once:
         after, before = k > first_smart, k < last_other
@@ -114,8 +122,9 @@ def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -
     columns = {
         "id": [*control.id, *(objects.id[k] for k in other), *lost],
         "role": [*np.where(weighted, "control", "fixed").tolist(), *["tie"] * len(rest)],
-        **dict(zip("XYZ", position.T)), **dict(zip(("sX", "sY", "sZ"), sigma.T)),
-    }  # fmt: skip
+        **dict(zip("XYZ", position.T)),
+        **dict(zip(("sX", "sY", "sZ"), sigma.T)),
+    }
     return Columns(columns, Source(str(path), np.array(lines, np.int64), "line"))
 
 
@@ -126,7 +135,13 @@ def ray_table(path: Path, marks: Block, names: dict[int, str]) -> Columns:
     values = marks.values
     sigma = np.where(values[:, 2:] > 0, values[:, 2:], np.nan)
     return Columns(
-        {"image": [names[photo] for photo in marks.photo], "point": marks.id,
-         "x": values[:, 0] - 0.5, "y": values[:, 1] - 0.5, "sx": sigma[:, 0], "sy": sigma[:, 1]},
+        {
+            "image": [names[photo] for photo in marks.photo],
+            "point": marks.id,
+            "x": values[:, 0] - 0.5,
+            "y": values[:, 1] - 0.5,
+            "sx": sigma[:, 0],
+            "sy": sigma[:, 1],
+        },
         Source(str(path), np.array(marks.line), "line"),
-    )  # fmt: skip
+    )

@@ -76,9 +76,10 @@ ADJUSTED = "network"
 FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
 """The files of a project."""
 INLINE = {
-    table: table.removesuffix("s") for table in TABLES
+    table: table.removesuffix("s")
+    for table in TABLES
     if table not in KINDS or not KINDS[table].SECTION
-}  # fmt: skip
+}
 """The tables and the name of one of their rows in the TOML file."""
 
 UNIT_DIGITS = 1e-12
@@ -88,9 +89,11 @@ WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "
 
 
 def read_project(
-    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = (),
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    models: Sequence[CameraModel] = (),
     oriented: bool = False,
-) -> Network:  # fmt: skip
+) -> Network:
     """The network of a project file, or of that in a folder (`project_file`).
 
     `overrides` are settings `KEY=VALUE` that replace those of the file, see
@@ -102,15 +105,19 @@ def read_project(
     path = project_file(Path(path))
     document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
     document["project"].setdefault("name", path.resolve().parent.name)
-    tables = {table: _read_table(document, table, path) for table in TABLES
-              if not (oriented and table in WITHOUT and _is_absent(document, table))}  # fmt: skip
+    tables = {
+        table: _read_table(document, table, path)
+        for table in TABLES
+        if not (oriented and table in WITHOUT and _is_absent(document, table))
+    }
     for table, columns in WITHOUT.items() if oriented else ():
         found = tables.get(table)
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))
         tables[table] = dataclasses.replace(found, may_be_empty=True)
-    return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path),
-                      models)  # fmt: skip
+    return network_of(
+        document, {k: v for k, v in tables.items() if v is not None}, str(path), models
+    )
 
 
 def _is_absent(document: Document, table: str) -> bool:
@@ -161,7 +168,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
         if table not in REQUIRED_TABLES:
             return None
         raise InputError(
-            f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
+            f'{path}, [project]: {table} is missing; give {table} = "{table}.csv" or '
             f"[[{INLINE[table]}]] entries"
         )
     if not isinstance(file, str):
@@ -204,22 +211,36 @@ def fill_project(network: Network, folder: Path) -> None:
     exterior = np.concatenate([images.position, images.angles], 1) / unit
     camera_id = [network.cameras[c].id for c in images.camera]
     _write_table(
-        folder / "images.csv", IMAGE_COLUMNS, (images.id, camera_id), exterior,
-        IMAGE_SIGMAS, images.sigma / unit, {0.0: "fixed"},
-    )  # fmt: skip
+        folder / "images.csv",
+        IMAGE_COLUMNS,
+        (images.id, camera_id),
+        exterior,
+        IMAGE_SIGMAS,
+        images.sigma / unit,
+        {0.0: "fixed"},
+    )
     _write_table(
-        folder / "points.csv", POINT_COLUMNS, (points.id, points.role), points.position,
-        POINT_SIGMAS, points.sigma, {np.inf: "free"},
-    )  # fmt: skip
+        folder / "points.csv",
+        POINT_COLUMNS,
+        (points.id, points.role),
+        points.position,
+        POINT_SIGMAS,
+        points.sigma,
+        {np.inf: "free"},
+    )
     origin = rays.sigma_origin
     if origin == UNIT and np.allclose(sigma, 1.0, rtol=UNIT_DIGITS, atol=0):
         # Nobody gave them: where none are written, they are units of weight again.
         sigma, origin = np.full_like(sigma, np.nan), STATED
     _write_table(
-        folder / "observations.csv", OBSERVATION_COLUMNS,
-        ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]), xy,
-        OBSERVATION_SIGMAS, sigma, {},
-    )  # fmt: skip
+        folder / "observations.csv",
+        OBSERVATION_COLUMNS,
+        ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]),
+        xy,
+        OBSERVATION_SIGMAS,
+        sigma,
+        {},
+    )
     distances = network.distances
     if len(distances):
         ends = [[points.id[p] for p in column] for column in distances.points.T]
@@ -243,10 +264,11 @@ def _write_table(path, header, ids, values, sigma_header, sigma, words):
 def _write_further(folder: Path, further: Further, radians: float) -> None:
     """The table of a further kind."""
     columns = {
-        name: column if isinstance(column, tuple) else [
-            x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column
-        ] for name, column in further.columns(radians).items()
-    }  # fmt: skip
+        name: column
+        if isinstance(column, tuple)
+        else [x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column]
+        for name, column in further.columns(radians).items()
+    }
     write_csv(folder / f"{further.TABLE}.csv", tuple(columns), zip(*columns.values()))
 
 
@@ -276,8 +298,10 @@ def _document_text(network: Network, origin: str) -> str:
 
 def cameras_text(cameras: Sequence[Camera]) -> str:
     """Cameras as the `[[camera]]` entries of a TOML file."""
-    entries = ([*_of_own(camera), "[[camera]]", *assignments(_camera_entry(camera)), ""]
-               for camera in cameras)  # fmt: skip
+    entries = (
+        [*_of_own(camera), "[[camera]]", *assignments(_camera_entry(camera)), ""]
+        for camera in cameras
+    )
     return "\n".join(line for entry in entries for line in entry)
 
 
@@ -285,8 +309,10 @@ def _of_own(camera: Camera) -> Sequence[str]:
     """A remark on a model that a file can only name."""
     if not is_own(camera.model):
         return ()
-    return (f"# {str(camera.model)!r} is a model of the user's own: give the object to "
-            "jaxbundle.read_network(path, models=[…])",)  # fmt: skip
+    return (
+        f"# {str(camera.model)!r} is a model of the user's own: give the object to "
+        "jaxbundle.read_network(path, models=[…])",
+    )
 
 
 def _camera_entry(camera: Camera) -> dict:

@@ -50,8 +50,10 @@ def is_rig_result(path: Path) -> bool:
     """Whether a JSON file has the calibrations and the rig of `calibrate --rig`."""
     if path.suffix.lower() != ".json":
         return False
-    return re.match(rb'\s*\{\s*"converged"\s*:\s*\w+\s*,\s*"calibrations"\s*:',
-                    beginning(path, 1000)) is not None  # fmt: skip
+    return (
+        re.match(rb'\s*\{\s*"converged"\s*:\s*\w+\s*,\s*"calibrations"\s*:', beginning(path, 1000))
+        is not None
+    )
 
 
 def file_of_line(path: Path) -> Path:
@@ -73,13 +75,13 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     file = file_of_line(path)
     key = str(path)[len(str(file)) + 1 :] or None
-    rigs = {row["key"]: row for row in _rows(file)
-            if "mounting" in row.get("further_unknowns", {})}  # fmt: skip
+    rigs = {row["key"]: row for row in _rows(file) if "mounting" in row.get("further_unknowns", {})}
     if not rigs:
         raise InputError(f"{file}: no rig is in it; expected lines of jaxbundle batch --rig")
     if key is None and len(rigs) > 1:
-        raise InputError(f"{file}: {len(rigs)} rigs; name one: {file}#KEY, with KEY one of "
-                         f"{list_some(rigs)}")  # fmt: skip
+        raise InputError(
+            f"{file}: {len(rigs)} rigs; name one: {file}#KEY, with KEY one of {list_some(rigs)}"
+        )
     row = rigs.get(next(iter(rigs)) if key is None else key)
     if row is None:
         raise InputError(f"{file}: no rig {key!r}{did_you_mean(str(key), rigs)}")
@@ -87,8 +89,10 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     try:
         if row["converged"] is not True:
             raise InputError(f"{where}: was not solved ({row['status']})")
-        mountings = {label.rpartition(" of ")[0]: {name: x["value"] for name, x in found.items()}
-                     for label, found in row["further_unknowns"]["mounting"].items()}  # fmt: skip
+        mountings = {
+            label.rpartition(" of ")[0]: {name: x["value"] for name, x in found.items()}
+            for label, found in row["further_unknowns"]["mounting"].items()
+        }
         cameras, pixel = [], row.get("settings", {}).get("pixel_size")
         for id in mountings:
             entry = row["cameras"][id]

@@ -132,9 +132,11 @@ def _number(key: str, text: str) -> float:
 
 
 def network_of(
-    document: Document, tables: Mapping[str, Columns], where: str,
+    document: Document,
+    tables: Mapping[str, Columns],
+    where: str,
     models: Sequence[CameraModel] = (),
-) -> Network:  # fmt: skip
+) -> Network:
     """The network of a document and its tables; `where` is the file, for messages; `models`: own
     camera models it may name."""
     project = document["project"]
@@ -149,9 +151,7 @@ def check_settings(project: Mapping[str, Any], where: str) -> None:
     """Refuse unknown keys and impossible values of `[project]`."""
     for key, value in project.items():
         if key not in (*SETTINGS, *TABLES):
-            raise InputError(
-                f"{where}unknown key {key!r}{did_you_mean(key, (*SETTINGS, *TABLES))}"
-            )
+            raise InputError(f"{where}unknown key {key!r}{did_you_mean(key, (*SETTINGS, *TABLES))}")
         if key in (*TEXT, *TABLES) and not isinstance(value, str):
             raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
         if key in CHOICES:

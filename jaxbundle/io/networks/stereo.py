@@ -50,9 +50,12 @@ from jaxbundle.system.file_content import beginning
 
 ROS_FILES = ("*.yaml",)
 OF_A_FISHEYE = "fisheye_model", "distortion_model"
-NAMES = (("M1", "D1", "M2", "D2"), ("K1", "D1", "K2", "D2"),
-         ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
-         ("camera_matrix_1", "dist_coeffs_1", "camera_matrix_2", "dist_coeffs_2"))  # fmt: skip
+NAMES = (
+    ("M1", "D1", "M2", "D2"),
+    ("K1", "D1", "K2", "D2"),
+    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
+    ("camera_matrix_1", "dist_coeffs_1", "camera_matrix_2", "dist_coeffs_2"),
+)
 """Names of matrices and coefficients; the first are written."""
 
 
@@ -69,9 +72,14 @@ class Rectification(NamedTuple):
         """Of [x, y, disparity, 1] the homogeneous point in the first rectified frame."""
         f, cx, cy = self.P1[0, 0], self.P1[0, 2], self.P1[1, 2]
         base = np.abs(self.P2[:2, 3]).argmax()
-        return np.array([
-            [1, 0, 0, -cx], [0, 1, 0, -cy], [0, 0, 0, f], [0, 0, -f / self.P2[base, 3], 0],
-        ])  # fmt: skip
+        return np.array(
+            [
+                [1, 0, 0, -cx],
+                [0, 1, 0, -cy],
+                [0, 0, 0, f],
+                [0, 0, -f / self.P2[base, 3], 0],
+            ]
+        )
 
 
 def rectify(
@@ -184,8 +192,10 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     """
     cameras, R, T, lost = _pair(network, "a pair of ROS")
     found = rectify(cameras, R, T)
-    texts = [ros_text(camera, *parts) for camera, parts in zip(
-        cameras, ((found.R1, found.P1), (found.R2, found.P2)))]  # fmt: skip
+    texts = [
+        ros_text(camera, *parts)
+        for camera, parts in zip(cameras, ((found.R1, found.P1), (found.R2, found.P2)))
+    ]
     names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
     if len({name.casefold() for name in names}) < 2:
         raise InputError(f"{folder}: the names of the cameras give the same file {names[0]}.yaml")

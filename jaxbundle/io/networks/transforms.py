@@ -93,15 +93,20 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
     images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
-    return assemble(path, document, overrides, images,
-                    warnings=(*told, *fit_messages(cameras.values())))  # fmt: skip
+    return assemble(
+        path, document, overrides, images, warnings=(*told, *fit_messages(cameras.values()))
+    )
 
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     """The camera fields of a frame, missing ones from the file."""
     own = any(name in frame.document for name in INTRINSICS)
-    given = {name: value for source in (file, frame) for name in INTRINSICS
-             if (value := source.get(name)) is not None}  # fmt: skip
+    given = {
+        name: value
+        for source in (file, frame)
+        for name in INTRINSICS
+        if (value := source.get(name)) is not None
+    }
     return JsonFields(frame.path if own else file.path, given)
 
 

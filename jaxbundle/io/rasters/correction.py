@@ -57,8 +57,8 @@ def map_of(
     if not np.isfinite(X).any():
         raise InputError(
             f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
-            if isinstance(surface, Terrain) else
-            "no point of the image is on the ground; check attitude and mounting"
+            if isinstance(surface, Terrain)
+            else "no point of the image is on the ground; check attitude and mounting"
         )
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():
@@ -111,9 +111,7 @@ def write_corrected(
                 except package.errors.RasterioError as error:
                     raise unreadable(source, error) from None
 
-            write_map(
-                target, system, grid, surface, bands.count, bands.dtypes[0], block, progress
-            )
+            write_map(target, system, grid, surface, bands.count, bands.dtypes[0], block, progress)
     except package.errors.RasterioError as error:
         raise unreadable(source, error) from None
 

@@ -73,9 +73,11 @@ def _around(longitude, latitude):
         return None
     wider = MARGIN * np.ptp(longitude), MARGIN * np.ptp(latitude)
     return Extent(
-        float(longitude.min() - wider[0]), float(latitude.min() - wider[1]),
-        float(longitude.max() + wider[0]), float(latitude.max() + wider[1]),
-    )  # fmt: skip
+        float(longitude.min() - wider[0]),
+        float(latitude.min() - wider[1]),
+        float(longitude.max() + wider[0]),
+        float(latitude.max() + wider[1]),
+    )
 
 
 _locate = compile_once(locate_lines, ())

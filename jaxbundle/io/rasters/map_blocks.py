@@ -46,10 +46,18 @@ def write_map(
 
     corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
     with write_raster(
-        target, grid.columns, grid.rows, count, dtype, crs=system.text,
-        nodata=np.nan if floating else 0, tiled=True, blockxsize=BLOCK, blockysize=BLOCK,
+        target,
+        grid.columns,
+        grid.rows,
+        count,
+        dtype,
+        crs=system.text,
+        nodata=np.nan if floating else 0,
+        tiled=True,
+        blockxsize=BLOCK,
+        blockysize=BLOCK,
         transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
-    ) as map_:  # fmt: skip
+    ) as map_:
         if names:
             map_.describe(names)
         with ThreadPoolExecutor(2) as workers:

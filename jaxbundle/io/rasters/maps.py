@@ -89,9 +89,7 @@ class MapGrid(NamedTuple):
 
     def centres(self, row: Float[np.ndarray, " r"], column: Float[np.ndarray, " c"]):
         """x and y of the centres of rows × columns."""
-        return np.meshgrid(
-            self.x + (column + 0.5) * self.size, self.y - (row + 0.5) * self.size
-        )
+        return np.meshgrid(self.x + (column + 0.5) * self.size, self.y - (row + 0.5) * self.size)
 
     def place(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row and column, whole numbers at the centres, of map coordinates."""

@@ -73,9 +73,12 @@ def read_terrain(
                     "gdal_translate -a_srs EPSG:4326"
                 )
             with WarpedVRT(
-                source, crs=_degrees_around(source), dtype="float64", nodata=np.nan,
+                source,
+                crs=_degrees_around(source),
+                dtype="float64",
+                nodata=np.nan,
                 resampling=package.enums.Resampling.bilinear,
-            ) as warped:  # fmt: skip
+            ) as warped:
                 return _terrain(warped, earth, path, extent)
     except package.errors.RasterioError as error:
         raise unreadable(path, error) from None
@@ -88,8 +91,10 @@ def _degrees_around(source):
     left, bottom, right, top = source.bounds
     back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
     middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
-    return f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}" if np.isfinite(middle) else (
-        GEOGRAPHIC
+    return (
+        f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}"
+        if np.isfinite(middle)
+        else (GEOGRAPHIC)
     )
 
 

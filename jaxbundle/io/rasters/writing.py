@@ -60,9 +60,16 @@ def write_raster(
         try:
             with _silence:
                 raster = open_plain(
-                    temporary, "w", driver="GTiff", width=width, height=height, count=count,
-                    dtype=dtype, BIGTIFF="IF_SAFER", **profile,
-                )  # fmt: skip
+                    temporary,
+                    "w",
+                    driver="GTiff",
+                    width=width,
+                    height=height,
+                    count=count,
+                    dtype=dtype,
+                    BIGTIFF="IF_SAFER",
+                    **profile,
+                )
             writer = RasterWriter(raster)
             try:
                 yield writer

@@ -33,16 +33,22 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     camera = [network.cameras[c].id for c in images.camera]
     sigma = np.isfinite(points.sigma).any()
     errors, unit = point_errors(network)
-    numbers = np.concatenate([points.position, *([points.sigma] if sigma else []),
-                              errors[:, None]], 1)  # fmt: skip
+    numbers = np.concatenate(
+        [points.position, *([points.sigma] if sigma else []), errors[:, None]], 1
+    )
     header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
     rows = zip(points.id, points.role, numbers.tolist())
     with replace_files(images_path(path), path) as (of_images, of_points):
         write_csv(
-            of_images, IMAGE_COLUMNS,
-            ((id, c, *_cells(row)) for id, c, row in
-             zip(images.id, camera, np.concatenate([images.position, angles], 1).tolist())),
-        )  # fmt: skip
+            of_images,
+            IMAGE_COLUMNS,
+            (
+                (id, c, *_cells(row))
+                for id, c, row in zip(
+                    images.id, camera, np.concatenate([images.position, angles], 1).tolist()
+                )
+            ),
+        )
         write_csv(of_points, header, ((id, role, *_cells(row)) for id, role, row in rows))
     return ("interior orientations", "image points")
 

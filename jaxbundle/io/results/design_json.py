@@ -26,12 +26,18 @@ def design_dict(designed: Design, proof: Proof | None = None) -> dict:
         "weights": designed.weights,
         "dropped": list(designed.dropped),
         "added": list(designed.added),
-        "proof": None if proof is None else {
-            "predicted": proof.predicted, "found": proof.found, "ratio": proof.ratio,
-            "limit": proof.limit, "draws": proof.draws, "failed": proof.failed,
+        "proof": None
+        if proof is None
+        else {
+            "predicted": proof.predicted,
+            "found": proof.found,
+            "ratio": proof.ratio,
+            "limit": proof.limit,
+            "draws": proof.draws,
+            "failed": proof.failed,
             "agrees": bool(proof.agrees),
         },
-    }  # fmt: skip
+    }
 
 
 def design_text(designed: Design, proof: Proof | None = None) -> str:
@@ -41,9 +47,11 @@ def design_text(designed: Design, proof: Proof | None = None) -> str:
 
 def _state(state: State) -> dict:
     return {
-        "aim": state.aim, "photographs": state.photographs, "image_points": state.rays,
+        "aim": state.aim,
+        "photographs": state.photographs,
+        "image_points": state.rays,
         "lost": list(state.lost),
-    }  # fmt: skip
+    }
 
 
 def _stations(designed: Design) -> dict:

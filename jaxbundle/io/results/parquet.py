@@ -30,10 +30,11 @@ def write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     need_pyarrow()
     arrow, parquet = map(importlib.import_module, ("pyarrow", "pyarrow.parquet"))
     arrays = {
-        name: arrow.array([str(x) for x in values] if values.dtype.kind in "OU" else values,
-                          from_pandas=True)
+        name: arrow.array(
+            [str(x) for x in values] if values.dtype.kind in "OU" else values, from_pandas=True
+        )
         for name, values in columns.items()
-    }  # fmt: skip
+    }
     written = io.BytesIO()
     parquet.write_table(arrow.table(arrays), written)
     write_bytes(path, written.getvalue())

@@ -17,8 +17,12 @@ from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Network
 
-COLOURS = {"tie": (160, 160, 160), "control": (0, 120, 255), "fixed": (0, 60, 160),
-           "check": (0, 180, 80)}  # fmt: skip
+COLOURS = {
+    "tie": (160, 160, 160),
+    "control": (0, 120, 255),
+    "fixed": (0, 60, 160),
+    "check": (0, 180, 80),
+}
 CAMERA = (220, 40, 40)
 VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f4")])
 
@@ -42,18 +46,27 @@ def write_ply(
     vertices["error"][:first], vertices["error"][first:] = errors[known], np.nan
     vertices["position"][first:] = corners.reshape(-1, 3)
     own = colours or {}
-    roles = [own.get(id, COLOURS[role]) for id, role, there in
-             zip(network.points.id, network.points.role, known) if there]  # fmt: skip
+    roles = [
+        own.get(id, COLOURS[role])
+        for id, role, there in zip(network.points.id, network.points.role, known)
+        if there
+    ]
     vertices["colour"][:first] = np.array(roles).reshape(-1, 3)
     vertices["colour"][first:] = CAMERA
     edges = (edges.reshape(-1, 2) + first).astype("<i4")
-    head = ["ply", "format binary_little_endian 1.0",
-            f"comment error: mean reprojection error in {unit}",
-            f"element vertex {len(vertices)}", *(f"property double {axis}" for axis in "xyz"),
-            *(f"property uchar {name}" for name in ("red", "green", "blue")),
-            "property float error",
-            f"element edge {len(edges)}", "property int vertex1", "property int vertex2",
-            "end_header\n"]  # fmt: skip
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment error: mean reprojection error in {unit}",
+        f"element vertex {len(vertices)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        "property float error",
+        f"element edge {len(edges)}",
+        "property int vertex1",
+        "property int vertex2",
+        "end_header\n",
+    ]
     write_bytes(Path(path), "\n".join(head).encode() + vertices.tobytes() + edges.tobytes())
     lost = ("names", "cameras but for their pyramids", "image points")
     return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")

@@ -57,9 +57,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
         "images": _images(adjustment),
         "further_unknowns": adjustment.further_unknowns,
         "far_points": _far_points(adjustment),
-        "removed": [
-            {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
-        ],
+        "removed": [{"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed],
         "suspects": [
             {"kind": s.kind, "name": s.name, "test": s.test, "weight": s.weight}
             for s in adjustment.suspects
@@ -127,9 +125,11 @@ def without_nan(value):
 def verdict_dict(verdict) -> dict:
     """A verdict (`report.verdict`) as plain dicts."""
     state, words, findings = verdict
-    return {"state": state, "words": words, "findings": [
-        {"about": f.about, "state": f.state, "words": f.words} for f in findings
-    ]}  # fmt: skip
+    return {
+        "state": state,
+        "words": words,
+        "findings": [{"about": f.about, "state": f.state, "words": f.words} for f in findings],
+    }
 
 
 def _camera(table: dict) -> dict:
@@ -175,9 +175,10 @@ def _points(table) -> Iterator[tuple[str, dict]]:
     for row in table_rows(table):
         point = dict(zip(table, row))
         estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
-        yield point["id"], {"role": point["role"]} | estimates | {
-            "rays": point["rays"], "rms": point["rms"]
-        }  # fmt: skip
+        yield (
+            point["id"],
+            {"role": point["role"]} | estimates | {"rays": point["rays"], "rms": point["rms"]},
+        )
 
 
 def _far_points(adjustment) -> dict:

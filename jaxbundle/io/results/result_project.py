@@ -29,23 +29,39 @@ def adjusted_network(adjustment) -> Network:
     gone = {(name.id, name.parameter) for name in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
-            camera, parameters=adjustment.camera_parameters(camera.id),
+            camera,
+            parameters=adjustment.camera_parameters(camera.id),
             sigma=camera.sigma if get_model(camera.model).prior else {},
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
-    )  # fmt: skip
+    )
     used = (np.asarray(problem.data.image_weight) > 0).any(1)
     roles = tuple("tie" if role == "control" else role for role in points.role)
     adjusted = network.replace(
         cameras=cameras,
-        images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
-                      np.full_like(images.sigma, np.nan), images.source),
-        points=Points(points.id, roles, adjustment.point_values,
-                      np.full_like(points.sigma, np.nan), points.source),
+        images=Images(
+            images.id,
+            images.camera,
+            values[:, :3],
+            values[:, 3:],
+            np.full_like(images.sigma, np.nan),
+            images.source,
+        ),
+        points=Points(
+            points.id,
+            roles,
+            adjustment.point_values,
+            np.full_like(points.sigma, np.nan),
+            points.source,
+        ),
         observations=rays.take(used),
-        datum="inner", datum_points=(), further=(), warnings=(), notes=("the adjusted network",),
-    )  # fmt: skip
+        datum="inner",
+        datum_points=(),
+        further=(),
+        warnings=(),
+        notes=("the adjusted network",),
+    )
     return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
 
 
@@ -66,28 +82,38 @@ def readjustable_network(adjustment) -> Network:
     values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
-            camera, parameters=adjustment.camera_parameters(camera.id), sigma={},
+            camera,
+            parameters=adjustment.camera_parameters(camera.id),
+            sigma={},
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
-    )  # fmt: skip
+    )
     weight = np.asarray(data.image_weight)
     used = (weight > 0).any(1)
     adjusted = network.replace(
         cameras=cameras,
-        images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
-                      np.where(images.sigma == 0, 0.0, np.nan), images.source),
+        images=Images(
+            images.id,
+            images.camera,
+            values[:, :3],
+            values[:, 3:],
+            np.where(images.sigma == 0, 0.0, np.nan),
+            images.source,
+        ),
         points=_given_points(adjustment),
         observations=dataclasses.replace(
-            rays, sigma=_sigma(weight, np.nan),
+            rays,
+            sigma=_sigma(weight, np.nan),
             sigma_origin=ESTIMATED if adjustment.sigma_factors else rays.sigma_origin,
         ).take(used),
         distances=dataclasses.replace(
             network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
         ),
         further=_joined(*_further(adjustment), *_priors(adjustment)),
-        warnings=(), notes=("the adjusted network",),
-    )  # fmt: skip
+        warnings=(),
+        notes=("the adjusted network",),
+    )
     adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
     return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
 
@@ -133,9 +159,11 @@ def _priors(adjustment) -> list[Further]:
                 rows.append((camera.id, name, float(data.interior[row, j]), 1 / weight))
     if rows:
         camera, parameter, value, sigma = zip(*rows)
-        found.append(CameraParameters(
-            camera=camera, parameter=parameter, value=np.array(value), sigma=np.array(sigma)
-        ))  # fmt: skip
+        found.append(
+            CameraParameters(
+                camera=camera, parameter=parameter, value=np.array(value), sigma=np.array(sigma)
+            )
+        )
     return found
 
 

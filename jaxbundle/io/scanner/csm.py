@@ -51,9 +51,13 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
     states = states_of(isd, when, interpolation)
     optics, turn = optics_of(isd, pixels, *_middle(states, ends.mean()))
     image = make_image(
-        trajectory_of(states, turn, interpolation, order), times, optics, lines, pixels,
+        trajectory_of(states, turn, interpolation, order),
+        times,
+        optics,
+        lines,
+        pixels,
         sources=states.sources,
-    )  # fmt: skip
+    )
     name = str(isd.get("name_sensor") or Path(path).stem)
     return Scanner(name, image, _earth(isd), states.warnings)
 
@@ -106,5 +110,3 @@ def _middle(states, middle):
     )
     camera = slerp(states.rows, states.R, np.array([middle]))[0].inv()
     return camera.apply(-here), camera.apply(after - here)
-
-

@@ -60,10 +60,12 @@ def _focal_plane(isd, u):
     A = np.stack([to_line[1:], to_sample[1:]])
     if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
         raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
-    offset = np.stack([
-        np.full(len(u), line - isd.number("detector_center.line") - to_line[0]),
-        sample - isd.number("detector_center.sample") - to_sample[0],
-    ])  # fmt: skip
+    offset = np.stack(
+        [
+            np.full(len(u), line - isd.number("detector_center.line") - to_line[0]),
+            sample - isd.number("detector_center.sample") - to_sample[0],
+        ]
+    )
     return np.linalg.solve(A, offset)
 
 
@@ -109,9 +111,20 @@ def _transverse(isd, a, b, x, y):
     """The point that the cubic polynomials a and b distort to (x, y)."""
     u, v = x, y
     for _ in range(100):
-        terms = np.stack([
-            u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3,
-        ])  # fmt: skip
+        terms = np.stack(
+            [
+                u**0,
+                u,
+                v,
+                u * u,
+                u * v,
+                v * v,
+                u**3,
+                u * u * v,
+                u * v * v,
+                v**3,
+            ]
+        )
         du, dv = x - a @ terms, y - b @ terms
         u, v = u + du, v + dv
         if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):

@@ -20,9 +20,16 @@ from jaxbundle.network.columns import show
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 DISTORTIONS = (
-    "radial", "transverse", "kaguyalism", "dawnfc", "lrolrocnac", "cahvor", "lunarorbiter",
-    "radtan", "kplo_shadowcam",
-)  # fmt: skip
+    "radial",
+    "transverse",
+    "kaguyalism",
+    "dawnfc",
+    "lrolrocnac",
+    "cahvor",
+    "lunarorbiter",
+    "radtan",
+    "kplo_shadowcam",
+)
 """By their number, `m_distortionType`."""
 PLATFORM_ORDERS = {0: 3, 1: 7}
 """Degree of the interpolation by `m_platformFlag`."""
@@ -51,13 +58,17 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
     if flag not in PLATFORM_ORDERS:
         raise InputError(f"{state.path}: m_platformFlag is {flag:g}; 0 or 1 is expected")
     isd = {
-        "name_sensor": state.get("m_sensorName") or "", "name_model": MODEL,
-        "image_lines": number("m_nLines"), "image_samples": number("m_nSamples"),
+        "name_sensor": state.get("m_sensorName") or "",
+        "name_model": MODEL,
+        "image_lines": number("m_nLines"),
+        "image_samples": number("m_nSamples"),
         "line_scan_rate": np.stack(rates, 1).tolist(),
         "sensor_position": {"positions": _rows(state, "m_positions", 3), "unit": "m"},
-        "t0_ephemeris": number("m_t0Ephem"), "dt_ephemeris": number("m_dtEphem"),
+        "t0_ephemeris": number("m_t0Ephem"),
+        "dt_ephemeris": number("m_dtEphem"),
         "sensor_orientation": {"quaternions": _rows(state, "m_quaternions", 4)},
-        "t0_quaternion": number("m_t0Quat"), "dt_quaternion": number("m_dtQuat"),
+        "t0_quaternion": number("m_t0Quat"),
+        "dt_quaternion": number("m_dtQuat"),
         # the camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round
         "focal_length_model": {
             "focal_length": number("m_focalLength") * np.sign(number("m_zDirection", 1))
@@ -65,15 +76,19 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
         "focal2pixel_lines": array("m_iTransL", (3,)).tolist(),
         "focal2pixel_samples": array("m_iTransS", (3,)).tolist(),
         "detector_center": {
-            "line": number("m_detectorLineOrigin"), "sample": number("m_detectorSampleOrigin"),
+            "line": number("m_detectorLineOrigin"),
+            "sample": number("m_detectorSampleOrigin"),
         },
         "detector_sample_summing": number("m_detectorSampleSumming", 1),
         "starting_detector_line": number("m_startingDetectorLine", 0),
         "starting_detector_sample": number("m_startingDetectorSample", 0),
         "optical_distortion": _distortion(state),
-        "radii": {"semimajor": number("m_majorAxis"), "semiminor": number("m_minorAxis"),
-                  "unit": "m"},
-    }  # fmt: skip
+        "radii": {
+            "semimajor": number("m_majorAxis"),
+            "semiminor": number("m_minorAxis"),
+            "unit": "m",
+        },
+    }
     return isd, PLATFORM_ORDERS[int(flag)]
 
 

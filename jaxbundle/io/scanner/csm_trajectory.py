@@ -90,8 +90,13 @@ def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int
 
     def options(k, n):
         least = order if interpolation == "usgscsm" else min(order, n - 1)
-        return {"method": interpolation, "order": least, "gap": np.inf,
-                "extrapolate": states.extrapolate[k], "source": states.sources[k]}  # fmt: skip
+        return {
+            "method": interpolation,
+            "order": least,
+            "gap": np.inf,
+            "extrapolate": states.extrapolate[k],
+            "source": states.sources[k],
+        }
 
     return Trajectory(
         position_table(states.t, states.P, **options(0, len(states.t))),
@@ -127,12 +132,17 @@ def _resample(isd, lines, interpolation):
     _check_rows(isd, "instrument_position", given)
     body_times, body, body_lengths = _turns(isd, "body_rotation")
     pointing_times, pointing, pointing_lengths = _turns(isd, "instrument_pointing")
-    tables = {"instrument_position": given, "instrument_pointing": pointing_times,
-              "body_rotation": body_times}  # fmt: skip
+    tables = {
+        "instrument_position": given,
+        "instrument_pointing": pointing_times,
+        "body_rotation": body_times,
+    }
     warnings = [
-        warning for key, t in tables.items() if len(t) > 1
+        warning
+        for key, t in tables.items()
+        if len(t) > 1
         for warning in warn_of_extrapolation(t, lines, isd.source(key))
-    ]  # fmt: skip
+    ]
     t = np.linspace(given[0], given[-1], max(FEWEST, len(given)))
     P = body(t).apply(_positions(isd, given)(t))
     if interpolation == "usgscsm":

@@ -80,7 +80,7 @@ def read_dimap(file: XmlFields) -> Scanner:
     psi = file.columns(
         "Instrument_Look_Angles_List/Instrument_Look_Angles/Look_Angles_List/Look_Angles",
         ["PSI_X", "PSI_Y"],
-    )  # fmt: skip
+    )
     if len(psi) != pixels:
         raise InputError(f"{path}: {len(psi)} Look_Angles for {pixels} columns; one a column")
     optics = AngleTable(jnp.asarray(-psi[:, 1]), jnp.asarray(psi[:, 0]))

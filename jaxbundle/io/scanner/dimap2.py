@@ -73,9 +73,13 @@ def read_dimap2(file: XmlFields) -> Scanner:
     )
     trajectory, told = trajectory_of(tables, frame.turn, period * np.arange(lines))
     image = make_image(
-        trajectory, times, polynomial_optics(frame, y, -x), lines, pixels,
+        trajectory,
+        times,
+        polynomial_optics(frame, y, -x),
+        lines,
+        pixels,
         sources=(positions, attitude),
-    )  # fmt: skip
+    )
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
     return Scanner(name, image, WGS84, (*lengths, *warnings, *told))
 
@@ -148,8 +152,12 @@ def _look_angles(file):
         given = [file.number(f"{angles}/{n}", None if k == 0 else 0.0) for k, n in enumerate(row)]
         moved = np.polynomial.Polynomial(given)(np.polynomial.Polynomial([shift, 1.0])).coef
         polynomials.append(np.r_[moved, np.zeros(len(row) - len(moved))])
-    warnings = () if len(bands) < 2 else (
-        f"{file.path}: {len(bands)} bands have different look angles; those of the first, "
-        f"{bands[0].findtext('BAND_ID', '').strip() or 'without a name'}, are used",
-    )  # fmt: skip
+    warnings = (
+        ()
+        if len(bands) < 2
+        else (
+            f"{file.path}: {len(bands)} bands have different look angles; those of the first, "
+            f"{bands[0].findtext('BAND_ID', '').strip() or 'without a name'}, are used",
+        )
+    )
     return *polynomials, warnings

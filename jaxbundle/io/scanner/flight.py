@@ -96,12 +96,20 @@ def read_flight(path: str | Path) -> FlightFile:
             raise InputError(f"{instruments.where}{name} is {rate}; a positive number, in Hz")
     options |= {k: instruments.text(k) for k in METHODS if k in instruments}
     flight = Flight(
-        scanner.integer("lines"), pixels, period, optics_of(file, pixels), _track(file, earth),
-        {k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
-         for k, v in file.section("angles").values.items()},
-        mounting_of(file), noise=_noise(file),
-        seed=int(file.section("simulation").number("seed", 0)), **options,
-    )  # fmt: skip
+        scanner.integer("lines"),
+        pixels,
+        period,
+        optics_of(file, pixels),
+        _track(file, earth),
+        {
+            k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
+            for k, v in file.section("angles").values.items()
+        },
+        mounting_of(file),
+        noise=_noise(file),
+        seed=int(file.section("simulation").number("seed", 0)),
+        **options,
+    )
     return FlightFile(file, flight, earth)
 
 
@@ -142,7 +150,7 @@ def _signal(value: Any, unit: float, where: str):
     if isinstance(value, int | float) and not isinstance(value, bool):
         return unit * value
     if not isinstance(value, Mapping):
-        raise InputError(f"{where}a number or a table such as {{ kind = \"sine\", … }} is expected")
+        raise InputError(f'{where}a number or a table such as {{ kind = "sine", … }} is expected')
     kind = value.get("kind", "constant")
     if kind not in KEYS:
         raise InputError(f"{where}unknown signal {kind!r}{did_you_mean(str(kind), KEYS)}")

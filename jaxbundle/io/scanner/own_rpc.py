@@ -73,8 +73,14 @@ def check_against_rpc(scanner: Scanner, path: Path, choose: bool = True) -> Scan
 def _rpc_file(path: Path) -> Path | None:
     suffix, stem = path.suffix.lower(), path.stem
     if suffix == ".imd":
-        return next((p for p in path.parent.glob(f"{_plain(stem)}.*")
-                     if p.suffix.lower() == ".rpb" and p.stem == stem), None)  # fmt: skip
+        return next(
+            (
+                p
+                for p in path.parent.glob(f"{_plain(stem)}.*")
+                if p.suffix.lower() == ".rpb" and p.stem == stem
+            ),
+            None,
+        )
     if stem.upper().startswith("DIM_"):
         file = path.with_name(f"RPC_{path.name[4:]}")
         return file if file.is_file() else None

@@ -31,8 +31,9 @@ class Tables(NamedTuple):
 
     def directions(self, at: float) -> tuple[np.ndarray, np.ndarray]:
         """Approximate directions down and of flight in the camera frame."""
-        here, after = (np.array([np.interp(at + dt, self.t, p) for p in self.P.T])
-                       for dt in (0, 1e-3))  # fmt: skip
+        here, after = (
+            np.array([np.interp(at + dt, self.t, p) for p in self.P.T]) for dt in (0, 1e-3)
+        )
         camera = slerp(self.rows, self.R, np.array([at]))[0].inv()
         return camera.apply(-here), camera.apply(after - here)
 
@@ -53,9 +54,12 @@ def trajectory_of(
         told = warn_of_extrapolation(rows, lines, source)
         warnings.extend(told)
         return {
-            "method": "usgscsm" if told else "lagrange", "order": min(ORDER, len(rows) - 1),
-            "gap": np.inf, "extrapolate": extrapolation_limit(rows), "source": source,
-        }  # fmt: skip
+            "method": "usgscsm" if told else "lagrange",
+            "order": min(ORDER, len(rows) - 1),
+            "gap": np.inf,
+            "extrapolate": extrapolation_limit(rows),
+            "source": source,
+        }
 
     q = np.roll((tables.R * turn).as_quat(), 1, axis=1)
     trajectory = Trajectory(

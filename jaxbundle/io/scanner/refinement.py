@@ -58,10 +58,18 @@ from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points
 
 SECTIONS = {
     "refine": (
-        "points", "observations", "frames", "sigma", "angle_unit", "snooping", "significance",
+        "points",
+        "observations",
+        "frames",
+        "sigma",
+        "angle_unit",
+        "snooping",
+        "significance",
     ),
-    "images": (), "sensors": (), "unknowns": (),
-}  # fmt: skip
+    "images": (),
+    "sensors": (),
+    "unknowns": (),
+}
 REQUIRED_FIELDS = ("refine", "images", "unknowns")
 WORDS = {"free": math.inf, "held": 0.0}
 TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
@@ -94,7 +102,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     radians = ANGLE_UNITS[unit]
     scanners = file.section("images")
     if not scanners.values:
-        raise InputError(f"{path}, [images]: no image; give id = \"scanner.toml\"")
+        raise InputError(f'{path}, [images]: no image; give id = "scanner.toml"')
     sensors, unknowns = file.section("sensors"), file.section("unknowns")
     sensors.check_keys(tuple(scanners.values))
     own = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
@@ -126,23 +134,25 @@ def read_refinement(path: str | Path) -> RefineFile:
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
-        ids |= {id: k for k, id in enumerate(
-            (id for id in frames.points.id if id not in ids), len(ids)
-        )}  # fmt: skip
+        ids |= {
+            id: k for k, id in enumerate((id for id in frames.points.id if id not in ids), len(ids))
+        }
     observations = _observations(
-        read_csv(path.parent / section.text("observations")), ids, [one.id for one in images],
-        section, str(path),
-    )  # fmt: skip
+        read_csv(path.parent / section.text("observations")),
+        ids,
+        [one.id for one in images],
+        section,
+        str(path),
+    )
     snooping = section.text("snooping", "none")
     if snooping not in TESTS:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
-        raise InputError(f"{section.where}significance is {significance}; a number between 0 and 1 "
-                         "is expected")  # fmt: skip
-    return RefineFile(
-        images, points, observations, frames, snooping, significance, tuple(warnings)
-    )
+        raise InputError(
+            f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
+        )
+    return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
 
 
 def _freedom(section: Section, radians: float) -> Freedom:
@@ -200,16 +210,25 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
                 f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
                 "order of columns and at angle_unit"
             )
-        X = np.stack([np.asarray(v) for v in earth_fixed(
-            earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2])
-        )], 1)  # fmt: skip
+        X = np.stack(
+            [
+                np.asarray(v)
+                for v in earth_fixed(earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2]))
+            ],
+            1,
+        )
         known = np.isfinite(X).all(1)
         for k in np.flatnonzero(known):
             axes[k] = east_north_up(earth, X[k])
     return GroundPoints(
-        table.ids("id"), table.ids("role"), X, np.nan_to_num(sigma, nan=0.0, posinf=np.inf), axes,
-        ("east", "north", "up") if geographic else ("X", "Y", "Z"), table.source,
-    )  # fmt: skip
+        table.ids("id"),
+        table.ids("role"),
+        X,
+        np.nan_to_num(sigma, nan=0.0, posinf=np.inf),
+        axes,
+        ("east", "north", "up") if geographic else ("X", "Y", "Z"),
+        table.source,
+    )
 
 
 def _observations(table, ids, images, section, where) -> Observations:
@@ -229,6 +248,7 @@ def _observations(table, ids, images, section, where) -> Observations:
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
         table.indices("point", "point", ids, section.text("points")),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, given), table.source,
+        np.where(lacking, sigma, given),
+        table.source,
         STATED if stated or not lacking.any() else UNIT,
-    )  # fmt: skip
+    )

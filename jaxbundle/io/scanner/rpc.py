@@ -30,16 +30,25 @@ from jaxbundle.pushbroom.rpc import TERMS, Rpc
 from jaxbundle.system.file_content import check_plain
 
 OFFSETS = {
-    "line": ("LINE", "line"), "sample": ("SAMP", "samp"), "longitude": ("LONG", "long"),
-    "latitude": ("LAT", "lat"), "height": ("HEIGHT", "height"),
-}  # fmt: skip
+    "line": ("LINE", "line"),
+    "sample": ("SAMP", "samp"),
+    "longitude": ("LONG", "long"),
+    "latitude": ("LAT", "lat"),
+    "height": ("HEIGHT", "height"),
+}
 """Names in text and in RPB."""
 UNITS = {
-    "line": "pixels", "sample": "pixels", "longitude": "degrees", "latitude": "degrees",
+    "line": "pixels",
+    "sample": "pixels",
+    "longitude": "degrees",
+    "latitude": "degrees",
     "height": "meters",
-}  # fmt: skip
-ACCEPTED = {"pixels": {"pixels", "pixel"}, "degrees": {"degrees", "degree", "deg"},
-            "meters": {"meters", "metres", "meter", "metre", "m"}}  # fmt: skip
+}
+ACCEPTED = {
+    "pixels": {"pixels", "pixel"},
+    "degrees": {"degrees", "degree", "deg"},
+    "meters": {"meters", "metres", "meter", "metre", "m"},
+}
 RASTERS = (".tif", ".tiff", ".ntf", ".vrt")
 FIELDS = {
     "line_numerator": ("LINE_NUM_COEFF", "lineNumCoef"),

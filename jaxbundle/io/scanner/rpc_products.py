@@ -18,10 +18,18 @@ from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.columns import show
 from jaxbundle.pushbroom.rpc import TERMS
 
-AXES = {"line": "line", "sample": "samp", "longitude": "long", "latitude": "lat",
-        "height": "height"}  # fmt: skip
-FIELDS = {f"{axis}_{part}": (AXES[axis], part[:3]) for axis in ("line", "sample")
-          for part in ("numerator", "denominator")}  # fmt: skip
+AXES = {
+    "line": "line",
+    "sample": "samp",
+    "longitude": "long",
+    "latitude": "lat",
+    "height": "height",
+}
+FIELDS = {
+    f"{axis}_{part}": (AXES[axis], part[:3])
+    for axis in ("line", "sample")
+    for part in ("numerator", "denominator")
+}
 """Names of the four polynomials in the files: line, num."""
 DIMAP_ORIGIN = {"PHR": 1.0, "PNEO": 0.0, "S6": 0.0, "S7": 0.0}
 """Row and column of the centre of the first pixel in DIMAP's RPC, by the beginning of
@@ -73,10 +81,13 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
             "are those of RPC00B"
         )
     adjusted = [
-        name for name, (value, _) in found.items()
-        if ".adj_param_" in name and name.endswith(".parameter") and value not in ("0", "0.0")
+        name
+        for name, (value, _) in found.items()
+        if ".adj_param_" in name
+        and name.endswith(".parameter")
+        and value not in ("0", "0.0")
         and number_of(path, found, name) != 0
-    ]  # fmt: skip
+    ]
     if adjusted:
         raise InputError(
             f"{path}, line {found[adjusted[0]][1]}: the adjustable parameter {adjusted[0]} is not "
@@ -101,9 +112,7 @@ def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float
 
 
 def _from_dimap(file):
-    inverse = next(
-        (n for n in DIMAP_OTHER if file.find(n) is not None), None
-    )
+    inverse = next((n for n in DIMAP_OTHER if file.find(n) is not None), None)
     if inverse is None:
         raise file.missing("Inverse_Model")
     values = {}

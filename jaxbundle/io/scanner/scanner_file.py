@@ -87,7 +87,14 @@ INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
 KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
     "scanner": (
-        "name", "lines", "pixels", "epoch", "earth", "angle_unit", "source", "interpolation",
+        "name",
+        "lines",
+        "pixels",
+        "epoch",
+        "earth",
+        "angle_unit",
+        "source",
+        "interpolation",
     ),
     "times": ("first", "period", "table"),
     "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
@@ -96,7 +103,7 @@ SECTIONS = {
     "mounting": ANGLES,
     "corrections": Corrections._fields,
     "earth_orientation": frames.EarthOrientation._fields,
-}  # fmt: skip
+}
 REQUIRED_FIELDS = ("scanner", "times", "position", "attitude", "optics")
 
 
@@ -118,9 +125,15 @@ def scanner_of(file: TomlFile) -> Scanner:
     if corrections.any and earth is None:
         raise InputError(f"{switches.where}corrections need an Earth; set [scanner] earth")
     image = make_image(
-        Trajectory(position, attitude), _times(file, lines), optics_of(file, pixels), lines, pixels,
-        mounting, corrections, (positions, attitudes),
-    )  # fmt: skip
+        Trajectory(position, attitude),
+        _times(file, lines),
+        optics_of(file, pixels),
+        lines,
+        pixels,
+        mounting,
+        corrections,
+        (positions, attitudes),
+    )
     return Scanner(scanner.text("name", file.path.stem), image, earth, lengths)
 
 
@@ -205,7 +218,7 @@ def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> s
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
-            f'{section.where}frame is {frame!r}, earth is {"local" if earth is None else "given"}; '
+            f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
             'a local frame belongs to [scanner] earth = "local", and no other does'
         )
     return frame
@@ -272,9 +285,7 @@ def _orbit(
     return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
 
 
-def _attitude(
-    file: TomlFile, earth: Ellipsoid | None
-) -> tuple[Attitude, Source, tuple[str, ...]]:
+def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source, tuple[str, ...]]:
     """The attitudes, the source of their rows, warnings."""
     section = file.section("attitude")
     frame = _frame(section, earth, (*FRAMES, "orbit"))
@@ -296,9 +307,12 @@ def _attitude(
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         values = frames.turn_quaternions(R, values)
     attitude = attitude_table(
-        t, values, **_options(section, "slerp" if quaternions else "linear"),
-        reference="orbit" if frame == "orbit" else "earth", source=columns.source,
-    )  # fmt: skip
+        t,
+        values,
+        **_options(section, "slerp" if quaternions else "linear"),
+        reference="orbit" if frame == "orbit" else "earth",
+        source=columns.source,
+    )
     return attitude, columns.source, lengths
 
 
@@ -320,9 +334,11 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         section.check_keys(("across", "along", "middle", "half"))
         half = section.number("half", pixels / 2)
         return AnglePolynomial(
-            jnp.asarray(section.numbers("across")), jnp.asarray(section.numbers("along")),
-            jnp.asarray(middle), jnp.asarray(half),
-        )  # fmt: skip
+            jnp.asarray(section.numbers("across")),
+            jnp.asarray(section.numbers("along")),
+            jnp.asarray(middle),
+            jnp.asarray(half),
+        )
     try:
         model = get_model(section.text("model", "brown"))
         section.check_keys(("model", "pitch", "middle", "row", *model.parameters))
@@ -337,6 +353,9 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
     return FocalLine(
-        jnp.asarray([values[name] for name in model.parameters]), jnp.asarray(pitch),
-        jnp.asarray(middle), jnp.asarray(section.number("row", 0.0)), model.name,
-    )  # fmt: skip
+        jnp.asarray([values[name] for name in model.parameters]),
+        jnp.asarray(pitch),
+        jnp.asarray(middle),
+        jnp.asarray(section.number("row", 0.0)),
+        model.name,
+    )

@@ -20,9 +20,10 @@ class SightFrame(NamedTuple):
 
 
 def sight_frame(
-    sights: Float[np.ndarray, "2 pixels"], down: Float[np.ndarray, "3"],
+    sights: Float[np.ndarray, "2 pixels"],
+    down: Float[np.ndarray, "3"],
     forward: Float[np.ndarray, "3"],
-) -> SightFrame:  # fmt: skip
+) -> SightFrame:
     """The frame of a camera that looks along ±(x, y, 1): the side of the planet.
 
     **Arguments:** `sights` x and y of all pixels; `down` and `forward`, the directions to the

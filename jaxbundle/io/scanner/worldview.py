@@ -80,9 +80,14 @@ def read_worldview(file: XmlFields) -> Scanner:
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
     trajectory, told = trajectory_of(tables, frame.turn, when)
     image = make_image(
-        trajectory, times, polynomial_optics(frame, x, y), lines, pixels, corrections=CORRECTIONS,
+        trajectory,
+        times,
+        polynomial_optics(frame, x, y),
+        lines,
+        pixels,
+        corrections=CORRECTIONS,
         sources=(tables.positions, tables.attitude),
-    )  # fmt: skip
+    )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
     return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
@@ -152,15 +157,19 @@ def _detectors(file):
             for n in names
         ]
         for band in bands
-    ]  # fmt: skip
+    ]
     x0, y0, angle, pitch = values[0]
     c = file.number("GEO/PRINCIPAL_DISTANCE/PD")
     if c == 0 or pitch == 0:
         raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
     other = [band.tag for band, v in zip(bands, values) if v != values[0]]
-    warnings = () if not other else (
-        f"{file.path}: the detectors of {', '.join(other)} differ in position from those of "
-        f"{bands[0].tag}, which are used",
-    )  # fmt: skip
+    warnings = (
+        ()
+        if not other
+        else (
+            f"{file.path}: the detectors of {', '.join(other)} differ in position from those of "
+            f"{bands[0].tag}, which are used",
+        )
+    )
     direction = pitch * np.array([np.sin(np.radians(angle)), -np.cos(np.radians(angle))])
     return np.array([x0, direction[0]]) / c, np.array([y0, direction[1]]) / c, warnings

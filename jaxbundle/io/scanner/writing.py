@@ -47,8 +47,13 @@ def write_scanner_image(
     radians = ANGLE_UNITS[angle_unit]
     file = lambda kind: f"{f'{name}_' if prefix is None else prefix}{kind}.csv"
     rates = [] if position.rates is None else [np.asarray(position.rates)]
-    _write(folder / file("positions"), ("t", "X", "Y", "Z", "VX", "VY", "VZ")[: 4 + 3 * len(rates)],
-           position.times, position.values, *rates)  # fmt: skip
+    _write(
+        folder / file("positions"),
+        ("t", "X", "Y", "Z", "VX", "VY", "VZ")[: 4 + 3 * len(rates)],
+        position.times,
+        position.values,
+        *rates,
+    )
     quaternions = attitude.table.values.shape[1] == 4
     columns = ("q0", "q1", "q2", "q3") if quaternions else ANGLES
     values = np.asarray(attitude.table.values) / (1.0 if quaternions else radians)
@@ -60,14 +65,18 @@ def write_scanner_image(
     frame = "local" if earth is None else "ITRF"
     turning = "orbit" if attitude.reference == "orbit" else frame
     document = {
-        "scanner": scanner, "times": times,
+        "scanner": scanner,
+        "times": times,
         "position": {"table": file("positions"), "frame": frame, **_options(position)},
-        "attitude": {"table": file("attitude"), "frame": turning,
-                     **_options(attitude.table, "slerp" if attitude.slerp else None)},
+        "attitude": {
+            "table": file("attitude"),
+            "frame": turning,
+            **_options(attitude.table, "slerp" if attitude.slerp else None),
+        },
         "optics": _optics(image.optics, folder, file, radians),
         "mounting": dict(zip(ANGLES, (np.asarray(image.mounting) / radians).tolist())),
         "corrections": {k: v for k, v in zip(Corrections._fields, image.corrections)},
-    }  # fmt: skip
+    }
     path = folder / f"{name}.toml"
     write_text(path, toml_text(document))
     return path
@@ -91,12 +100,18 @@ def _optics(optics: Optics, folder: Path, file, radians: float) -> dict[str, Any
         return {"model": optics.model, **parameters, **more}
     if isinstance(optics, AnglePolynomial):
         return {
-            "across": optics.across.tolist(), "along": optics.along.tolist(),
-            "middle": float(optics.middle), "half": float(optics.half),
-        }  # fmt: skip
+            "across": optics.across.tolist(),
+            "along": optics.along.tolist(),
+            "middle": float(optics.middle),
+            "half": float(optics.half),
+        }
     assert isinstance(optics, AngleTable)
-    _write(folder / file("angles"), ("across", "along"), optics.across / radians,
-           optics.along / radians)  # fmt: skip
+    _write(
+        folder / file("angles"),
+        ("across", "along"),
+        optics.across / radians,
+        optics.along / radians,
+    )
     return {"table": file("angles")}
 
 

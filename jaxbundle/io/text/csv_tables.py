@@ -34,9 +34,7 @@ def read_text(path: Path, fallback: str = "") -> str:
         if fallback:
             return error.object.decode(fallback)
         line = error.object[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"{path}, line {line}: not UTF-8 text; save the file as UTF-8"
-        ) from None
+        raise InputError(f"{path}, line {line}: not UTF-8 text; save the file as UTF-8") from None
 
 
 def read_toml(path: Path) -> dict[str, Any]:

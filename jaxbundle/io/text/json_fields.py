@@ -44,9 +44,7 @@ class JsonFields:
             array = np.array(value, float)
         except (TypeError, ValueError, OverflowError):
             array = np.array(np.nan)
-        fits = array.ndim == len(shape) and all(
-            n in (None, m) for n, m in zip(shape, array.shape)
-        )
+        fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape))
         if not fits or not np.isfinite(array).all():
             size = " × ".join("n" if n is None else str(n) for n in shape)
             kind = f"an array {size} of finite numbers" if shape else "a finite number"

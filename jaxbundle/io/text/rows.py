@@ -82,9 +82,13 @@ class Rows:
     """
 
     def __init__(
-        self, path: Path, comment: str = "", blank: bool = False, separator: str | None = None,
+        self,
+        path: Path,
+        comment: str = "",
+        blank: bool = False,
+        separator: str | None = None,
         fallback: str = "",
-    ):  # fmt: skip
+    ):
         self.path = path
         self.lines = [
             (number, line)

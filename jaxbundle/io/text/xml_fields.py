@@ -66,10 +66,15 @@ class XmlFields:
     def columns(self, key: str, names: Sequence[str]) -> np.ndarray:
         """Numbers [elements, names] of repeated elements."""
         last = key.rpartition("/")[2]
-        return np.array([
-            [number_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}") for name in names]
-            for k, e in enumerate(self.elements(key), 1)
-        ])
+        return np.array(
+            [
+                [
+                    number_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}")
+                    for name in names
+                ]
+                for k, e in enumerate(self.elements(key), 1)
+            ]
+        )
 
     def times(self, key: str, epoch: np.datetime64, name: str = "TIME") -> np.ndarray:
         """Seconds since the epoch of repeated elements."""

@@ -23,9 +23,12 @@ TAG = re.compile(r"!\S*\s*")
 OPEN, CLOSE = re.compile(r"[\[{]"), re.compile(r"[\]}]")
 WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 NOT_READ = {
-    "{": "a dictionary in braces", "&": "an anchor", "*": "an alias", "|": "a block of text",
+    "{": "a dictionary in braces",
+    "&": "an anchor",
+    "*": "an alias",
+    "|": "a block of text",
     ">": "a block of text",
-}  # fmt: skip
+}
 
 
 class Line:

@@ -132,9 +132,10 @@ def read_marker(folder: Path) -> Marker | None:
     try:
         document = json.loads((folder / MARKER).read_bytes())
         files = {str(name): str(digest) for name, digest in document["files"].items()}
-        return Marker(str(document["command"]), {
-            name: digest for name, digest in files.items() if _is_inside(folder, name)
-        })
+        return Marker(
+            str(document["command"]),
+            {name: digest for name, digest in files.items() if _is_inside(folder, name)},
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
 
@@ -156,9 +157,7 @@ def _check_place(folder: Path, said: str) -> None:
         raise InputError(f"{said}: cannot be written: no permission in {there}")
 
 
-def _refuse_others(
-    folder: Path, real: Path, by: str, names: Sequence[str], said: str
-) -> None:
+def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said: str) -> None:
     """Refuse folders of other commands, and other files among `names`."""
     marker, entries = read_marker(real), _entries(real)
     if not entries:
@@ -326,8 +325,9 @@ def _files(folder: Path) -> list[str]:
     """All files below a folder, the marker last."""
     found = [
         Path(root, name).relative_to(folder).as_posix()
-        for root, _, names in os.walk(folder) for name in names
-    ]  # fmt: skip
+        for root, _, names in os.walk(folder)
+        for name in names
+    ]
     return sorted(found, key=lambda name: (name == MARKER, name))
 
 

@@ -56,8 +56,10 @@ def move_into_datum(
     def further(values):
         tables = {name: values[name] for name in pinned.weight}
         moves = directions_of_motions(declared, tables)
-        away = {name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
-                for name, value in tables.items()}  # fmt: skip
+        away = {
+            name: _of_rows(partial(_difference, declared.spaces[name]), value, start[name])
+            for name, value in tables.items()
+        }
         missing, slope = datum.equations(pinned, moves, away)
         step = datum.limit_step(pinned.gauge @ -np.linalg.solve(slope, missing), curved)
         moved = _move_tables(declared, free, step, values)

@@ -93,9 +93,9 @@ def leave_held(
         return plan
     if moves is None:
         moves = generators(declared, {name: values[name] for name in held})
-    rows = jnp.concatenate([
-        (moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()
-    ])  # fmt: skip
+    rows = jnp.concatenate(
+        [(moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()]
+    )
     A = rows.T @ rows
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
@@ -165,8 +165,9 @@ def move_to_datum(
         slope = jnp.where(before > NEAR_DATUM * size, slope, near)
         step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
         moved = _move(declared, plan, step, values)
-        differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
-                       for name in datum.weight}  # fmt: skip
+        differences = {
+            name: jax.tree.map(jnp.subtract, moved[name], values[name]) for name in datum.weight
+        }
         return moved, largest(datum.weight, differences), before, count + 1
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
@@ -192,8 +193,9 @@ def largest(holding: Tangent, tables: Values):
     where = np.where if all(isinstance(w, np.ndarray) for w in holding.values()) else jnp.where
     return max(
         where(weight.max(1) > 0, abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
-        for name, weight in holding.items() for x in jax.tree.leaves(tables[name])
-    )  # fmt: skip
+        for name, weight in holding.items()
+        for x in jax.tree.leaves(tables[name])
+    )
 
 
 def equations(datum: Datum, moves: Tangent, away: Tangent):
@@ -211,8 +213,10 @@ def _datum_equations(declared, plan, values, start):
     """The same, differentiable, from the tables."""
     datum = present(plan.datum)
     moves = generators(declared, {name: values[name] for name in datum.weight})
-    away = {name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
-            for name in datum.weight}  # fmt: skip
+    away = {
+        name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
+        for name in datum.weight
+    }
     return equations(datum, moves, away)
 
 

@@ -66,18 +66,20 @@ def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)
     everywhere = {
-        name: jnp.concatenate([
-            moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
-        ], 1)
+        name: jnp.concatenate(
+            [moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members], 1
+        )
         for name, group in plan.groups.items()
-    }  # fmt: skip
+    }
     products, squares = [], jnp.zeros(motions)
     for number, part in enumerate(plan.parts):
         if declared.kinds[part.set_name].invariant:
             continue
         _, touches, E = differentiate(declared, plan, number, prepared, laid)
-        blocks = [(J, everywhere[t.group][t.row, t.start : t.stop][:, None])
-                  for t, J in zip(part.touches, touches)]  # fmt: skip
+        blocks = [
+            (J, everywhere[t.group][t.row, t.start : t.stop][:, None])
+            for t, J in zip(part.touches, touches)
+        ]
         if E is not None:
             blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
         if not blocks:  # Held tables only: it determines nothing.
@@ -127,9 +129,13 @@ def _triangle(parts, scales) -> Float[np.ndarray, "n n"]:
 
 
 def make_datum(
-    plan: Plan, survey: Survey, gauge: Float[np.ndarray, "motions defect"],
-    weight: dict[str, np.ndarray], minimal: bool, real: dict[str, Bool[np.ndarray, " rows"]],
-) -> Datum:  # fmt: skip
+    plan: Plan,
+    survey: Survey,
+    gauge: Float[np.ndarray, "motions defect"],
+    weight: dict[str, np.ndarray],
+    minimal: bool,
+    real: dict[str, Bool[np.ndarray, " rows"]],
+) -> Datum:
     """The datum fixed by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
     many of them as the defect, chosen well spread. `real`: see `survey_motions`.
 

@@ -87,9 +87,12 @@ def differentiate_locally(
         J = jnp.concatenate([blocks[slot] for slot, _ in one.slots], -1)
         if number_of == touch:
             mask = jnp.take_along_axis(
-                jnp.broadcast_to(free, (*columns.shape[:2], group.width)), columns, -1,
-                mode="fill", fill_value=0.0,
-            )  # fmt: skip
+                jnp.broadcast_to(free, (*columns.shape[:2], group.width)),
+                columns,
+                -1,
+                mode="fill",
+                fill_value=0.0,
+            )
             J = J * mask[:, :, None, :]
         else:
             J = zero_held_columns(plan, one, J)

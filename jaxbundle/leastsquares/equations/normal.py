@@ -89,9 +89,13 @@ class Normal(lx.AbstractLinearOperator):
 
 
 for _trait in (
-    lx.is_diagonal, lx.is_tridiagonal, lx.has_unit_diagonal, lx.is_lower_triangular,
-    lx.is_upper_triangular, lx.is_negative_semidefinite,
-):  # fmt: skip
+    lx.is_diagonal,
+    lx.is_tridiagonal,
+    lx.has_unit_diagonal,
+    lx.is_lower_triangular,
+    lx.is_upper_triangular,
+    lx.is_negative_semidefinite,
+):
     _trait.register(Normal)(lambda operator: False)
 for _trait in (lx.is_symmetric, lx.is_positive_semidefinite):
     _trait.register(Normal)(lambda operator: True)
@@ -140,9 +144,10 @@ def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
         at = plan.incidences[g]
         moved = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][at.row])
         found = found + jax.ops.segment_sum(
-            moved.reshape(-1, blocks.shape[-2]), at.eliminated.ravel(),
+            moved.reshape(-1, blocks.shape[-2]),
+            at.eliminated.ravel(),
             plan.groups[present(plan.eliminated)].rows,
-        )  # fmt: skip
+        )
     return found
 
 
@@ -162,9 +167,9 @@ def normal_equations(
     for number, part in enumerate(plan.parts):
         local = local_touch(declared, part)
         if local is not None:
-            sums.add_local(part, differentiate_locally(
-                declared, plan, number, local, prepared, laid
-            ))  # fmt: skip
+            sums.add_local(
+                part, differentiate_locally(declared, plan, number, local, prepared, laid)
+            )
             continue
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
         sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
@@ -224,11 +229,13 @@ class Sums:
         others = [k for k in range(len(part.touches)) if k != t]
         couples = [c for c in part.couples if t not in (c.first, c.second)]
         rest = dataclasses.replace(
-            part, touches=tuple(part.touches[k] for k in others),
-            couples=tuple(dataclasses.replace(
-                c, first=others.index(c.first), second=others.index(c.second)
-            ) for c in couples),
-        )  # fmt: skip
+            part,
+            touches=tuple(part.touches[k] for k in others),
+            couples=tuple(
+                dataclasses.replace(c, first=others.index(c.first), second=others.index(c.second))
+                for c in couples
+            ),
+        )
         r, E = found.r, found.eliminated
         kept = tuple(found.touches[k] for k in others)
         self.add_part(rest, 0.5 * jnp.vdot(r, r), *_products_of(rest, r, kept, E))
@@ -242,9 +249,10 @@ class Sums:
                 B = spread(jnp.einsum("clri,clrj->clij", J, found.touches[k]), at, width)
                 touches = tuple(whole if i == t else one for i, one in enumerate(part.touches))
                 self._add_couple(
-                    dataclasses.replace(part, touches=touches), couple,
+                    dataclasses.replace(part, touches=touches),
+                    couple,
                     B if couple.first == t else B.mT,
-                )  # fmt: skip
+                )
         if E is not None:
             self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
 
@@ -305,9 +313,7 @@ class Sums:
 def products(a, b):
     """aᵀb of every row, written out: a batched product of tiny matrices takes three times as
     long."""
-    return reduce(
-        jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
-    )
+    return reduce(jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1])))
 
 
 def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:

@@ -32,17 +32,24 @@ class Reduced(eqx.Module):
         times = lambda B, s, t: B * s[:, :, None] * t[:, None, :]
         return Reduced(
             {g: times(B, scale[g], scale[g]) for g, B in self.own.items()},
-            {(a, b): times(B, scale[a][plan.blocks[a, b].row], scale[b][plan.blocks[a, b].column])
-             for (a, b), B in self.off.items()},
-        )  # fmt: skip
+            {
+                (a, b): times(
+                    B, scale[a][plan.blocks[a, b].row], scale[b][plan.blocks[a, b].column]
+                )
+                for (a, b), B in self.off.items()
+            },
+        )
 
     def matrix(self, plan: Plan, groups: Groups) -> Float[Array, "n n"]:
         """The matrix of some groups; only its lower triangle is right."""
         size = lambda g: plan.groups[g].free.size
         rows = [
-            [self.block(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
-             for j, b in enumerate(groups)] for i, a in enumerate(groups)
-        ]  # fmt: skip
+            [
+                self.block(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
+                for j, b in enumerate(groups)
+            ]
+            for i, a in enumerate(groups)
+        ]
         return jnp.block(rows) if rows else jnp.zeros((0, 0))
 
     def block(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
@@ -105,9 +112,7 @@ def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     own = {g: parts[g][g][i, :, i] for g, i in index.items()}
     keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
     at = plan.blocks
-    return Reduced(own, {
-        (a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys
-    })
+    return Reduced(own, {(a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys})
 
 
 def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
@@ -119,6 +124,4 @@ def split(plan: Plan, groups: Groups, vector: Float[Array, "n ..."]):
     """The rows of some groups in one, group by group."""
     ends = np.cumsum([plan.groups[g].free.size for g in groups])
     parts = jnp.split(vector, ends[:-1]) if groups else ()
-    return {
-        g: x.reshape(*plan.groups[g].free.shape, *x.shape[1:]) for g, x in zip(groups, parts)
-    }
+    return {g: x.reshape(*plan.groups[g].free.shape, *x.shape[1:]) for g, x in zip(groups, parts)}

@@ -85,7 +85,9 @@ def find_alternatives(
         return float(along**2 @ (1 / size[seen]))
 
     return [
-        other for other in range(len(observations))
-        if other != suspect and explained(other) > critical**2
+        other
+        for other in range(len(observations))
+        if other != suspect
+        and explained(other) > critical**2
         and explained(suspect, other) - explained(other) < apart**2
-    ]  # fmt: skip
+    ]

@@ -58,9 +58,12 @@ class Grouping:
     eliminated table its place among those that are eliminated; `kept`: the groups in order."""
 
     def __init__(
-        self, tables: Sequence[Table], observations: Sequence[Observations],
-        eliminate: str | None, choose: Choices,
-    ):  # fmt: skip
+        self,
+        tables: Sequence[Table],
+        observations: Sequence[Observations],
+        eliminate: str | None,
+        choose: Choices,
+    ):
         self.tables = {t.name: t for t in tables}
         self.observations = {given.name: given for given in observations}
         self.eliminate, self.choose = eliminate, choose

@@ -20,9 +20,10 @@ def chunk_length(major: Int[np.ndarray, " n"]) -> int:
     """The longest chunks of rows of one major with little padding."""
     _, number = np.unique(major, return_counts=True)
     fits = (
-        length for length in CHUNK_LENGTHS
+        length
+        for length in CHUNK_LENGTHS
         if (-(-number // length) * length).sum() <= (1 + MOST_EMPTY) * len(major)
-    )  # fmt: skip
+    )
     return next(fits, 1) if len(major) >= SMALL_PART else 1
 
 

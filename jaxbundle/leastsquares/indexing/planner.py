@@ -23,9 +23,12 @@ from jaxbundle.leastsquares.indexing.reduction import FACTORS, MOST_PAIRS, plan_
 
 
 def make_plan(
-    tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None,
-    choices: dict | None = None, ways: Sequence[str] = REDUCTIONS,
-) -> tuple[Plan, Sizes, dict]:  # fmt: skip
+    tables: Sequence[Table],
+    observations: Sequence[Observations],
+    eliminate: str | None,
+    choices: dict | None = None,
+    ways: Sequence[str] = REDUCTIONS,
+) -> tuple[Plan, Sizes, dict]:
     """The plan on the host, its arrays as `Index` and `Column` (`indices.finish`), the sizes of its
     lists, and the choices made (lengths of chunks, blocks of the reduced matrix). `choices`: those
     of a larger problem of which this is a part, to be reused; `ways`: allowed solvers of the
@@ -139,19 +142,28 @@ class _Planner:
             eliminated = as_index(at, along, ("group", self.by.eliminate))
         number = ("observations", share.set_name)
         made = Part(
-            set_name=share.set_name, slot=share.slot, by_row=tuple(by_row),
-            large=large, lookup=tuple(lookup), eliminated=eliminated,
-            source=as_index(source, along, number), place=as_index(place, number, along, length),
-            touches=tuple(touches), couples=(),
-        )  # fmt: skip
+            set_name=share.set_name,
+            slot=share.slot,
+            by_row=tuple(by_row),
+            large=large,
+            lookup=tuple(lookup),
+            eliminated=eliminated,
+            source=as_index(source, along, number),
+            place=as_index(place, number, along, length),
+            touches=tuple(touches),
+            couples=(),
+        )
         return _LaidPart(made, used, length, along)
 
     def incidences_of(self, group, parts):
         """The incidences of a group; sets the incidence of the observations of the parts."""
         at = [
-            (k, t) for k, p in enumerate(parts) if p.part.slot is not None
-            for t, touch in enumerate(p.part.touches) if touch.group == group
-        ]  # fmt: skip
+            (k, t)
+            for k, p in enumerate(parts)
+            if p.part.slot is not None
+            for t, touch in enumerate(p.part.touches)
+            if touch.group == group
+        ]
         if not at:
             return None
         number = len(self.by.row_in)
@@ -238,9 +250,16 @@ class _Planner:
         if within:  # below the diagonal; an incidence paired with itself is summed by chunks
             there &= later.row[i] > earlier.row[j]
         i, j = i[there], j[there]
-        return later.live[i], earlier.live[j], later.row[i], earlier.row[j], (
-            (later.along, later.length), (earlier.along, earlier.length),
-        )  # fmt: skip
+        return (
+            later.live[i],
+            earlier.live[j],
+            later.row[i],
+            earlier.row[j],
+            (
+                (later.along, later.length),
+                (earlier.along, earlier.length),
+            ),
+        )
 
     def _block_list(self, key, pairs, direct, parts):
         i, j, row, column, into = pairs

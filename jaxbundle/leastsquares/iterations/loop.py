@@ -63,8 +63,9 @@ def iterate(
         accept, region = loop.region.after(first, ratio)
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
-            (loop.trial, trial_equations, trial_cost), (loop.at, loop.equations, loop.cost),
-        )  # fmt: skip
+            (loop.trial, trial_equations, trial_cost),
+            (loop.at, loop.equations, loop.cost),
+        )
         step_size, approach = loop.approach.choose_step(
             region.radius, loop.step_size, first, accept, loop.predicted, ratio, cost
         )
@@ -73,15 +74,28 @@ def iterate(
         finite = jnp.isfinite(decrement)
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
         termination, approach = approach.judge(
-            tolerance(equations), step_size, finite, decrement, first, accept, loop.cost, cost,
+            tolerance(equations),
+            step_size,
+            finite,
+            decrement,
+            first,
+            accept,
+            loop.cost,
+            cost,
             trial_cost,
-        )  # fmt: skip
+        )
         return Loop(
-            at=at, trial=retract(at, change), equations=equations, cost=cost,
+            at=at,
+            trial=retract(at, change),
+            equations=equations,
+            cost=cost,
             predicted=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
-            step_size=step_size, region=region, approach=approach, termination=termination,
+            step_size=step_size,
+            region=region,
+            approach=approach,
+            termination=termination,
             steps=loop.steps + 1,
-        )  # fmt: skip
+        )
 
     equations, zero = jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linearise, start)
@@ -90,8 +104,15 @@ def iterate(
         lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
         body,
         Loop(
-            at=start, trial=start, equations=equations, cost=zero, predicted=zero,
-            step_size=jnp.full_like(zero, jnp.inf), region=RegionState.begin(),
-            approach=Approach.begin(), termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
+            at=start,
+            trial=start,
+            equations=equations,
+            cost=zero,
+            predicted=zero,
+            step_size=jnp.full_like(zero, jnp.inf),
+            region=RegionState.begin(),
+            approach=Approach.begin(),
+            termination=jnp.asarray(LIMIT),
+            steps=jnp.asarray(0),
         ),
-    )  # fmt: skip
+    )

@@ -47,18 +47,26 @@ class Fit(eqx.Module):
 
 
 def adjust(
-    residuals: Callable, retract: Callable, start, data: tuple, unknowns: int,
-    steps=MOST_EVALUATIONS
-):  # fmt: skip
+    residuals: Callable,
+    retract: Callable,
+    start,
+    data: tuple,
+    unknowns: int,
+    steps=MOST_EVALUATIONS,
+):
     """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
     estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
     return finish(residuals, retract, estimate, data, unknowns)
 
 
 def minimise(
-    residuals: Callable, retract: Callable, start, data: tuple, unknowns: int,
-    steps=MOST_EVALUATIONS
-):  # fmt: skip
+    residuals: Callable,
+    retract: Callable,
+    start,
+    data: tuple,
+    unknowns: int,
+    steps=MOST_EVALUATIONS,
+):
     """The estimate at the end of the iterations, and its vᵀv, without derivatives.
 
     **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum

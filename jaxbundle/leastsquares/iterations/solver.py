@@ -118,12 +118,18 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         zero, rows = zero_tangent(self.plan), self.rows
         nothing = jnp.full(rows, jnp.nan)
         return State(
-            first=jnp.asarray(True), known=_zeros(struct), change=zero, trial=y,
-            step_size=jnp.asarray(jnp.inf), descent=self.descent.init(zero, info),
-            search=self.search.init(zero, info), approach=Approach.begin(),
-            termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
+            first=jnp.asarray(True),
+            known=_zeros(struct),
+            change=zero,
+            trial=y,
+            step_size=jnp.asarray(jnp.inf),
+            descent=self.descent.init(zero, info),
+            search=self.search.init(zero, info),
+            approach=Approach.begin(),
+            termination=jnp.asarray(LIMIT),
+            steps=jnp.asarray(0),
             history=History(nothing, nothing, jnp.zeros(rows, bool)),
-        )  # fmt: skip
+        )
 
     def step(self, fn, y, args, options, state: State, tags):
         before, zero = self._info(state.known), zero_tangent(self.plan)
@@ -140,19 +146,36 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         )
         change, finite = self._next_change(known, step_size, state.descent)
         termination, approach = approach.judge(
-            self.tolerance, step_size, finite, -dot(self.plan, known.gradient, change),
-            state.first, accept, before.f, known.cost, trial.f,
-        )  # fmt: skip
+            self.tolerance,
+            step_size,
+            finite,
+            -dot(self.plan, known.gradient, change),
+            state.first,
+            accept,
+            before.f,
+            known.cost,
+            trial.f,
+        )
         following = self.retract(self.plan, y, change)
         y = jax.tree.map(lambda a, b: jnp.where(termination == SETTLED, b, a), y, following)
         self._report(state, trial.f)
-        return y, State(
-            first=jnp.asarray(False), known=dataclasses.replace(known, damping=1 / step_size),
-            change=change, trial=following, step_size=step_size,
-            descent=state.descent, search=search,
-            approach=approach, termination=termination, steps=state.steps + 1,
-            history=state.history.with_row(state.steps, trial.f, 1 / state.step_size, accept),
-        ), aux  # fmt: skip
+        return (
+            y,
+            State(
+                first=jnp.asarray(False),
+                known=dataclasses.replace(known, damping=1 / step_size),
+                change=change,
+                trial=following,
+                step_size=step_size,
+                descent=state.descent,
+                search=search,
+                approach=approach,
+                termination=termination,
+                steps=state.steps + 1,
+                history=state.history.with_row(state.steps, trial.f, 1 / state.step_size, accept),
+            ),
+            aux,
+        )
 
     def terminate(self, fn, y, args, options, state: State, tags):
         ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
@@ -162,8 +185,10 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         # optimistix ends the loop at non-finite unknowns before any step.
         termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
         stats = {
-            "termination": termination, "iterations": state.steps, "history": state.history,
-        }  # fmt: skip
+            "termination": termination,
+            "iterations": state.steps,
+            "history": state.history,
+        }
         return y, aux, stats
 
     def _linearise(self, values: Values, laid: Laid) -> Known:

@@ -105,9 +105,17 @@ class Approach(eqx.Module):
         return jnp.where(quadratic | self.repeat_undamped, jnp.inf, step_size), approach
 
     def judge(
-        self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost,
+        self,
+        tolerance: Tolerance,
+        step_size,
+        finite,
+        decrement,
+        first,
+        accept,
+        before,
+        cost,
         trial_cost,
-    ):  # fmt: skip
+    ):
         """The termination code after a step was computed, and the approach.
 
         `cost`: at the accepted point; `before`: at the one before; `trial_cost`: at the one tried.

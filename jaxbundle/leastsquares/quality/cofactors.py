@@ -85,9 +85,14 @@ def _couplings(factor: Factor, Q: Reduced):
         if at.pairs is None:
             continue
         flat[later], flat[earlier] = _spread(
-            at.pairs, rows[later], rows[earlier], Q.off[later, earlier],
-            flat[later], flat[earlier], later == earlier,
-        )  # fmt: skip
+            at.pairs,
+            rows[later],
+            rows[earlier],
+            Q.off[later, earlier],
+            flat[later],
+            flat[earlier],
+            later == earlier,
+        )
     return {g: flat[g].reshape(k.shape) for g, k in K.items()}
 
 

@@ -92,9 +92,12 @@ def variance_components(
             factor = factors.get(group.name, 1.0)
             unit = group.unit / factor
             components[group.name] = Component(
-                used.size, float(r.sum()), float(square.sum()),
-                (float(unit / used.max()), float(unit / used.min())), factor,
-            )  # fmt: skip
+                used.size,
+                float(r.sum()),
+                float(square.sum()),
+                (float(unit / used.max()), float(unit / used.min())),
+                factor,
+            )
     return components
 
 

@@ -57,9 +57,14 @@ FIRST_ORDER_ONLY = (
 
 
 def solve(
-    problem: Problem, data: Data | None = None, *, sensitivity: Sensitivity = "exact",
-    max_iterations: int = 100, atol: float = 1e-7, **options,
-) -> Values:  # fmt: skip
+    problem: Problem,
+    data: Data | None = None,
+    *,
+    sensitivity: Sensitivity = "exact",
+    max_iterations: int = 100,
+    atol: float = 1e-7,
+    **options,
+) -> Values:
     """Adjusted tables as a differentiable function of the observations and all other data.
 
     Use it under `jax.jit`, `jax.vmap` (over any field of `data`), `jax.grad`, `jax.jacfwd` and

@@ -53,14 +53,13 @@ def name_of(problem: Problem, group: str, row: int, column: int) -> Name:
 def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
     """Group, row and column of all unknowns of the reduced system, in its order."""
     return [
-        (g, row, column) for g in problem.plan.kept
+        (g, row, column)
+        for g in problem.plan.kept
         for row, column in np.ndindex(problem.plan.groups[g].free.shape)
-    ]  # fmt: skip
+    ]
 
 
-def undetermined(
-    problem: Problem, values: Values, threshold: float = INDETERMINATE
-) -> list[str]:
+def undetermined(problem: Problem, values: Values, threshold: float = INDETERMINATE) -> list[str]:
     """The unknowns that the observations do not determine, most affected first. `threshold`: of the
     scaled eigenvalues; a larger one also finds unknowns that are hardly separated."""
     S, V, G = scaled_system(problem, values)
@@ -142,4 +141,3 @@ def _name_singular(problem: Problem, V) -> list[str]:
     rows = weak if rows is None else np.asarray(rows)[weak]
     all_of = ", ".join(table.parameter(j) for j in range(table.space.width))
     return [f"{all_of} of {table.title} {table.label(int(row))}" for row in rows]
-

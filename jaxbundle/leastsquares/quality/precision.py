@@ -39,9 +39,12 @@ class Precision(eqx.Module):
 
 
 def precision(
-    problem: Problem, data: Data | None = None, of: Callable[[Values], Array] | None = None,
-    *, sigma0: float | Float[Array, ""] = 1.0,
-) -> Precision:  # fmt: skip
+    problem: Problem,
+    data: Data | None = None,
+    of: Callable[[Values], Array] | None = None,
+    *,
+    sigma0: float | Float[Array, ""] = 1.0,
+) -> Precision:
     """The precision of a design, differentiable to any order.
 
     **Arguments:** `data`: numbers that replace `problem.data` (same shapes): the design in `start`,
@@ -86,9 +89,7 @@ def covariances(
 
 
 @compile_once
-def redundancy(
-    declared: Declared, plan: Plan, data: Data
-) -> Mapping[int, Float[AnyArray, "n r"]]:
+def redundancy(declared: Declared, plan: Plan, data: Data) -> Mapping[int, Float[AnyArray, "n r"]]:
     """Redundancy numbers by set, for data padded to the sizes of the plan."""
     filled, laid = fill_places(plan, lay_out_data(plan, data))
     normal = normal_equations(declared, filled, data.start, laid)[-1]

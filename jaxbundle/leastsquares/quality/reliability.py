@@ -69,10 +69,11 @@ def reliability(
     found = hat_blocks(declared, plan, values, laid, Q)
     whitened, hats, owns = (restore_order(plan, rows) for rows in found)
     by_set = {
-        o: _correlated(data.weight[o], u, hats[o], owns[o]) if data.weight[o].ndim == 3
+        o: _correlated(data.weight[o], u, hats[o], owns[o])
+        if data.weight[o].ndim == 3
         else _uncorrelated(data.weight[o], u, hats[o], owns[o])
         for o, u in whitened.items()
-    }  # fmt: skip
+    }
     columns = {f.name: {o: x[f.name] for o, x in by_set.items()} for f in fields(Reliability)}
     return Reliability(**columns)
 
@@ -80,10 +81,14 @@ def reliability(
 def _uncorrelated(weight, v, hat, own):
     used = weight > 0
     return {
-        "residual": v, "standard": v, "gain": used.astype(float),
+        "residual": v,
+        "standard": v,
+        "gain": used.astype(float),
         "redundancy": jnp.where(used, jnp.clip(1 - hat, 0.0, 1.0), 0.0),
-        "w": _test(v, hat, used), "hat": hat, "own": own,
-    }  # fmt: skip
+        "w": _test(v, hat, used),
+        "hat": hat,
+        "own": own,
+    }
 
 
 def _correlated(weight, u, hat, own):
@@ -97,10 +102,14 @@ def _correlated(weight, u, hat, own):
     h, standard = along(hat), jnp.einsum("nki,nk->ni", n, u)
     r = jnp.einsum("nik,nkl,nli->ni", L, jnp.eye(weight.shape[-1]) - hat, weight)
     return {
-        "residual": jnp.einsum("nik,nk->ni", L, u) / sigma, "standard": standard,
-        "gain": jnp.where(used, sigma * length, 0.0), "redundancy": jnp.where(used, r, 0.0),
-        "w": _test(standard, h, used), "hat": h, "own": along(own),
-    }  # fmt: skip
+        "residual": jnp.einsum("nik,nk->ni", L, u) / sigma,
+        "standard": standard,
+        "gain": jnp.where(used, sigma * length, 0.0),
+        "redundancy": jnp.where(used, r, 0.0),
+        "w": _test(standard, h, used),
+        "hat": h,
+        "own": along(own),
+    }
 
 
 def _test(standard, hat, used):

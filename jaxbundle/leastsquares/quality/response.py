@@ -85,10 +85,11 @@ def pull_back(
     wide = lambda t, x: np.pad(x, ((0, 0), (0, size[t] - x.shape[1]), (0, 0)))
     rows = {t: wide(t, np.asarray(x)) for t, x in functions.items()}
     pulled = [
-        _pull_back(declared, plan, values, data, found.factor,
-                   {t: x[k : k + 1] for t, x in rows.items()})
+        _pull_back(
+            declared, plan, values, data, found.factor, {t: x[k : k + 1] for t, x in rows.items()}
+        )
         for k in range(number)
-    ]  # fmt: skip
+    ]
     _require(np.array([left for _, _, left in pulled]))
     effects = {}
     for given in problem.observations:

@@ -99,8 +99,9 @@ def residual_lengths(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """|v/σ| of the observations that are removed or weighted as a whole, by set."""
     return {
         o.name: np.sqrt((found.residuals[o.name] ** 2).sum(1))
-        for o in found.problem.observations if o.kind.snooped == "whole"
-    }  # fmt: skip
+        for o in found.problem.observations
+        if o.kind.snooped == "whole"
+    }
 
 
 def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) -> float:
@@ -140,9 +141,7 @@ def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: s
             rests = bool(np.sqrt(np.mean(change**2)) < resting)
             if rests:
                 break
-            weight = {
-                o: np.asarray(p) * _root(w[o], p) if o in w else p for o, p in given.items()
-            }
+            weight = {o: np.asarray(p) * _root(w[o], p) if o in w else p for o, p in given.items()}
             weighted = with_data(problem, dataclasses.replace(problem.data, weight=weight))
             # The first start values may be far from a solution.
             values = move(weighted, values, adjust_from).values

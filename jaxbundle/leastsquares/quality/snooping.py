@@ -194,9 +194,10 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [
-        Removed(o, *_place(tests[o]), float(tests[o].max())) for o in touched.single
+        Removed(o, *_place(tests[o]), float(tests[o].max()))
+        for o in touched.single
         if tests[o].size
-    ]  # fmt: skip
+    ]
     together, of, row = [], [], []
     for o in filter(lambda o: len(tests[o]), touched.whole):
         of_one = tests[o].max(1, initial=0.0)
@@ -215,9 +216,15 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     if not len(at):
         return []
     pick = lambda by_set: np.array([by_set[o][k] for o, k in zip(of[at], row[at])])
-    chosen = at[choose_together(
-        together[at], pick(touched.own), pick(touched.shared), pick(_leverage(found)), critical,
-    )]  # fmt: skip
+    chosen = at[
+        choose_together(
+            together[at],
+            pick(touched.own),
+            pick(touched.shared),
+            pick(_leverage(found)),
+            critical,
+        )
+    ]
     rays = _Neighbours(found, touched, unit)
     others = {
         k: rays.alternatives(str(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
@@ -286,8 +293,9 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
     return {
         (r.set, row, r.residual)
         for r, tests in _test_removed(whole, found, removed)
-        for row, test in zip(r.rows, tests) if test < critical and not excluded(r, row)
-    }  # fmt: skip
+        for row, test in zip(r.rows, tests)
+        if test < critical and not excluded(r, row)
+    }
 
 
 def _with_tests(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:

@@ -107,9 +107,11 @@ def _weak(
     order = np.argsort(-sigma, kind="stable")[: (VAGUE_RATIO * sigma > 1).sum()]
     names = kept_unknowns(problem) if len(order) else []
     return Weak(
-        tuple(str(name_of(problem, *names[k])) for k in order), float(sigma.max(initial=0.0)),
-        far, judged,
-    )  # fmt: skip
+        tuple(str(name_of(problem, *names[k])) for k in order),
+        float(sigma.max(initial=0.0)),
+        far,
+        judged,
+    )
 
 
 def _far_rows(problem: Problem, factor: Factor, extents: Extents, sigma0: float):

@@ -19,9 +19,19 @@ from jaxbundle.network.further.ties import Ties as Ties
 KINDS = {
     kind.TABLE: kind
     for kind in (
-        Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
-        Ties, CameraParameters, ExteriorPriors,
-    )  # fmt: skip
+        Antennas,
+        Attitudes,
+        Rigs,
+        RollingShutter,
+        Differences,
+        Angles,
+        Figures,
+        Shapes,
+        Edges,
+        Ties,
+        CameraParameters,
+        ExteriorPriors,
+    )
 }
 """By the name of their table."""
 OF_ANGLES = {kind.name for kind in (attitudes.ATTITUDE, attitudes.PRIOR, differences.ANGLE)}

@@ -60,9 +60,13 @@ def antenna(pose, arm, strip, clock, given):
 
 
 POSITION = Kind(
-    "antenna positions", antenna, ("image", "lever arm", "GNSS strip", "GNSS clock"), AXES,
-    scalars=True, snooped="whole",
-)  # fmt: skip
+    "antenna positions",
+    antenna,
+    ("image", "lever arm", "GNSS strip", "GNSS clock"),
+    AXES,
+    scalars=True,
+    snooped="whole",
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -90,18 +94,23 @@ class Antennas(Further):
         for (i, j), name in zip(PAIRS, pairs):
             R[:, i, j] = R[:, j, i] = np.nan_to_num(table.numbers(name))
         for row in np.flatnonzero(~(np.linalg.eigvalsh(R).min(1) > 1e-12))[:1]:
-            raise InputError(f"{table.source(row)}: the correlations {', '.join(pairs)} are "
-                             "impossible together")  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: the correlations {', '.join(pairs)} are impossible together"
+            )
         time = table.numbers("t")
         if {"drift", "time_offset"} & {*chosen.free} and np.isnan(time).any():
             row = int(np.isnan(time).argmax())
             raise InputError(f"{table.source(row)}: t is missing; drift and time_offset need it")
         strip = table.ids("strip") if "strip" in table.values else ("all",) * len(table)
         return cls(
-            image=table.ids("image"), position=position, strip=strip, time=time,
-            covariance=R * sigma[:, :, None] * sigma[:, None, :], settings=dict(settings),
+            image=table.ids("image"),
+            position=position,
+            strip=strip,
+            time=time,
+            covariance=R * sigma[:, :, None] * sigma[:, None, :],
+            settings=dict(settings),
             source=table.source,
-        )  # fmt: skip
+        )
 
     def columns(self, radians: float) -> dict:
         sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
@@ -110,8 +119,11 @@ class Antennas(Further):
         columns |= {a: self.position[:, k] for k, a in enumerate(AXES)}
         columns |= {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}
         columns |= {f"r{AXES[i]}{AXES[j]}": R[:, i, j] for i, j in PAIRS}
-        return columns | {"strip": self.strip} | ({} if np.isnan(self.time).any() else
-                                                  {"t": self.time})  # fmt: skip
+        return (
+            columns
+            | {"strip": self.strip}
+            | ({} if np.isnan(self.time).any() else {"t": self.time})
+        )
 
     def begin(self, network):
         """Antenna positions serve as start values of projection centres."""
@@ -135,22 +147,40 @@ class Antennas(Further):
         cameras = [network.cameras[c].id for c in camera]
         given = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
-            "lever arm", three_by_camera(SECTION, "lever_arm", given, cameras), Vector(3),
-            parameters.mask(ARM), cameras, ARM, "lever arm of camera",
-        )  # fmt: skip
+            "lever arm",
+            three_by_camera(SECTION, "lever_arm", given, cameras),
+            Vector(3),
+            parameters.mask(ARM),
+            cameras,
+            ARM,
+            "lever arm of camera",
+        )
         since, velocity = _track(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
             raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
         groups = [*SHIFTS, *["drift"] * 3]
         names = ("shift X", "shift Y", "shift Z", "drift X", "drift Y", "drift Z")
-        shift = Table("GNSS strip", np.zeros((len(strips), 6)), Vector(6), parameters.mask(groups),
-                      list(strips), names)  # fmt: skip
-        clock = Table("GNSS clock", np.zeros((1, 1)), Vector(1),
-                      parameters.mask(["time_offset"]), ["offset"], ("seconds",))  # fmt: skip
+        shift = Table(
+            "GNSS strip",
+            np.zeros((len(strips), 6)),
+            Vector(6),
+            parameters.mask(groups),
+            list(strips),
+            names,
+        )
+        clock = Table(
+            "GNSS clock",
+            np.zeros((1, 1)),
+            Vector(1),
+            parameters.mask(["time_offset"]),
+            ["offset"],
+            ("seconds",),
+        )
         seen = POSITION(
             (image, of_camera, strip, np.zeros(len(self), int)),
-            (self.position - origin, since, velocity), covariance=self.covariance,
-        )  # fmt: skip
+            (self.position - origin, since, velocity),
+            covariance=self.covariance,
+        )
         priors = (
             *parameters.priors(arm, ARM),
             *parameters.priors(shift, groups),

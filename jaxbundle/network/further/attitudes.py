@@ -76,8 +76,13 @@ class Attitudes(Further):
         Parameters.of(SECTION, settings, ("boresight",))
         angles = np.stack([table.numbers(a, required=True) for a in ANGLES], 1)
         sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
-        return cls(image=table.ids("image"), angles=radians * angles, sigma=radians * sigma,
-                   settings=dict(settings), source=table.source)  # fmt: skip
+        return cls(
+            image=table.ids("image"),
+            angles=radians * angles,
+            sigma=radians * sigma,
+            settings=dict(settings),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         columns = {"image": self.image}
@@ -95,14 +100,21 @@ class Attitudes(Further):
         radians = ANGLE_UNITS[network.angle_unit]
         parameters = Parameters.of(SECTION, self.settings, ("boresight",))
         given = self.settings.get("boresight", [0.0, 0.0, 0.0])
-        M = np.stack([
-            np.asarray(matrix_from_omega_phi_kappa(radians * angles))
-            for angles in three_by_camera(SECTION, "boresight", given, cameras)
-        ])  # fmt: skip
+        M = np.stack(
+            [
+                np.asarray(matrix_from_omega_phi_kappa(radians * angles))
+                for angles in three_by_camera(SECTION, "boresight", given, cameras)
+            ]
+        )
         boresight = Table(
-            "boresight", np.asarray(jax.vmap(quaternion_from_matrix)(M)), Rotation(),
-            "boresight" in parameters.free, cameras, ANGLES, "boresight of camera",
-        )  # fmt: skip
+            "boresight",
+            np.asarray(jax.vmap(quaternion_from_matrix)(M)),
+            Rotation(),
+            "boresight" in parameters.free,
+            cameras,
+            ANGLES,
+            "boresight of camera",
+        )
         found = [ATTITUDE((image, of_camera), self.angles, sigma=self.sigma)]
         if "boresight" in parameters.sigma:
             sigma = radians * parameters.sigma["boresight"]

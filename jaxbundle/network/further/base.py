@@ -14,9 +14,20 @@ from jaxbundle.leastsquares.declarations import Kind, Observations, Table
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Images, Points, Source
 
-LENGTHS = frozenset((
-    "ax", "ay", "az", "shift X", "shift Y", "shift Z", "shift x", "shift y", "shift z", "R",
-))  # fmt: skip
+LENGTHS = frozenset(
+    (
+        "ax",
+        "ay",
+        "az",
+        "shift X",
+        "shift Y",
+        "shift Z",
+        "shift x",
+        "shift y",
+        "shift z",
+        "R",
+    )
+)
 ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
 """Unknowns of further tables that are lengths or angles: their σ are compared with the point
 distance and with a radian."""
@@ -91,8 +102,9 @@ class Further(abc.ABC):
 
         **Raises:** `InputError`."""
         for fields, table, thing in (
-            (self.IMAGES, network.images, "image"), (self.POINTS, network.points, "point"),
-        ):  # fmt: skip
+            (self.IMAGES, network.images, "image"),
+            (self.POINTS, network.points, "point"),
+        ):
             known = set(table.id)
             for field in fields:
                 for row, id in enumerate(getattr(self, field)):

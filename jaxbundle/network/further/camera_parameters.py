@@ -48,19 +48,23 @@ class CameraParameters(Further):
     TABLE = "camera_parameters"
 
     @classmethod
-    def of(
-        cls, table: Columns, settings: Mapping[str, Any], radians: float
-    ) -> "CameraParameters":
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "CameraParameters":
         table.check_names(("camera", "parameter", "value", "sigma"))
         return cls(
-            camera=table.ids("camera"), parameter=table.ids("parameter"),
-            value=table.numbers("value", required=True), sigma=positive_sigma(table, "sigma"),
+            camera=table.ids("camera"),
+            parameter=table.ids("parameter"),
+            value=table.numbers("value", required=True),
+            sigma=positive_sigma(table, "sigma"),
             source=table.source,
-        )  # fmt: skip
+        )
 
     def columns(self, radians: float) -> dict:
-        return {"camera": self.camera, "parameter": self.parameter, "value": self.value,
-                "sigma": self.sigma}  # fmt: skip
+        return {
+            "camera": self.camera,
+            "parameter": self.parameter,
+            "value": self.value,
+            "sigma": self.sigma,
+        }
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -79,8 +83,10 @@ class CameraParameters(Further):
             camera = cameras[id]
             known, names = get_model(camera.model).parameters, parameter.split(RATIO)
             if len(names) > 2:
-                raise InputError(f"{self.source(row)}: expected a parameter or a ratio of two, "
-                                 f"such as fy/fx, got {parameter!r}")  # fmt: skip
+                raise InputError(
+                    f"{self.source(row)}: expected a parameter or a ratio of two, "
+                    f"such as fy/fx, got {parameter!r}"
+                )
             for name in names:
                 if name not in known:
                     raise InputError(
@@ -97,8 +103,11 @@ class CameraParameters(Further):
 
     def declare(self, network, origin) -> Declared:
         index = {camera.id: c for c, camera in enumerate(network.cameras)}
-        place = {int(c): (table, k) for table in camera_tables(network.cameras)
-                 for k, c in enumerate(table.cameras)}  # fmt: skip
+        place = {
+            int(c): (table, k)
+            for table in camera_tables(network.cameras)
+            for k, c in enumerate(table.cameras)
+        }
         sets: dict[tuple, list[int]] = {}
         for row, (id, parameter) in enumerate(zip(self.camera, self.parameter)):
             table, _ = place[index[id]]
@@ -108,8 +117,14 @@ class CameraParameters(Further):
         kind = lambda table, parameter, residual: Kind(
             "camera parameters", residual, (table,), (parameter,), snooped="", invariant=True
         )
-        return Declared((), tuple(
-            kind(*of)((np.array([place[index[self.camera[row]]][1] for row in rows]),),
-                      self.value[rows], sigma=self.sigma[rows])
-            for of, rows in sets.items()
-        ))  # fmt: skip
+        return Declared(
+            (),
+            tuple(
+                kind(*of)(
+                    (np.array([place[index[self.camera[row]]][1] for row in rows]),),
+                    self.value[rows],
+                    sigma=self.sigma[rows],
+                )
+                for of, rows in sets.items()
+            ),
+        )

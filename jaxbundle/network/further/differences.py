@@ -55,10 +55,17 @@ class Differences(Further):
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
         given = ~np.isnan(value)
         for row in np.flatnonzero((given != ~np.isnan(sigma)).any(1) | ~given.any(1))[:1]:
-            raise InputError(f"{table.source(row)}: a difference dX, dY or dZ with its σ sdX, sdY "
-                             "or sdZ is expected, both or neither")  # fmt: skip
-        return cls(start=table.ids("from"), to=table.ids("to"), value=np.where(given, value, 0.0),
-                   sigma=np.where(given, sigma, np.inf), source=table.source)  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: a difference dX, dY or dZ with its σ sdX, sdY "
+                "or sdZ is expected, both or neither"
+            )
+        return cls(
+            start=table.ids("from"),
+            to=table.ids("to"),
+            value=np.where(given, value, 0.0),
+            sigma=np.where(given, sigma, np.inf),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         given = np.isfinite(self.sigma)
@@ -89,18 +96,31 @@ class Angles(Further):
         table.check_names(("from", "at", "to", "value", "sigma"))
         value = radians * table.numbers("value", required=True)
         for row in np.flatnonzero(~((value > 0) & (value < np.pi)))[:1]:
-            raise InputError(f"{table.source(row)}: an angle between 0 and half a turn is "
-                             f"expected, not {value[row] / radians:g}")  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: an angle between 0 and half a turn is "
+                f"expected, not {value[row] / radians:g}"
+            )
         start, at, to = (table.ids(name) for name in ("from", "at", "to"))
         for row, ids in enumerate(zip(start, at, to)):
             if len({*ids}) < 3:
                 raise InputError(f"{table.source(row)}: three different points are expected")
-        return cls(start=start, at=at, to=to, value=value,
-                   sigma=radians * positive_sigma(table, "sigma"), source=table.source)  # fmt: skip
+        return cls(
+            start=start,
+            at=at,
+            to=to,
+            value=value,
+            sigma=radians * positive_sigma(table, "sigma"),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
-        return {"from": self.start, "at": self.at, "to": self.to, "value": self.value / radians,
-                "sigma": self.sigma / radians}  # fmt: skip
+        return {
+            "from": self.start,
+            "at": self.at,
+            "to": self.to,
+            "value": self.value / radians,
+            "sigma": self.sigma / radians,
+        }
 
     def declare(self, network, origin) -> Declared:
         ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.at, self.to))

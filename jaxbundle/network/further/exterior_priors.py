@@ -50,10 +50,15 @@ class ExteriorPriors(Further):
         value = np.stack([table.numbers(name) for name in EXTERIOR], 1) * unit
         sigma = np.stack([positive_sigma(table, s, required=False) for s in sigmas], 1) * unit
         for row, k in np.argwhere(np.isnan(value) != np.isnan(sigma))[:1]:
-            raise InputError(f"{table.source(row)}: {EXTERIOR[k]} and s{EXTERIOR[k]}: give both or "
-                             "neither")  # fmt: skip
-        return cls(image=table.ids("image"), value=np.nan_to_num(value),
-                   sigma=np.where(np.isnan(sigma), np.inf, sigma), source=table.source)  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: {EXTERIOR[k]} and s{EXTERIOR[k]}: give both or neither"
+            )
+        return cls(
+            image=table.ids("image"),
+            value=np.nan_to_num(value),
+            sigma=np.where(np.isnan(sigma), np.inf, sigma),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         unit = np.array([1, 1, 1, radians, radians, radians])
@@ -69,6 +74,6 @@ class ExteriorPriors(Further):
     def declare(self, network, origin) -> Declared:
         shift = np.concatenate([origin, np.zeros(3)])
         value = np.where(np.isfinite(self.sigma), self.value - shift, 0.0)
-        return Declared((), (
-            EXTERIOR_PRIOR((rows_of(self.image, network.images),), value, sigma=self.sigma),
-        ))  # fmt: skip
+        return Declared(
+            (), (EXTERIOR_PRIOR((rows_of(self.image, network.images),), value, sigma=self.sigma),)
+        )

@@ -44,9 +44,12 @@ its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equa
 conditioned."""
 SHIFTS, TILTS = (0, 1, 2), (3, 4)
 MOVES = {
-    "plane": (2, *TILTS), "line": (0, 1, *TILTS), "circle": (*SHIFTS, *TILTS), "sphere": SHIFTS,
+    "plane": (2, *TILTS),
+    "line": (0, 1, *TILTS),
+    "circle": (*SHIFTS, *TILTS),
+    "sphere": SHIFTS,
     "cylinder": (0, 1, *TILTS),
-}  # fmt: skip
+}
 DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
 ROUND = ("circle", "sphere", "cylinder")
 
@@ -78,9 +81,13 @@ def in_shape(frame, point, given):
     return jnp.stack(frame.ray(point)) - given
 
 
-RESIDUALS = {"plane": (on_plane, ("distance",)), "line": (on_line, ("x", "y")),
-             "circle": (on_circle, ("radial", "z")), "sphere": (on_sphere, ("distance",)),
-             "cylinder": (on_cylinder, ("distance",))}  # fmt: skip
+RESIDUALS = {
+    "plane": (on_plane, ("distance",)),
+    "line": (on_line, ("x", "y")),
+    "circle": (on_circle, ("radial", "z")),
+    "sphere": (on_sphere, ("distance",)),
+    "cylinder": (on_cylinder, ("distance",)),
+}
 
 
 def _move_radius(motion, radius):
@@ -103,14 +110,18 @@ class Figures(Further):
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
         table.check_names(("figure", "type", "point"), ("sigma", "radius"))
         made = cls(
-            figure=table.ids("figure"), type=table.ids("type"), point=table.ids("point"),
-            sigma=sigma_or_exact(table), radius=positive_sigma(table, "radius", required=False),
+            figure=table.ids("figure"),
+            type=table.ids("type"),
+            point=table.ids("point"),
+            sigma=sigma_or_exact(table),
+            radius=positive_sigma(table, "radius", required=False),
             source=table.source,
-        )  # fmt: skip
+        )
         for row, word in enumerate(made.type):
             if word not in TYPES:
-                raise InputError(f"{table.source(row)}: type is {show(word)}"
-                                 f"{did_you_mean(word, TYPES)}")  # fmt: skip
+                raise InputError(
+                    f"{table.source(row)}: type is {show(word)}{did_you_mean(word, TYPES)}"
+                )
         first: dict[str, int] = {}
         for row, name in enumerate(made.figure):
             other = first.setdefault(name, row)
@@ -129,16 +140,19 @@ class Figures(Further):
 
     def columns(self, radians: float) -> dict:
         sigma = ["exact" if s == 0 else s for s in self.sigma.tolist()]
-        return {"figure": self.figure, "type": self.type, "point": self.point, "sigma": sigma,
-                "radius": self.radius}  # fmt: skip
+        return {
+            "figure": self.figure,
+            "type": self.type,
+            "point": self.point,
+            "sigma": sigma,
+            "radius": self.radius,
+        }
 
     def declare(self, network, origin) -> Declared:
         point = rows_of(self.point, network.points)
         place = network.points.position - origin
         exact = EXACT_SIGMA * across_rays(network)
-        declared = [
-            self._of_type(type, point, place, exact) for type in TYPES if type in self.type
-        ]
+        declared = [self._of_type(type, point, place, exact) for type in TYPES if type in self.type]
         return Declared(*(sum(parts, ()) for parts in zip(*declared)))
 
     def _of_type(self, type, point, place, exact) -> Declared:
@@ -156,24 +170,42 @@ class Figures(Further):
         centre, M, radius = (np.array(x) for x in zip(*fitted))
         q = np.array([np.asarray(quaternion_from_matrix(m)) for m in M])
         columns = MOVES[type]
-        frame = Table(type, PoseValue(centre, q), Frame(columns), labels=list(names),
-                      parameters=tuple(DIRECTIONS[c] for c in columns))  # fmt: skip
+        frame = Table(
+            type,
+            PoseValue(centre, q),
+            Frame(columns),
+            labels=list(names),
+            parameters=tuple(DIRECTIONS[c] for c in columns),
+        )
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
         if type not in ROUND:
             seen = self._observe_points(type, (type,), (figure,), point[rows], sigma)
             return Declared((frame,), (seen,), ((type, move_pose),))
-        known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
-                          for k in range(len(names))])  # fmt: skip
-        size = Table(f"radius of {type}", np.where(known > 0, known, radius), free=known <= 0,
-                     labels=list(names), parameters=("R",))  # fmt: skip
+        known = np.array(
+            [np.nanmax([*self.radius[rows[figure == k]], -1.0]) for k in range(len(names))]
+        )
+        size = Table(
+            f"radius of {type}",
+            np.where(known > 0, known, radius),
+            free=known <= 0,
+            labels=list(names),
+            parameters=("R",),
+        )
         seen = []
         for given in (False, True):
             those = np.flatnonzero((known > 0)[figure] == given)
             if len(those):
                 touched = (figure[those],) * 2
-                seen.append(self._observe_points(
-                    type, (type, size.name), touched, point[rows[those]], sigma[those], not given
-                ))  # fmt: skip
+                seen.append(
+                    self._observe_points(
+                        type,
+                        (type, size.name),
+                        touched,
+                        point[rows[those]],
+                        sigma[those],
+                        not given,
+                    )
+                )
         actions = (type, move_pose), (size.name, _move_radius)
         return Declared((frame, size), tuple(seen), actions)
 
@@ -203,8 +235,13 @@ class Shapes(Further):
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Shapes":
         table.check_names(("shape", "point", "x", "y", "z"), ("sigma",))
         place = np.stack([table.numbers(a, required=True) for a in "xyz"], 1)
-        return cls(shape=table.ids("shape"), point=table.ids("point"), place=place,
-                   sigma=sigma_or_exact(table), source=table.source)  # fmt: skip
+        return cls(
+            shape=table.ids("shape"),
+            point=table.ids("point"),
+            place=place,
+            sigma=sigma_or_exact(table),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         columns = {"shape": self.shape, "point": self.point}
@@ -222,13 +259,20 @@ class Shapes(Further):
         for k, name in enumerate(names):
             own = np.flatnonzero(shape == k)
             if len(own) < 3:
-                raise InputError(f"{self.source(own[0])}: shape {name!r}: {len(own)} points, "
-                    "at least 3 are needed")  # fmt: skip
+                raise InputError(
+                    f"{self.source(own[0])}: shape {name!r}: {len(own)} points, "
+                    "at least 3 are needed"
+                )
             X0, M = _place(self.place[own], places[point[own]])
             centre.append(X0)
             rotation.append(np.asarray(quaternion_from_matrix(M)))
-        frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
-                      labels=list(names), parameters=DIRECTIONS)  # fmt: skip
+        frame = Table(
+            "shape",
+            PoseValue(np.array(centre), np.array(rotation)),
+            Frame(),
+            labels=list(names),
+            parameters=DIRECTIONS,
+        )
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)

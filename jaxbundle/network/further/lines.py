@@ -70,13 +70,22 @@ class Edges(Further):
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Edges":
         table.check_names(("line", "image", "x", "y"), ("sigma",))
         xy = np.stack([table.numbers(name, required=True) for name in "xy"], 1)
-        return cls(line=table.ids("line"), image=table.ids("image"), xy=xy,
-                   sigma=positive_sigma(table, "sigma", required=False),
-                   source=table.source)  # fmt: skip
+        return cls(
+            line=table.ids("line"),
+            image=table.ids("image"),
+            xy=xy,
+            sigma=positive_sigma(table, "sigma", required=False),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
-        return {"line": self.line, "image": self.image, "x": self.xy[:, 0], "y": self.xy[:, 1],
-                "sigma": self.sigma}  # fmt: skip
+        return {
+            "line": self.line,
+            "image": self.image,
+            "x": self.xy[:, 0],
+            "y": self.xy[:, 1],
+            "sigma": self.sigma,
+        }
 
     def declare(self, network, origin) -> Declared:
         images = network.images
@@ -88,13 +97,19 @@ class Edges(Further):
         xy, own = from_image_unit(network.cameras, camera, self.xy, both, unit)
         sigma = np.where(np.isnan(self.sigma), sigma, own[:, 0])
         names, line = np.unique(np.array(self.line, dtype=object), return_inverse=True)
-        start = [self._start(network, origin, np.flatnonzero(line == k), image, xy)
-                 for k in range(len(names))]  # fmt: skip
+        start = [
+            self._start(network, origin, np.flatnonzero(line == k), image, xy)
+            for k in range(len(names))
+        ]
         centre, rotation = (np.array(x) for x in zip(*start))
         lines = Table(
-            LINE, PoseValue(centre, rotation), Frame((0, 1, 3, 4)), labels=list(names),
-            parameters=("shift x", "shift y", "turn x", "turn y"), title="line",
-        )  # fmt: skip
+            LINE,
+            PoseValue(centre, rotation),
+            Frame((0, 1, 3, 4)),
+            labels=list(names),
+            parameters=("shift x", "shift y", "turn x", "turn y"),
+            title="line",
+        )
         observed = []
         for table in camera_tables(network.cameras):
             rows = np.flatnonzero(np.isin(camera, table.cameras))
@@ -102,8 +117,14 @@ class Edges(Further):
                 continue
             place = {int(c): k for k, c in enumerate(table.cameras)}
             of_camera = np.array([place[int(c)] for c in camera[rows]], int)
-            kind = Kind("edges", OnLine(table.model), ("image", table.name, LINE), ("across",),
-                        scalars=True, invariant=True)  # fmt: skip
+            kind = Kind(
+                "edges",
+                OnLine(table.model),
+                ("image", table.name, LINE),
+                ("across",),
+                scalars=True,
+                invariant=True,
+            )
             observed.append(kind((image[rows], of_camera, line[rows]), xy[rows], sigma=sigma[rows]))
         return Declared((lines,), observed, ((LINE, move_pose),))
 
@@ -118,9 +139,13 @@ class Edges(Further):
             c = network.images.camera[i]
             table = next(t for t in camera_tables(network.cameras) if c in t.cameras)
             p = tuple(start_of(network.cameras[c]))
-            r = np.stack([np.asarray(x) for x in cameras.image_ray(
-                cameras.get_model(table.model), p, *xy[own].T
-            )], 1)  # fmt: skip
+            r = np.stack(
+                [
+                    np.asarray(x)
+                    for x in cameras.image_ray(cameras.get_model(table.model), p, *xy[own].T)
+                ],
+                1,
+            )
             M = np.asarray(matrix_from_omega_phi_kappa(network.images.angles[i]))
             normals.append(np.linalg.svd(r @ M)[2][-1])
             through.append(normals[-1] @ (network.images.position[i] - origin))

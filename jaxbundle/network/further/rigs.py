@@ -53,7 +53,7 @@ def mounting_misclosure(one, other, mounting_of_one, mounting_of_other, given):
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
 MOUNTED = Kind(
     "mountings", mounting_misclosure, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
-)  # fmt: skip
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,8 +73,13 @@ class Rigs(Further):
         for name in ("sigma_position", "sigma_angle"):
             if name in settings:
                 positive(f"[{SECTION}]: {name}", settings[name])
-        return cls(rig=table.ids("rig"), epoch=table.ids("epoch"), image=table.ids("image"),
-                   settings=dict(settings), source=table.source)  # fmt: skip
+        return cls(
+            rig=table.ids("rig"),
+            epoch=table.ids("epoch"),
+            image=table.ids("image"),
+            settings=dict(settings),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         return {"rig": self.rig, "epoch": self.epoch, "image": self.image}
@@ -123,15 +128,23 @@ class Rigs(Further):
             raise InputError(f"{self.source.name}: no epoch has images of two cameras")
         free = ~np.array(held)[:, None] * np.ones(6, bool)
         mounting = Table(
-            MOUNTING, PoseValue(np.array(places), np.array(turns)), Pose(), free, labels, AXES,
+            MOUNTING,
+            PoseValue(np.array(places), np.array(turns)),
+            Pose(),
+            free,
+            labels,
+            AXES,
             "mounting of",
-        )  # fmt: skip
+        )
         across = across_rays(network)
         length = self.settings.get("sigma_position", EXACT_SIGMA * across)
-        depth = np.median(np.linalg.norm(
-            network.points.position[network.observations.point]
-            - images.position[network.observations.image], axis=1,
-        ))  # fmt: skip
+        depth = np.median(
+            np.linalg.norm(
+                network.points.position[network.observations.point]
+                - images.position[network.observations.image],
+                axis=1,
+            )
+        )
         angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
@@ -159,10 +172,13 @@ class Rigs(Further):
 def _mounting(epochs, reference, camera, position, M):
     """Start values: those of the epoch with the median position."""
     found = [
-        (M[e[reference]] @ (position[e[camera]] - position[e[reference]]),
-         M[e[camera]] @ M[e[reference]].T)
-        for e in epochs if reference in e and camera in e
-    ]  # fmt: skip
+        (
+            M[e[reference]] @ (position[e[camera]] - position[e[reference]]),
+            M[e[camera]] @ M[e[reference]].T,
+        )
+        for e in epochs
+        if reference in e and camera in e
+    ]
     if camera == reference or not found:
         return np.zeros(3), np.eye(3)
     t = np.array([t for t, _ in found])

@@ -77,11 +77,14 @@ class RollingShutter(Further):
             raise InputError(f"[{SECTION}]: line_time is missing, seconds from a line to the next")
         sigma = [positive_sigma(table, name, required=False) for name in sigmas]
         return cls(
-            image=table.ids("image"), sigma=np.stack(sigma, 1), settings=dict(settings),
+            image=table.ids("image"),
+            sigma=np.stack(sigma, 1),
+            settings=dict(settings),
             velocity=np.nan_to_num(np.stack([table.numbers(name) for name in VELOCITY], 1)),
-            time=table.numbers("t"), source=table.source,
+            time=table.numbers("t"),
+            source=table.source,
             strip=table.ids("strip") if "strip" in table.values else ("all",) * len(table),
-        )  # fmt: skip
+        )
 
     def columns(self, radians: float) -> dict:
         columns = {"image": self.image}
@@ -99,8 +102,9 @@ class RollingShutter(Further):
         given, ids = self.settings["line_time"], [camera.id for camera in network.cameras]
         for id in given if isinstance(given, Mapping) else ():
             if id not in ids:
-                raise InputError(f"[{SECTION}]: line_time names no camera {id!r}"
-                                 f"{did_you_mean(id, ids)}")  # fmt: skip
+                raise InputError(
+                    f"[{SECTION}]: line_time names no camera {id!r}{did_you_mean(id, ids)}"
+                )
 
     def line_times(self, network) -> Float[np.ndarray, " cameras"]:
         """Seconds per line of every camera, 0 for a global shutter."""
@@ -137,13 +141,19 @@ class RollingShutter(Further):
         common = np.array([parameters.sigma.get(name, np.inf) for name in VELOCITY])
         sigma = np.where(np.isnan(sigma), common, sigma)
         free = parameters.mask(VELOCITY) & (times != 0)[images.camera][:, None]
-        moves = Table(VELOCITIES, velocity, Vector(6), free, images.id, VELOCITY,
-                      "velocity of image")  # fmt: skip
+        moves = Table(
+            VELOCITIES, velocity, Vector(6), free, images.id, VELOCITY, "velocity of image"
+        )
         known = parameters.mask(["line_time"]) & (times != 0)[:, None]
         read_out = Table(
-            READ_OUT, times[:, None], Vector(1), known, [camera.id for camera in network.cameras],
-            ("line_time",), "read-out of camera",
-        )  # fmt: skip
+            READ_OUT,
+            times[:, None],
+            Vector(1),
+            known,
+            [camera.id for camera in network.cameras],
+            ("line_time",),
+            "read-out of camera",
+        )
         priors = list(parameters.priors(read_out, ["line_time"]))
         weighted = np.flatnonzero((np.isfinite(sigma) & (free > 0)).any(1))
         if len(weighted):
@@ -151,7 +161,6 @@ class RollingShutter(Further):
             priors.append(PRIOR((weighted,), velocity[weighted], sigma=sigma))
         priors += self._from_neighbours(network, free)
         return Declared((moves, read_out), priors, ((VELOCITIES, _move_velocity),))
-
 
     def _from_neighbours(self, network, free):
         """Velocities between the preceding and following images, as observations."""
@@ -184,18 +193,27 @@ def between_neighbours(velocity, before, after, time):
 
 def _check_neighbours(given: Any, table: Columns) -> None:
     if not isinstance(given, Mapping) or set(given) - {"v", "w"}:
-        raise InputError(f"[{SECTION}]: neighbours is {show(given)}; the σ of velocities and "
-                         "turns are expected, { v = 0.5, w = 0.02 }")  # fmt: skip
+        raise InputError(
+            f"[{SECTION}]: neighbours is {show(given)}; the σ of velocities and "
+            "turns are expected, { v = 0.5, w = 0.02 }"
+        )
     for name, value in given.items():
         positive(f"[{SECTION}]: neighbours, σ of {name}", value)
     for row in np.flatnonzero(np.isnan(table.numbers("t")))[:1]:
         if given:
-            raise InputError(f"{table.source(row)}: t, the time of exposure, is missing, which "
-                             f"[{SECTION}] neighbours needs")  # fmt: skip
+            raise InputError(
+                f"{table.source(row)}: t, the time of exposure, is missing, which "
+                f"[{SECTION}] neighbours needs"
+            )
 
 
-NEIGHBOURS = Kind("velocities of neighbours", between_neighbours, (VELOCITIES, "image", "image"),
-                  VELOCITY, snooped="")  # fmt: skip
+NEIGHBOURS = Kind(
+    "velocities of neighbours",
+    between_neighbours,
+    (VELOCITIES, "image", "image"),
+    VELOCITY,
+    snooped="",
+)
 PRIOR = Kind("velocities", less, (VELOCITIES,), VELOCITY, snooped="")
 
 

@@ -54,14 +54,21 @@ class Ties(Further):
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Ties":
         table.check_names(("camera", "other", "parameter"), ("sigma",))
         return cls(
-            camera=table.ids("camera"), other=table.ids("other"),
-            parameter=table.ids("parameter"), sigma=sigma_or_exact(table), source=table.source,
-        )  # fmt: skip
+            camera=table.ids("camera"),
+            other=table.ids("other"),
+            parameter=table.ids("parameter"),
+            sigma=sigma_or_exact(table),
+            source=table.source,
+        )
 
     def columns(self, radians: float) -> dict:
         sigma = ["exact" if s == 0 else s for s in self.sigma.tolist()]
-        return {"camera": self.camera, "other": self.other, "parameter": self.parameter,
-                "sigma": sigma}  # fmt: skip
+        return {
+            "camera": self.camera,
+            "other": self.other,
+            "parameter": self.parameter,
+            "sigma": sigma,
+        }
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -100,31 +107,38 @@ class Ties(Further):
 
     def declare(self, network, origin) -> Declared:
         index = {camera.id: c for c, camera in enumerate(network.cameras)}
-        place = {int(c): (t, k) for t in camera_tables(network.cameras)
-                 for k, c in enumerate(t.cameras)}  # fmt: skip
+        place = {
+            int(c): (t, k) for t in camera_tables(network.cameras) for k, c in enumerate(t.cameras)
+        }
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * self._from_rays(network, index))
         sets: dict[tuple, list] = {}
         for row, (a, b, name) in enumerate(zip(self.camera, self.other, self.parameter)):
             (one, k), (other, m) = place[index[a]], place[index[b]]
             residual = SameParameter(one.parameters.index(name), other.parameters.index(name))
             sets.setdefault((one.name, other.name, name, residual), []).append((k, m, sigma[row]))
-        return Declared((), tuple(
-            _kind(one, other, name, residual)(
-                (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
-                np.zeros(len(rows)), sigma=np.array([r[2] for r in rows]),
-            )
-            for (one, other, name, residual), rows in sets.items()
-        ))  # fmt: skip
+        return Declared(
+            (),
+            tuple(
+                _kind(one, other, name, residual)(
+                    (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
+                    np.zeros(len(rows)),
+                    sigma=np.array([r[2] for r in rows]),
+                )
+                for (one, other, name, residual), rows in sets.items()
+            ),
+        )
 
     def _from_rays(self, network, index) -> Float[np.ndarray, " n"]:
         """σ of the parameters from the rays of their cameras, all else given; the smaller of the
         two."""
         used = {index[id] for id in (*self.camera, *self.other)}
         of = {c: parameter_sigmas(network, c) for c in used}
-        return np.array([
-            min(of[index[id]][name] for id in (a, b))
-            for a, b, name in zip(self.camera, self.other, self.parameter)
-        ])  # fmt: skip
+        return np.array(
+            [
+                min(of[index[id]][name] for id in (a, b))
+                for a, b, name in zip(self.camera, self.other, self.parameter)
+            ]
+        )
 
 
 def _kind(one: str, other: str, name: str, residual: SameParameter) -> Kind:

@@ -87,8 +87,9 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
     findings = also.conclude(adjustment).findings
     first = give_verdict(findings, warnings, also.overview, noted, *_whole(adjustment))
     drawings: dict[str, Any] = {
-        "network-data": describe_network(adjustment), "frames": describe_frames(adjustment)
-    }  # fmt: skip
+        "network-data": describe_network(adjustment),
+        "frames": describe_frames(adjustment),
+    }
     shown = [first, *also.sections, *sections.collect(adjustment)]
     tables = {**also.tables, **collect_tables(adjustment)}
     return Page(title, shown, origin, settings, tables, drawings)
@@ -99,7 +100,9 @@ def _whole(adjustment) -> list[str]:
     return [
         "<h3>Result</h3>\n",
         facts(row for row in summary(adjustment) if row[0] not in REPEATED_LINES),
-        "<h3>Variance factor</h3>\n", facts(head.variance_facts(adjustment)),
-        "<h3>Counts</h3>\n", grid(("", "", ""), head.count_rows(adjustment), "words"),
+        "<h3>Variance factor</h3>\n",
+        facts(head.variance_facts(adjustment)),
+        "<h3>Counts</h3>\n",
+        grid(("", "", ""), head.count_rows(adjustment), "words"),
         paragraph(A_POSTERIORI),
-    ]  # fmt: skip
+    ]

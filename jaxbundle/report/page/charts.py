@@ -39,20 +39,27 @@ class Scale(NamedTuple):
 
 
 def draw_curves(
-    curves: Sequence[Curve], x_label: str, y_label: str, logarithmic: str = "",
+    curves: Sequence[Curve],
+    x_label: str,
+    y_label: str,
+    logarithmic: str = "",
     mark: tuple[float, str] | None = None,
-) -> str:  # fmt: skip
+) -> str:
     """Curves over a common x; `logarithmic`: the axes, of x and y, whose values are log10 of what
     they say; `mark`: an x with a vertical line, and its name."""
-    reach = [np.concatenate([c.y - band, c.y + band]) for c in curves
-             for band in [np.nan_to_num(0 if c.sigma is None else c.sigma)]]  # fmt: skip
+    reach = [
+        np.concatenate([c.y - band, c.y + band])
+        for c in curves
+        for band in [np.nan_to_num(0 if c.sigma is None else c.sigma)]
+    ]
     xs, ys = np.concatenate([c.x for c in curves]), np.concatenate(reach)
     x, y = _scale(xs, LEFT, WIDE - RIGHT), _scale(ys, HIGH - BOTTOM, TOP, 0.05)
     parts = [_axes(x, y, x_label, y_label, logarithmic)]
     if mark is not None:
         at = float(x(mark[0]))
-        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
-                     f'y2="{HIGH - BOTTOM}"/>\n')  # fmt: skip
+        parts.append(
+            f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HIGH - BOTTOM}"/>\n'
+        )
     for curve in curves:
         if curve.sigma is not None:
             ends = np.concatenate([curve.y - curve.sigma, (curve.y + curve.sigma)[::-1]])
@@ -60,13 +67,12 @@ def draw_curves(
             parts.append(f'<polygon class="band {curve.kind}" points="{outline}"/>\n')
         line = _places(x, y, curve.x, curve.y)
         parts.append(f'<polyline class="{curve.kind}" points="{line}"/>\n')
-    return _svg(parts) + _legend([(c.kind, c.label) for c in curves],
-                                 None if mark is None else mark[1])  # fmt: skip
+    return _svg(parts) + _legend(
+        [(c.kind, c.label) for c in curves], None if mark is None else mark[1]
+    )
 
 
-def draw_plan(
-    lines: Sequence[Curve], x_label: str, y_label: str, down: bool = False
-) -> str:  # fmt: skip
+def draw_plan(lines: Sequence[Curve], x_label: str, y_label: str, down: bool = False) -> str:
     """Lines in a plane, both axes at one scale; `down`: y grows downwards. Lines of the same label
     have one sample."""
     xs, ys = (np.concatenate([getattr(line, name) for line in lines]) for name in ("x", "y"))
@@ -79,15 +85,20 @@ def draw_plan(
     x = Scale(low[0], low[0] + unit * room[0], LEFT, WIDE - RIGHT)
     y = Scale(low[1], low[1] + unit * room[1], top, bottom)
     parts = [_axes(x, y, x_label, y_label)]
-    parts += [f'<polyline class="{line.kind}" points="{_places(x, y, line.x, line.y)}"/>\n'
-              for line in lines]  # fmt: skip
+    parts += [
+        f'<polyline class="{line.kind}" points="{_places(x, y, line.x, line.y)}"/>\n'
+        for line in lines
+    ]
     return _svg(parts) + _legend([*dict.fromkeys((line.kind, line.label) for line in lines)])
 
 
 def draw_histogram(
-    edges: np.ndarray, counted: np.ndarray, x_label: str, things: str,
+    edges: np.ndarray,
+    counted: np.ndarray,
+    x_label: str,
+    things: str,
     expected: np.ndarray | None = None,
-) -> str:  # fmt: skip
+) -> str:
     """Counts by class as bars, with the expectation of a normal distribution as steps; an
     outer class whose edge is infinite is open, and drawn as wide as its neighbour."""
     ends = np.array(edges, float)
@@ -185,27 +196,34 @@ def _round_values(low: float, high: float, whole: bool = False) -> np.ndarray:
     return step * np.arange(first, np.floor(high / step + 1e-9) + 1)
 
 
-def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "",
-          whole: bool = False) -> str:  # fmt: skip
+def _axes(
+    x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "", whole: bool = False
+) -> str:
     """Axes with their ticks; `whole`: y counts."""
     parts = []
     across = _ticks(x, "x" in logarithmic)
     for at, name in zip(x(across.places), across.names):
-        parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
-                     f'y2="{HIGH - BOTTOM}"/>\n'
-                     f'<text class="tick" x="{at:.1f}" y="{HIGH - BOTTOM + 16}" '
-                     f'text-anchor="middle">{name}</text>\n')  # fmt: skip
+        parts.append(
+            f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
+            f'y2="{HIGH - BOTTOM}"/>\n'
+            f'<text class="tick" x="{at:.1f}" y="{HIGH - BOTTOM + 16}" '
+            f'text-anchor="middle">{name}</text>\n'
+        )
     up = _ticks(y, "y" in logarithmic, whole)
     for at, name in zip(y(up.places), up.names):
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
-                     f'y2="{at:.1f}"/>\n'
-                     f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" '
-                     f'text-anchor="end">{name}</text>\n')  # fmt: skip
+        parts.append(
+            f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
+            f'y2="{at:.1f}"/>\n'
+            f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" '
+            f'text-anchor="end">{name}</text>\n'
+        )
     middle = (TOP + HIGH - BOTTOM) / 2
-    parts.append(f'<text x="{(LEFT + WIDE - RIGHT) / 2}" y="{HIGH - 8}" text-anchor="middle">'
-                 f"{text(x_label + across.offset)}</text>\n"
-                 f'<text x="14" y="{middle}" text-anchor="middle" '
-                 f'transform="rotate(-90 14 {middle})">{text(y_label + up.offset)}</text>\n')
+    parts.append(
+        f'<text x="{(LEFT + WIDE - RIGHT) / 2}" y="{HIGH - 8}" text-anchor="middle">'
+        f"{text(x_label + across.offset)}</text>\n"
+        f'<text x="14" y="{middle}" text-anchor="middle" '
+        f'transform="rotate(-90 14 {middle})">{text(y_label + up.offset)}</text>\n'
+    )
     return "".join(parts)
 
 

@@ -31,9 +31,13 @@ class Column(NamedTuple):
 
 def estimates(values: np.ndarray, sigma: np.ndarray, label: str) -> Column:
     """A column of values of different kinds, each with the digits that its σ gives it."""
-    return Column(values, label, -WITHOUT_SIGMA, True, np.array(
-        [digits_of(value, s) for value, s in zip(values, sigma)], int
-    ))  # fmt: skip
+    return Column(
+        values,
+        label,
+        -WITHOUT_SIGMA,
+        True,
+        np.array([digits_of(value, s) for value, s in zip(values, sigma)], int),
+    )
 
 
 def encode_table(columns: Mapping[str, Column]) -> dict[str, Any]:

@@ -20,8 +20,14 @@ from jaxbundle.report.page.origin import UNKNOWN, Origin, software_versions, sta
 from jaxbundle.system.clock import in_words, now
 
 SCRIPTS = (
-    "data.js", "table.js", "canvas.js", "pointer.js", "network.js", "photograph.js", "start.js",
-)  # fmt: skip
+    "data.js",
+    "table.js",
+    "canvas.js",
+    "pointer.js",
+    "network.js",
+    "photograph.js",
+    "start.js",
+)
 STYLE = "page.css"
 NO_SCRIPT = "<noscript><p>The tables need JavaScript; --out has them as CSV files.</p></noscript>\n"
 NOTHING: Mapping[str, Any] = MappingProxyType({})

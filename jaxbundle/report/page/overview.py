@@ -15,8 +15,10 @@ def give_verdict(findings: Sequence[Finding], warnings: Sequence[str], *parts: s
     content = [
         paragraph(words, f"verdict {state.replace(' ', '-')}"),
         list_messages("Warnings", warnings),
-        "<h3>Tests</h3>\n", grid(("test", "", "what was found"), rows, "words"), *parts,
-    ]  # fmt: skip
+        "<h3>Tests</h3>\n",
+        grid(("test", "", "what was found"), rows, "words"),
+        *parts,
+    ]
     return Section("overview", "Verdict", "".join(content))
 
 
@@ -24,8 +26,11 @@ def explain_failure(
     rows: Iterable[tuple[str, str]], warnings: Sequence[str], *parts: str
 ) -> Section:
     """The verdict without a result, and the remedy."""
-    content = [paragraph(head.NO_RESULT, "verdict not-met"),
-               list_messages("Warnings", warnings), facts(rows)]
+    content = [
+        paragraph(head.NO_RESULT, "verdict not-met"),
+        list_messages("Warnings", warnings),
+        facts(rows),
+    ]
     return Section("overview", "Verdict", "".join([*content, *parts]))
 
 

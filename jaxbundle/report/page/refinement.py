@@ -40,11 +40,15 @@ def _describe(result, origin: Origin) -> Page:
         "points": Listing("Points", _points(result), "points.csv"),
         "checks": Listing("Check points, computed − given", _checks(result), "result.json"),
         "observations": Listing("Image points", _observations(used), "result.json"),
-        "removed": Listing("Removed as blunders", {
-            "observation": Column(_words(b.name for b in result.removed), "observation"),
-            "test": Column(numbers(b.test for b in result.removed), "|w|"),
-        }, "result.json"),
-    }  # fmt: skip
+        "removed": Listing(
+            "Removed as blunders",
+            {
+                "observation": Column(_words(b.name for b in result.removed), "observation"),
+                "test": Column(numbers(b.test for b in result.removed), "|w|"),
+            },
+            "result.json",
+        ),
+    }
     title = f"{', '.join(one.id for one in result.images)}: {KIND}"
     frames = {"frames": _frames(result)}
     return Page(title, sections, origin, tables=tables, drawings=frames)
@@ -72,20 +76,25 @@ def _whole(result, used) -> str:
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     frames = 0 if result.frames is None else len(result.frames.images)
     rows = [
-        ("Scanner images", len(result.images)), ("Photographs", frames),
+        ("Scanner images", len(result.images)),
+        ("Photographs", frames),
         ("Points", ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))),
         ("Image points", len(used)),
-        ("σ0", f"{result.sigma0:.4f}, redundancy {result.redundancy}, "
-         f"{count(result.inspection.steps, 'step')}"),
-    ]  # fmt: skip
+        (
+            "σ0",
+            f"{result.sigma0:.4f}, redundancy {result.redundancy}, "
+            f"{count(result.inspection.steps, 'step')}",
+        ),
+    ]
     return f"<h3>Result</h3>\n{facts(rows)}"
 
 
 def _unknowns(result) -> Section:
     """The changes of the unknowns with σ and prior, and their correlations."""
     rows, shows_matrix = [], 1 < len(result.names) <= MOST_CORRELATED
-    numbered = [f"{i}: {name}" if shows_matrix else str(name)
-                for i, name in enumerate(result.names, 1)]  # fmt: skip
+    numbered = [
+        f"{i}: {name}" if shows_matrix else str(name) for i, name in enumerate(result.names, 1)
+    ]
     for said, name, value, s, p in zip(
         numbered, result.names, result.estimate, result.inspection.sigma, result.prior_sigma
     ):
@@ -93,8 +102,10 @@ def _unknowns(result) -> Section:
         rows.append((said, *estimate(value * name.factor, s * name.factor), prior, name.unit))
     parts = [grid(("unknown", "change", "σ", "σ of prior", "unit"), rows)]
     if shows_matrix:
-        parts += ["<h3>Correlations in %</h3>\n",
-                  show_correlations(numbered, result.correlation, range(1, len(rows) + 1))]
+        parts += [
+            "<h3>Correlations in %</h3>\n",
+            show_correlations(numbered, result.correlation, range(1, len(rows) + 1)),
+        ]
     return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns")
 
 
@@ -115,11 +126,14 @@ def _images(result, used) -> Columns:
 
 def _points(result) -> Columns:
     rows = point_rows(result)
-    found = {"id": Column(_words(row["id"] for row in rows), "point"),
-             "role": Column(_words(row["role"] for row in rows), "role")}  # fmt: skip
+    found = {
+        "id": Column(_words(row["id"] for row in rows), "point"),
+        "role": Column(_words(row["role"] for row in rows), "role"),
+    }
     found |= {a: Column(numbers(row[a] for row in rows), f"{a} [m]", 3, True) for a in "XYZ"}
-    return found | {f"s{a}": Column(numbers(row[f"s{a}"] for row in rows), f"σ{a} [m]")
-                    for a in "XYZ"}  # fmt: skip
+    return found | {
+        f"s{a}": Column(numbers(row[f"s{a}"] for row in rows), f"σ{a} [m]") for a in "XYZ"
+    }
 
 
 def _checks(result) -> Columns:
@@ -140,19 +154,27 @@ def _observations(used) -> Columns:
     twice = lambda name: _words(row[name] for row in used for _ in range(2))
     return {
         "kind": Column(np.full(2 * len(used), "image", dtype=object)),
-        "image": Column(twice("image"), "image"), "point": Column(twice("point"), "point"),
+        "image": Column(twice("image"), "image"),
+        "point": Column(twice("point"), "point"),
         "axis": Column(_words(axis for row in used for axis in row["axes"]), "axis"),
-        "measured": Column(both("measured"), "measured", 3), "v": Column(both("v"), "v"),
-        "r": Column(both("r"), "r", 3), "tau": Column(both("w"), "w", 2),
-    }  # fmt: skip
+        "measured": Column(both("measured"), "measured", 3),
+        "v": Column(both("v"), "v"),
+        "r": Column(both("r"), "r", 3),
+        "tau": Column(both("w"), "w", 2),
+    }
 
 
 def _frames(result) -> dict[str, dict]:
     """By camera, and scanner image, what is drawn: pixels to the right, lines down."""
     frame = lambda low, high, known, down, unit: {
-        "low": low, "high": high, "known": known, "down": down, "scale": 1.0, "unit": unit,
+        "low": low,
+        "high": high,
+        "known": known,
+        "down": down,
+        "scale": 1.0,
+        "unit": unit,
         "centre": None,
-    }  # fmt: skip
+    }
     found = {
         f"scanner {one.id}": frame(
             [0.0, 0.0], [one.image.pixels - 1.0, one.image.lines - 1.0], True, True, "px"

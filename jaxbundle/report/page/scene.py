@@ -40,15 +40,20 @@ def describe_network(adjustment) -> dict:
         "size": size,
         "unit": clean(adjustment.network.object_unit),
         "factor": ellipsoids.factor,
-        "ellipsoids": {"points": ellipsoids.rows.tolist(),
-                       "images": thin_out(centres, np.nan_to_num(largest)).tolist()},
-        "drawn": " ".join([
-            f"error ellipsoids: 1σ a posteriori (probability {PROBABILITY[3]}), drawn",
-            ellipsoids.exaggeration, ellipsoids.selection,
-        ]).rstrip(),
+        "ellipsoids": {
+            "points": ellipsoids.rows.tolist(),
+            "images": thin_out(centres, np.nan_to_num(largest)).tolist(),
+        },
+        "drawn": " ".join(
+            [
+                f"error ellipsoids: 1σ a posteriori (probability {PROBABILITY[3]}), drawn",
+                ellipsoids.exaggeration,
+                ellipsoids.selection,
+            ]
+        ).rstrip(),
         "wide": bool(ellipsoids.factor * largest.max(initial=0.0) > MOST_OF_SIZE * size),
         "pyramids": encode_values(pyramids.ravel()),
-    }  # fmt: skip
+    }
 
 
 def describe_frames(adjustment) -> dict[str, dict]:
@@ -60,8 +65,12 @@ def describe_frames(adjustment) -> dict[str, dict]:
         scale, unit = micrometres(model.unit)
         centre = principal_point(adjustment, camera.id)
         found[camera.id] = {
-            "low": low.tolist(), "high": high.tolist(), "known": bool(known),
-            "down": model.axes == "down", "scale": scale, "unit": unit,
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "known": bool(known),
+            "down": model.axes == "down",
+            "scale": scale,
+            "unit": unit,
             "centre": centre.tolist() if np.isfinite(centre).all() else None,
-        }  # fmt: skip
+        }
     return found

@@ -35,14 +35,16 @@ def collect(adjustment) -> Iterator[Section]:
 def network() -> Section:
     """The placeholder of the rotatable network."""
     parts = [
-        paragraph("Parallel projection. Drag to rotate, with Shift to move, wheel to zoom; click a "
-                  "point or a station for its standard deviations, a station also for its rays.",
-                  "hint"),
+        paragraph(
+            "Parallel projection. Drag to rotate, with Shift to move, wheel to zoom; click a "
+            "point or a station for its standard deviations, a station also for its rays.",
+            "hint",
+        ),
         '<div class="tools" id="network-tools"></div>\n',
         '<canvas id="network-canvas" width="1200" height="800"></canvas>\n',
         '<p class="legend" id="network-legend"></p>\n',
         '<p id="network-said" aria-live="polite"></p>\n',
-    ]  # fmt: skip
+    ]
     return Section("network", "Network", "".join(parts), "Network")
 
 
@@ -51,11 +53,13 @@ def photographs(test: str = "τ") -> Section:
     parts = [
         '<div class="tools" id="photograph-tools"></div>\n',
         '<canvas id="photograph-canvas" width="1200" height="900"></canvas>\n',
-        paragraph("Residuals v = computed − observed, lines from the measured positions; thick if "
-                  f"|{test}| > 3. The area of a mark is the redundancy number r, mean of both "
-                  "coordinates; a cross means r < 0.1: hardly controlled."),
+        paragraph(
+            "Residuals v = computed − observed, lines from the measured positions; thick if "
+            f"|{test}| > 3. The area of a mark is the redundancy number r, mean of both "
+            "coordinates; a cross means r < 0.1: hardly controlled."
+        ),
         '<p id="photograph-said" aria-live="polite"></p>\n',
-    ]  # fmt: skip
+    ]
     title = "Photographs: residuals and redundancy"
     return Section("photographs", title, "".join(parts), "Photographs")
 
@@ -69,8 +73,10 @@ def cameras(adjustment) -> Iterator[Section]:
         parts = [items(equations(model)), _distortion(adjustment, camera)]
         parts.append(paragraph(validity(adjustment, camera)))
         if len(entry["free"]) > 1:
-            parts += ["<h3>Correlations in %</h3>\n",
-                      show_correlations(entry["free"], entry["correlations"])]
+            parts += [
+                "<h3>Correlations in %</h3>\n",
+                show_correlations(entry["free"], entry["correlations"]),
+            ]
         others = len(adjustment.cameras) - len(chosen)
         if others and number == len(chosen) - 1:
             parts.append(paragraph(f"{others} other cameras are in the table."))
@@ -84,16 +90,31 @@ def _distortion(adjustment, camera: str) -> str:
         return ""
     found = distortion_profile(adjustment, camera, reach=reach)
     scale, unit = micrometres(found.unit)
-    curves = [Curve("symmetric radial, band ±σ", found.radius, scale * found.radial,
-                    scale * found.radial_sigma)]  # fmt: skip
+    curves = [
+        Curve(
+            "symmetric radial, band ±σ",
+            found.radius,
+            scale * found.radial,
+            scale * found.radial_sigma,
+        )
+    ]
     if np.nan_to_num(found.decentring).any() or np.nan_to_num(found.decentring_sigma).any():
-        curves.append(Curve("decentring, band ±σ", found.radius, scale * found.decentring,
-                            scale * found.decentring_sigma, "second"))  # fmt: skip
+        curves.append(
+            Curve(
+                "decentring, band ±σ",
+                found.radius,
+                scale * found.decentring,
+                scale * found.decentring_sigma,
+                "second",
+            )
+        )
     mark = (measured, "farthest measurement") if measured < reach else None
     drawing = draw_curves(
-        curves, f"distance from the principal point [{found.unit}]",
-        f"measured − ideal [{unit}]", mark=mark,
-    )  # fmt: skip
+        curves,
+        f"distance from the principal point [{found.unit}]",
+        f"measured − ideal [{unit}]",
+        mark=mark,
+    )
     return figure(drawing, f"Distortion of camera {camera}, σ a posteriori")
 
 
@@ -109,9 +130,10 @@ def show_correlations(
     ]
     strong = [
         f"{names[i]} and {names[j]} {fixed(C[i, j], 1)} %"
-        for i in range(len(names)) for j in range(i)
+        for i in range(len(names))
+        for j in range(i)
         if abs(C[i, j]) > 90
-    ]  # fmt: skip
+    ]
     note = f"Over 90 %: {', '.join(strong)}." if strong else "None is over 90 %."
     return grid(("", *short), rows, "matrix") + paragraph(note)
 
@@ -119,10 +141,15 @@ def show_correlations(
 def residuals(adjustment) -> Section:
     """The histogram of the normalised residuals, and the variance components."""
     components = [
-        (name, c.observations, fixed(c.redundancy, 2), significant(c.vtpv, 5),
-         significant(c.sigma, 4))
+        (
+            name,
+            c.observations,
+            fixed(c.redundancy, 2),
+            significant(c.vtpv, 5),
+            significant(c.sigma, 4),
+        )
         for name, c in adjustment.variance_components.items()
-    ]  # fmt: skip
+    ]
     header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given")
     more = "<h3>Variance components</h3>\n" + grid(header, components)
     return show_residuals(adjustment.residuals["tau"], more=more)
@@ -146,12 +173,18 @@ def convergence(adjustment) -> Section:
     drawing = ""
     if there.sum() > 1 and vtpv[there].max() > (1 + LEAST_FALL) * vtpv[there].min():
         curve = Curve("vᵀPv", step[there], np.log10(vtpv[there]))
-        drawing = figure(draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
-                         f"{head.result_in_words(adjustment)}: {adjustment.termination}")
+        drawing = figure(
+            draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
+            f"{head.result_in_words(adjustment)}: {adjustment.termination}",
+        )
     rows = [
-        (i or "start", f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
-         f"{damping[i]:.1e}" if i else "", ("accepted" if accepted[i] else "rejected") if i else "")
+        (
+            i or "start",
+            f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
+            f"{damping[i]:.1e}" if i else "",
+            ("accepted" if accepted[i] else "rejected") if i else "",
+        )
         for i in step
-    ]  # fmt: skip
+    ]
     table = grid(("iteration", "vᵀPv", "λ (damping)", "step"), rows)
     return Section("convergence", "Convergence", drawing + table, "Convergence")

@@ -21,10 +21,15 @@ ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 def collect_tables(adjustment) -> dict[str, Listing]:
     """All tables by name."""
     total = len(adjustment.residuals["tau"])
-    most = "" if total <= MOST_ROWS else (
-        f"The {MOST_ROWS} with the largest |τ| of {total}, here and in the photographs; all are in "
-        "residuals.csv."
-    )  # fmt: skip
+    most = (
+        ""
+        if total <= MOST_ROWS
+        else (
+            f"The {MOST_ROWS} with the largest |τ| of {total}, here and in the photographs; "
+            "all are in "
+            "residuals.csv."
+        )
+    )
     return {
         "cameras": Listing("Cameras", cameras(adjustment), "cameras.csv"),
         "images": Listing("Images", images(adjustment), "images.csv"),
@@ -97,10 +102,16 @@ def far_points(adjustment) -> Columns:
     found = adjustment.table("far_points")
     network = adjustment.network
     labels = {
-        "id": "point", "uX": "uX", "uY": "uY", "uZ": "uZ", "su": f"σ [{network.angle_unit}]",
-        "distance": f"distance [{clean(network.object_unit)}]", "nearer": "from", "farther": "to",
+        "id": "point",
+        "uX": "uX",
+        "uY": "uY",
+        "uZ": "uZ",
+        "su": f"σ [{network.angle_unit}]",
+        "distance": f"distance [{clean(network.object_unit)}]",
+        "nearer": "from",
+        "farther": "to",
         "at_infinity": "at infinity",
-    }  # fmt: skip
+    }
     directions = ("uX", "uY", "uZ")
     return {
         name: Column(column, labels[name], 6 if name in directions else -3)
@@ -134,10 +145,20 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
     """The columns there are of a table of residuals."""
     chosen = choose_largest(found["tau"], MOST_ROWS)
     labels = {
-        "kind": "kind", "image": "image", "point": "point", "axis": "axis", "measured": "measured",
-        "v": "v", "sigma": "σ a priori", "r": "r", "w": "w", "tau": "τ", "mdb": "MDB (σ a priori)",
-        "external": "ext.", "weight": "weight",
-    }  # fmt: skip
+        "kind": "kind",
+        "image": "image",
+        "point": "point",
+        "axis": "axis",
+        "measured": "measured",
+        "v": "v",
+        "sigma": "σ a priori",
+        "r": "r",
+        "w": "w",
+        "tau": "τ",
+        "mdb": "MDB (σ a priori)",
+        "external": "ext.",
+        "weight": "weight",
+    }
     of_images = found["sigma"][found["kind"] == "image"]
     places = {"r": 3, "tau": 2, "w": 2, "measured": coordinate_decimals(sigma0 * of_images)}
     return {
