@@ -1,4 +1,4 @@
-# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-commands`,
+# `make demo`, `make test` (`make test-further`: the further cases of its dear tests, `make test-all`: both), `make test-commands`,
 # `make test-oldest`, `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
 # installed, else venv and pip) and install the package: `demo` with plots, the others with what the tests
 # need; `docs` also Sphinx, `bench` also what it compares with; `test-oldest` and `test-newest` have
@@ -19,7 +19,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all test-commands random-problems mutants bench docs install install-demo \
+.PHONY: demo test test-further test-all test-commands random-problems mutants bench docs install install-demo \
   install-docs clean \
   bench-gpu $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
@@ -60,7 +60,8 @@ $(VENV)/installed-demo: pyproject.toml
 	@touch $@
 
 test: CASES = -m 'not further'
-test test-all: install
+test-further: CASES = -m further -x
+test test-further test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/python -m ruff format --check --quiet jaxbundle
 	$(BIN)/basedpyright --pythonpath $(BIN)/python

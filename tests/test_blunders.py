@@ -76,6 +76,7 @@ def differences(found, clean):
     ]  # fmt: skip
 
 
+@pytest.mark.further
 def test_snooping_of_many_blunders(network, clean):
     spoilt, bad, size = with_blunders(network, 1)
     found = adjust(spoilt, snooping="pope")
@@ -210,7 +211,7 @@ def test_either_of_two_rays(network):
     assert result_dict(found, brief=True)["removed"][0]["name"] == removed.name
 
 
-@pytest.mark.parametrize("role", ["control", "tie"])
+@pytest.mark.parametrize("role", [pytest.param("control", marks=pytest.mark.further), "tie"])
 def test_points_without_good_rays_and_other_observations(network, role):
     """A height alone does not locate a point without rays; a distance to it keeps it."""
     rays, points = network.observations, network.points
@@ -271,6 +272,7 @@ def contradicted(network):
     return network.replace(observations=dataclasses.replace(rays, sigma=rays.sigma / 1.49))
 
 
+@pytest.mark.further
 def test_baardas_test_with_wrong_sigma_says_so(network):
     """The scale is that of all good points, not of those which fitted and so were left."""
     factor, significance = 3.0, 0.001

@@ -84,6 +84,7 @@ def run_twice(lines, environment) -> str:
     return first
 
 
+@pytest.mark.further
 def test_every_camera_model_can_be_kept(home, tmp_path):
     cameras = tmp_path / "cameras.toml"
     known = "fx = 600.0\nfy = 600.0\ncx = 320.0\ncy = 240.0\nimage_size = [640, 480]\n"
@@ -94,6 +95,7 @@ def test_every_camera_model_can_be_kept(home, tmp_path):
     assert all(f"model {model}" in said for model in MODELS)
 
 
+@pytest.mark.further
 def test_line_scanners_draw_random_errors(home):
     run_twice([
         f"pushbroom simulate {ROOT}/examples/line_scanner/flight.toml --out simulated --force",

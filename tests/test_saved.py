@@ -139,6 +139,7 @@ def test_the_datum_does_not_matter_after_a_similarity(epochs):
     assert back.t == pytest.approx(-first.t, rel=0.02, abs=0.02)  # in the scale of the other
 
 
+@pytest.mark.further
 def test_differences_vary_with_their_sigma(epochs):
     """Of independent measurements t has the variance of Student's t, F a mean of 1."""
     results = [jaxbundle.adjust(epochs(seed).replace(datum="inner")) for seed in range(10)]
@@ -170,6 +171,7 @@ def test_a_point_that_moved_is_found_and_told(epochs):
     assert f"X of point {name}" in str(found) and len(str(found).splitlines()) < 24
 
 
+@pytest.mark.further
 def test_shared_measurements_are_not_tested(network):
     a, b = jaxbundle.adjust(network), jaxbundle.adjust(network, robust="huber")
     found = jaxbundle.compare(a, b)

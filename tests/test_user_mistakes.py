@@ -191,7 +191,7 @@ def with_control_at(given, change):
     return given.replace(points=dataclasses.replace(points, position=position))
 
 
-@pytest.mark.parametrize("start", [True, False])
+@pytest.mark.parametrize("start", [True, pytest.param(False, marks=pytest.mark.further)])
 @pytest.mark.parametrize("change", [
     lambda X: X * [1, -1, 1], lambda X: X[:, [1, 0, 2]]
 ], ids=["Y in the other direction", "X and Y exchanged"])  # fmt: skip

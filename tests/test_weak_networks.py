@@ -69,6 +69,7 @@ def test_exchanged_control_points_among_others_are_a_warning():
     assert found.finding in found.network.warnings and found.finding in str(found)
 
 
+@pytest.mark.further
 def test_exchanged_control_points_are_named_where_nothing_else_can_be_had():
     result = jaxbundle.adjust(exchanged(network(RING, **CONTROL), "1", "5"))
     assert not result.converged

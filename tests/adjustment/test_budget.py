@@ -194,6 +194,7 @@ def test_the_mean_over_points_has_no_influence():
         jaxbundle.influence(held_network(), "points")
 
 
+@pytest.mark.further
 def test_the_command_writes_the_budget(command, tmp_path):
     project = "examples/convergent4/project4.toml"
     run = command("adjust", project, "--budget", "camera:cam:K3=1e-7", "--out", tmp_path / "out",

@@ -53,7 +53,7 @@ def assert_same_values(a, b, tolerance=SAME):
     np.testing.assert_allclose(a.camera, b.camera, atol=tolerance, rtol=tolerance)
 
 
-@pytest.mark.parametrize("name", [SHARED, "free"])
+@pytest.mark.parametrize("name", [pytest.param(SHARED, marks=pytest.mark.further), "free"])
 def test_the_minimum_is_one(name):
     problem, minimum = adjusted(name)
     assert int(minimum.termination) == SETTLED

@@ -46,6 +46,7 @@ def mounting(row):
     return row["further_unknowns"]["mounting"]["right of rig"]
 
 
+@pytest.mark.further
 def test_each_rig_has_its_status_and_is_that_of_calibrate(rigs, tmp_path):
     found = calibrate(rigs, snooping="pope")
     assert found.status.tolist() == ["converged"] * 4 + ["not solved"]

@@ -129,6 +129,7 @@ class InPixels:
         return self.lens.image_of(*pose) / [PITCH, -PITCH] + (np.array(self.size) - 1) / 2
 
 
+@pytest.mark.further
 def test_a_bent_board_is_estimated_with_a_camera_in_millimetres():
     views = simulated(InPixels("brown-projected"), points=bent(taken.BOARD), noise=0.02)
     trusting = calibrate(views, snooping=None)

@@ -11,6 +11,7 @@ from jaxbundle.calibration.result import Calibration
 EXACT = "The measurements fit exactly: σ of a projected point is 0."
 
 
+@pytest.mark.further
 @pytest.mark.parametrize("middle, corners, drawn", [
     ([0, 0, 0], [0, 0, 0], []),
     ([0, 0, 0], [np.nan, np.nan, np.nan], []),

@@ -77,7 +77,8 @@ TRUTH = {
 
 
 FURTHER = ("fov", "eucm", "division", "stereographic", "equidistant", "equisolid", "orthographic",
-           "kannala-brandt-tangential", "scaramuzza")  # fmt: skip
+           "kannala-brandt-tangential", "scaramuzza", "thin-prism-fisheye",
+           "double-sphere")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [

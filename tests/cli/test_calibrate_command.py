@@ -58,6 +58,7 @@ def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     assert text.strip() in told and "computed 20" in text.splitlines()[0]
 
 
+@pytest.mark.further
 def test_two_cameras_and_brief_json_alone(calibrate, folder, tmp_path, monkeypatch):
     monkeypatch.delattr(jaxbundle.calibration.quality, "cross_validation")
     code, told, error = calibrate(

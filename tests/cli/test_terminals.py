@@ -70,7 +70,7 @@ def run(*arguments, kind):
     return done.returncode, out, err
 
 
-@pytest.mark.parametrize("kind", ["cp1252", "C"])
+@pytest.mark.parametrize("kind", ["cp1252", pytest.param("C", marks=pytest.mark.further)])
 def test_report_iterations_and_files(kind, project, tmp_path):
     out = tmp_path / "out"
     options = ("--verbose", "--no-plots", "--out", out)
@@ -83,6 +83,7 @@ def test_report_iterations_and_files(kind, project, tmp_path):
     assert len(said.splitlines()) == pytest.approx(len(report.splitlines()), abs=3)
 
 
+@pytest.mark.further
 def test_json_on_standard_output_is_json(project):
     options = ("--json", "-", "--brief")
     status, said, _ = run("-m", "jaxbundle", "adjust", project, *options, kind="ascii")

@@ -263,6 +263,7 @@ def moved_start(adjustment, id, centre):
     return row, eqx.tree_at(lambda v: v.position, adjustment.values, jnp.asarray(position))
 
 
+@pytest.mark.further
 def test_a_moved_station_has_the_sigma_of_the_design(network, convergent4):
     """By `jaxbundle.precision`, and as an adjustment of measurements from there would have it."""
     id = convergent4.problem.network.images.id[1]
@@ -489,6 +490,7 @@ def test_the_flight_file_holds_what_was_chosen(scanner, tmp_path):
     assert scanner.export(PICTURE_FILE, given).content.startswith(b"\x89PNG")
 
 
+@pytest.mark.further
 def test_a_flight_has_an_orbit_and_a_straight_track(scanner, flight):
     """The other track begins at usual values; the given one is that of the file."""
     values = scanner.values({})

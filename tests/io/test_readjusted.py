@@ -89,6 +89,7 @@ def test_another_process_finds_the_same_result(georeferenced, tmp_path):
             assert other["sigma"] == pytest.approx(one["sigma"], rel=1e-5, abs=1e-12)
 
 
+@pytest.mark.further
 def test_removed_observations_stay_out(georeferenced, tmp_path):
     network = georeferenced.network
     (antennas, *others) = network.further

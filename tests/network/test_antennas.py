@@ -178,6 +178,7 @@ def test_free_shifts_leave_the_place_of_a_network_open(flight):
     assert known.counts.datum == 0
 
 
+@pytest.mark.further
 def test_a_lever_arm_that_never_turns_is_named(flight, result):
     """Positions of one image of each strip: the lever arm is a shift of the strip, exactly."""
     antennas, attitudes = measured(flight.truth)

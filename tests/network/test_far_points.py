@@ -266,6 +266,7 @@ def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
     )
 
 
+@pytest.mark.further
 def test_a_point_of_the_horizon_without_good_rays_is_excluded(horizon):
     """Two rays that contradict each other across their base: neither is used, nor their point."""
     network, _, result = horizon
@@ -286,6 +287,7 @@ def test_a_point_of_the_horizon_without_good_rays_is_excluded(horizon):
     )
 
 
+@pytest.mark.further
 def test_start_values_of_a_horizon_are_found(horizon):
     """From image coordinates and one distance alone; most of the rays do not intersect."""
     network, _, result = horizon

@@ -86,6 +86,7 @@ def result(simulated):
     return jaxbundle.adjust(conditioned(simulated.network, SIGMA, simulated.truth))
 
 
+@pytest.mark.further
 def test_counts_and_datum(result):
     """Figures and an angle move with the network; known shapes have a scale; a height difference
     shows a tilt: what is open are three shifts and two turns."""

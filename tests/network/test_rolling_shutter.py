@@ -146,6 +146,7 @@ def test_sigma_is_that_of_a_sample(flown, result):
     assert (np.abs(ratio - 1) < 5 / np.sqrt(2 * len(found["velocity"]))).all(), ratio
 
 
+@pytest.mark.further
 def test_a_still_camera_does_not_know_its_line_time(flown):
     """Velocities of 0 known to 1 mm/s, the line time free: only their product would show."""
     made, velocity = flown

@@ -33,6 +33,7 @@ def both():
     return tied, jaxbundle.adjust(tied.network), jaxbundle.adjust(network(()).network)
 
 
+@pytest.mark.further
 def test_one_unknown_less(both):
     truth, tied, apart = both
     assert tied.converged and apart.converged

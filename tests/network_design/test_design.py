@@ -173,6 +173,7 @@ def test_simulated_networks_confirm_the_design(page, designed):
     assert proof.predicted == pytest.approx(designed.after.aim, rel=1e-4)
 
 
+@pytest.mark.further
 def test_the_best_photographs_are_those_of_brute_force(page, designed, site):
     four = page["four"]
     pairs = make_pairs(designed.network, Aim(), site, SIGMA)
@@ -246,6 +247,7 @@ def test_what_cannot_be_designed_is_refused(network, site):
     refused(blind, "its field of view is not known")
 
 
+@pytest.mark.further
 def test_priors_in_tables_are_information_as_in_columns(network):
     """As in the folder of an adjusted network, whose priors have values of their own."""
     ids, camera = network.images.id[:3], network.cameras[0]

@@ -117,6 +117,7 @@ def test_control_seen_once_throughout(with_control):
     assert np.abs(off).max() < 0.05 * 1000
 
 
+@pytest.mark.further
 def test_a_strip_that_hangs_together_by_pairs():
     """With few points in three images resection stops, and a pair continues."""
     simulation = block(1, 11, 130, control=())
@@ -306,6 +307,7 @@ def test_a_case_needs_no_start_values():
     assert_same_answer(network, bare(network))
 
 
+@pytest.mark.further
 def test_control_in_the_corners_of_a_block():
     """No image sees enough control: pairs first, then the transformation to the control."""
     simulation = block()
@@ -316,6 +318,7 @@ def test_control_in_the_corners_of_a_block():
     assert_same_answer(simulation.network, bare(simulation.network))
 
 
+@pytest.mark.further
 def test_one_measurement_in_twenty_wrong(with_control):
     """Most blunders are left out with the start values, the rest by data snooping."""
     network = bare(with_blunders(with_control.network, 0.05, 20.0))

@@ -135,7 +135,7 @@ def support_data(older=False):
 PLACES = np.linspace(0, LINES - 1, 8), np.linspace(0, PIXELS - 1, 5)
 
 
-@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("older", [False, pytest.param(True, marks=pytest.mark.further)])
 def test_an_image_written_as_support_data_is_read_as_itself(tmp_path, older):
     # merged times of pointing and body would be too far apart for this restless satellite
     scanner = read_csm(write(tmp_path, support_data(older)), "usgscsm" if older else "lagrange")

@@ -46,6 +46,7 @@ def good(drone, handheld):
     return controlled(drone, drone.given(handheld))
 
 
+@pytest.mark.further
 def test_positions_are_observed_with_an_offset(drone, good):
     result, _, table = good
     assert isinstance(result, Adjustment) and result.network.datum == "control"
@@ -73,7 +74,8 @@ def test_the_ground_is_within_its_sigma(drone, good):
     assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["positions", "no positions"])
+@pytest.fixture(scope="module", params=[True, pytest.param(False, marks=pytest.mark.further)],
+                ids=["positions", "no positions"])  # fmt: skip
 def spoilt(drone, handheld, request):
     """With a wrong name, a bad point and a check point."""
     named, row = swapped(drone.named, "gcp04", "gcp00")
@@ -96,6 +98,7 @@ def test_a_wrong_name_and_a_bad_point_are_named(spoilt):
     assert np.linalg.norm(points["gcp06"].residual[:2] + [2.9, -2.6]) < 3 * SIGMA
 
 
+@pytest.mark.further
 def test_stated_sigma_is_not_refused(drone, handheld):
     named, _ = swapped(drone.named, "gcp04", "gcp00")
     X = handheld.copy()

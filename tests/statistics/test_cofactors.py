@@ -119,6 +119,7 @@ def assert_between(value, expected, standard_deviation, times=4.0):
     assert abs(value - expected) < times * standard_deviation, (value, expected)
 
 
+@pytest.mark.further
 @pytest.mark.slow
 def test_predicted_uncertainty_is_that_of_a_sample():
     """300 adjustments of a free self-calibrating network with fresh noise.

@@ -152,7 +152,7 @@ def satellite(tmp_path_factory):
     return folder, write_satellite(folder)
 
 
-@pytest.mark.parametrize("dense", [(), ("--dense",)])
+@pytest.mark.parametrize("dense", [(), pytest.param(("--dense",), marks=pytest.mark.further)])
 def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command, dense):
     folder, around = satellite
     out = tmp_path / "out"
@@ -192,6 +192,7 @@ def three(tmp_path_factory):
     return folder, around
 
 
+@pytest.mark.further
 def test_three_images_give_one_point_a_pixel_by_all_rays(three, tmp_path, command):
     """The rays of both pairs are intersected together: σ is smaller than that of a pair, and true.
     No base has more points than pixels."""

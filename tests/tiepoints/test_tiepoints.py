@@ -71,6 +71,7 @@ def test_principal_distance_and_distortion_from_pairs(cloud):
     assert found.misclosure < 0.5
 
 
+@pytest.mark.further
 def test_rotations_close_with_the_right_principal_distance_and_distortion():
     """A flat object, EXIF 20 % wrong, a fifth of the matches and one pair wrong: the coplanarity
     condition alone leaves the principal distance undecided."""
