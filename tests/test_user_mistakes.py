@@ -17,6 +17,7 @@ from jaxbundle.network.unit_mistakes import (
     name_unit_of_positions,
 )
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+from jaxbundle.orientation.network import without_placeholders
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -168,6 +169,25 @@ def test_a_sigma_that_is_only_poor_is_in_no_other_unit():
     rays = given.observations
     weights = dataclasses.replace(rays, sigma=np.ones_like(rays.sigma), sigma_origin="unit")
     assert name_sigma_unit(given.replace(observations=weights), 0.0015) == ""
+
+
+# --- start values that say nothing ----------------------------------------------------------
+
+
+def test_columns_of_zeros_are_no_start_values():
+    given = network()
+    assert without_placeholders(given) is given
+    images, points = given.images, given.points
+    zeros = given.replace(
+        images=dataclasses.replace(images, position=np.zeros((4, 3)), angles=np.zeros((4, 3))),
+        points=dataclasses.replace(points, position=np.zeros((25, 3))),
+    )
+    found = without_placeholders(zeros)
+    assert np.isnan(found.images.position).all() and np.isnan(found.points.position).all()
+    words = " ".join(found.warnings)
+    assert "all 25 tie points have one" in words and "all 4 images have one" in words
+    panorama = given.replace(images=dataclasses.replace(images, position=np.zeros((4, 3))))
+    assert without_placeholders(panorama) is panorama
 
 
 # --- names ----------------------------------------------------------------------------------

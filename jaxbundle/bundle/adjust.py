@@ -62,7 +62,7 @@ from jaxbundle.network.unit_mistakes import (
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
-from jaxbundle.orientation.network import Oriented, lacks_start_values
+from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
 from jaxbundle.statistics.inspection import Inspection
@@ -141,7 +141,7 @@ def adjust(
         snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
-    given = require_network(network)
+    given = without_placeholders(require_network(network))
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     mirror = partial(name_mirrored, given, try_again=partial(_try_mirrored, reduction, options))
     oriented = None
