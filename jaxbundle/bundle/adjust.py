@@ -197,9 +197,9 @@ def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
     known = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
     free = {id for id, free in zip(given.images.id, known) if free}
     found = {id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free}
-    return tuple(filter(None, (
-        name_unit_of_positions(given, found), name_other_side(given, found)
-    )))  # fmt: skip
+    return tuple(
+        filter(None, (name_unit_of_positions(given, found), name_other_side(given, found)))
+    )
 
 
 def _try_mirrored(reduction: str | None, options, network: Network) -> float | None:

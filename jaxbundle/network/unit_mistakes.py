@@ -67,9 +67,7 @@ def name_lengths(network: Network) -> list[str]:
     return [line for line in said if line]
 
 
-def name_unit_of_positions(
-    network: Network, images: dict[str, Float[np.ndarray, "3"]]
-) -> str:
+def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray, "3"]]) -> str:
     """Whether all adjusted projection centres (by id) are a thousand times their start values, or a
     thousandth, about the common origin: images in m beside control in mm, in words; else empty."""
     rows = [k for k, id in enumerate(network.images.id) if id in images]
