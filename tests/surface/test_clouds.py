@@ -20,7 +20,6 @@ from jaxbundle.surface.files import text_of
 from jaxbundle.surface.filtering import drop_isolated, drop_weak, thin
 from jaxbundle.surface.orthophoto import orthophoto
 from jaxbundle.surface.point_files import read_cloud, write_cloud
-from jaxbundle.surface.stereo import StereoPair, stereo_pair
 
 
 def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
@@ -195,16 +194,3 @@ def test_an_orthophoto_shows_what_the_image_sees_and_nothing_behind_a_roof():
     behind = (x < -1.35) & (x > -1.7) & (np.abs(y + 0.2) < 0.8)
     assert np.isnan(grey[behind]).mean() > 0.9 and np.isfinite(grey[x > 1]).mean() > 0.95
     assert np.nanmax(steep) <= 1 and steep[20, 110] > steep[20, 30]
-
-
-def test_stereo_formulas_are_those_of_the_normal_case():
-    pair = StereoPair(c=256.0, b=2.0, h=10.0)
-    assert pair.parallax == pytest.approx(51.2) and pair.base_to_height == pytest.approx(0.2)
-    p = pair.parallax + 3.0
-    assert 10 - pair.height(p) == pytest.approx(float(pair.height_difference(3.0)))
-    noise = np.random.default_rng(0).normal(0, 0.05, (2, 20_000))
-    drawn = pair.height(pair.parallax + noise[0] - noise[1])
-    assert drawn.std() == pytest.approx(pair.sigma_height(0.05), rel=0.02)
-    views, _ = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
-    made = stereo_pair(views[0], views[1], 0.0)
-    np.testing.assert_allclose([made.c, made.b, made.h], [256, 2, 10], rtol=1e-4)
