@@ -12,7 +12,7 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.surface.inputs import check_points, read_views, tie_points
 from jaxbundle.surface.orthophoto import ToViews
 from jaxbundle.surface.pairs import parse_partners
-from jaxbundle.surface.reconstruct import Surface, find_bounds, ground_bounds, reconstruct
+from jaxbundle.surface.reconstruct import SurfaceResult, find_bounds, ground_bounds, reconstruct
 from jaxbundle.surface.relative import align_all
 from jaxbundle.surface.scanner_inputs import from_map, read_ground_views, system_of, to_map
 from jaxbundle.surface.views import OrientedImage
@@ -22,7 +22,7 @@ class Found(NamedTuple):
     """The surface, its images, the transformation from cloud to image coordinates, and check
     points."""
 
-    surface: Surface
+    surface: SurfaceResult
     views: Sequence[OrientedImage]
     to_views: ToViews
     check: np.ndarray
@@ -68,7 +68,7 @@ def _partners(pairs: Sequence[str] | None, views):
     return parse_partners(pairs, [v.name for v in views]) if pairs else None
 
 
-def _with_messages(found: Surface, messages: Sequence[str]) -> Surface:
+def _with_messages(found: SurfaceResult, messages: Sequence[str]) -> SurfaceResult:
     everything = (*messages, *found.messages)
     for message in everything:
         typer.echo(f"jaxbundle: {message}", err=True)

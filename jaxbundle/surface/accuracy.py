@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from jaxbundle.surface.cloud import Cloud
 
 CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
-"""Bounds of σ in the object unit."""
-AROUND = 4.0
+"""Bounds of σ in the object unit: those of the source, so that reports can be compared."""
 AXES = ("X", "Y", "Z")
 
 
@@ -46,18 +45,21 @@ def accuracy_of(cloud: Cloud) -> dict[str, Any]:
 
 
 def at_check_points(
-    cloud: Cloud, check: Float[np.ndarray, "m 3"], radius: float | None = None, least: int = 6
+    cloud: Cloud, check: Float[np.ndarray, "m 3"], radius: float | None = None, min_points: int = 6
 ) -> dict[str, Any]:
     """RMS of heights at check points: Z of the plane through the points within `radius` in X and Y,
-    from `least` on; by default `AROUND` spacings of the cloud."""
+    by default four spacings of the cloud; check points with fewer than `min_points` are left out.
+
+    Six is twice the unknowns of a plane. Four spacings hold about 50 points of a grid: their noise
+    is averaged, and a usual surface is a plane within them."""
     tree = cKDTree(cloud.X[:, :2])
     if radius is None:
         some = cloud.X[:: max(1, len(cloud) // 10_000), :2]
-        radius = AROUND * float(np.median(tree.query(some, 2)[0][:, 1])) if len(cloud) > 1 else 0.0
+        radius = 4.0 * float(np.median(tree.query(some, 2)[0][:, 1])) if len(cloud) > 1 else 0.0
     misclosure = []
     for place in np.asarray(check, float):
         near = tree.query_ball_point(place[:2], radius)
-        if len(near) >= least:
+        if len(near) >= min_points:
             d = cloud.X[near] - place
             A = np.column_stack([np.ones(len(near)), d[:, :2]])
             misclosure.append(np.linalg.lstsq(A, d[:, 2], rcond=None)[0][0])

@@ -6,14 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
-
-FEWEST_POINTS = 5
-"""Minimum tie points of an image for its depths."""
-DEPTH_MARGIN = 0.35
-"""Margin of the depths beyond those of the tie points, relative to their range."""
-NEAREST_ANGLE, FARTHEST_ANGLE = 1.2, 0.003
-"""Default angles of intersection of two images, radians."""
+from jaxbundle.surface.views import FrameView, OrientedImage, is_inside, line_of_sight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,25 +32,33 @@ class Bounds:
 def bounds_from_points(
     view: OrientedImage, X: Float[np.ndarray, "n 3"]
 ) -> tuple[float, float] | None:
-    """Bounds of q of the points in an image with a margin; None if they are too few."""
+    """Bounds of q of the points in an image with a margin; None for fewer than five points."""
     X = X[is_inside(view, view.project(X))]
-    if len(X) < FEWEST_POINTS:
+    if len(X) < 5:
         return None
+    # Without the extremes, which may be wrong points. The margin is wide, a third of the range and
+    # more, since a few tie points miss the highest and lowest parts of a surface; q stays positive.
+    # Larger: more time and more false matches; smaller: parts of the surface are lost.
     low, high = np.percentile(view.parameter(X), [1, 99])
-    room = DEPTH_MARGIN * (high - low) + 0.05 * abs(high)
-    return max(low - room, 0.2 * low if low > 0 else -np.inf), high + room
+    margin = 0.35 * (high - low) + 0.05 * abs(high)
+    return max(low - margin, 0.2 * low if low > 0 else -np.inf), high + margin
 
 
-def bounds_from_geometry(view, others: Sequence) -> tuple[float, float] | None:
+def bounds_from_geometry(
+    view: FrameView, others: Sequence[FrameView]
+) -> tuple[float, float] | None:
     """Bounds of q of photographs for usual angles of intersection, around the point where most
     of their optical axes are nearest to each other; None for images at one position."""
     bases = [np.linalg.norm(o.X0 - view.X0) for o in others]
     base = float(np.median(bases)) if bases else 0.0
     if not base > 0:
         return None
-    near, far = base / np.tan(NEAREST_ANGLE), base / np.tan(FARTHEST_ANGLE)
-    meetings = [s for o in others if (s := _axes_meet(view, o)) is not None]
+    # Angles of intersection of 1.2 and 0.003 radians: nearer surfaces are not alike in both images,
+    # and of farther ones the parallax is a few pixels. A wide range costs only time.
+    near, far = base / np.tan(1.2), base / np.tan(0.003)
+    meetings = [s for o in others if (s := _distance_to_axis(view, o)) is not None]
     if meetings:
+        # cameras that look at one thing: a quarter to four times its distance
         s = float(np.median(meetings))
         near, far = max(near, s / 4), min(far, s * 4)
         if near >= far:
@@ -65,18 +66,21 @@ def bounds_from_geometry(view, others: Sequence) -> tuple[float, float] | None:
     return 1 / far, 1 / near
 
 
-def angle_at(views: Sequence[OrientedImage], X: Float[np.ndarray, "n 3"]) -> np.ndarray:
+def angle_at(
+    views: Sequence[OrientedImage], X: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
     """Angles between the lines of sight of two images at points, radians."""
     d, f = (line_of_sight(view.derivative(X)) for view in views)
     sine = np.linalg.norm(np.cross(d, f), axis=1)
     return np.arctan2(sine, np.abs(np.sum(d * f, 1)))
 
 
-def _axes_meet(view, other) -> float | None:
+def _distance_to_axis(view: FrameView, other: FrameView) -> float | None:
     """Distance along the optical axis to the point nearest to another axis; None if behind or
     parallel."""
     a, b, t = -view.M[2], -other.M[2], other.X0 - view.X0
     sine2 = 1 - (a @ b) ** 2
+    # axes within 3° are parallel: where they meet depends on errors of the orientation
     if sine2 < np.sin(np.radians(3)) ** 2:
         return None
     s = (t @ a - (a @ b) * (t @ b)) / sine2

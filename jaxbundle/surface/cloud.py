@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
@@ -26,7 +26,7 @@ class Cloud:
     colour: UInt8[np.ndarray, "n 3"] | None = None
     system: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n = len(self.X)
         shapes = {"X": (n, 3), "covariance": (n, 3, 3), "rays": (n,), "image": (n,), "uv": (n, 2)}
         for name, shape in shapes.items():
@@ -44,12 +44,18 @@ class Cloud:
         with np.errstate(invalid="ignore"):
             return np.sqrt(np.einsum("nii->ni", self.covariance))
 
-    def take(self, rows) -> "Cloud":
-        """Some of the points (a mask or indices)."""
+    def take(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"] | slice) -> "Cloud":
+        """Some of the points."""
         fields = ("X", "covariance", "rays", "image", "uv")
         some = {name: getattr(self, name)[rows] for name in fields}
         colour = None if self.colour is None else self.colour[rows]
         return dataclasses.replace(self, **some, colour=colour)
+
+
+def empty_cloud(image: str) -> Cloud:
+    """No points of a base image."""
+    X, number = np.zeros((0, 3)), np.zeros(0, int)
+    return Cloud(X, np.zeros((0, 3, 3)), number, number, np.zeros((0, 2)), (image,))
 
 
 def merge(clouds: Sequence[Cloud]) -> Cloud:

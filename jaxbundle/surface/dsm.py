@@ -9,9 +9,10 @@ are low (Hirschmüller 2008).
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from jaxbundle.arguments import positive
@@ -19,18 +20,34 @@ from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surface.cloud import Cloud
+from jaxbundle.surface.scatter import NORMAL_SIGMA_BY_MAD
 
-MOST_CELLS = 2e9
-ROBUST = 3.0
-"""Robust standard deviations from the median beyond which a height is left out."""
-LEAST_SPREAD = 0.3
-"""Minimum spread relative to the cell size."""
-SLOPE = 0.3
-"""σ of a filled cell per cell of distance, relative to the cell size."""
-STEP = 1.0
-"""Scatter of the heights around a gap, relative to the cell size, above which they are of two
-surfaces."""
+if TYPE_CHECKING:
+    import xarray
+
 NO_DATA = -9999.0
+"""The value of cells without height in files: the one most programs for height models expect."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DsmSettings:
+    """How the cells of a model are averaged and filled."""
+
+    max_deviation: float = 3.0
+    """Heights farther from the median of their cell are left out; robust σ. The usual limit: 0.3 %
+    of normal errors are lost."""
+    min_spread: float = 0.3
+    """Least σ for `max_deviation`, in cell sizes: on a slope of 45° the heights of a cell have a
+    standard deviation of 1/√12 of its size, and are all good."""
+    slope: float = 0.3
+    """σ of a filled cell, in cell sizes for each cell of distance: the slope of the surface that is
+    not known in a gap, 17°. To be larger for steep terrain; no measurement stands behind it."""
+    wall: float = 1.0
+    """Scatter of the heights around a gap, in cell sizes, above which they are of two surfaces:
+    larger, walls less than twice as high are filled by means; smaller, steep slopes are filled from
+    below."""
+    max_cells: float = 2e9
+    """A larger grid is refused: the three grids of so many cells take 48 GB."""
 
 
 @print_in_one_screen
@@ -51,7 +68,7 @@ class Dsm:
         """Row and column, whole numbers at the centres of cells, of points."""
         return (self.y - X[:, 1]) / self.size - 0.5, (X[:, 0] - self.x) / self.size - 0.5
 
-    def to_xarray(self):
+    def to_xarray(self) -> "xarray.Dataset":
         """Height, σ and number of points over x and y (centres of cells), as an `xarray.Dataset`
         (extra `grids`)."""
         rows, columns = self.height.shape
@@ -78,7 +95,9 @@ class Dsm:
         )
 
 
-def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
+def make_dsm(
+    cloud: Cloud, size: float, fill: int = 2, settings: DsmSettings = DsmSettings()
+) -> Dsm:
     """The model with square cells of `size`, their edges at multiples of it; gaps of up to `fill`
     cells from the next height are filled.
 
@@ -90,10 +109,11 @@ def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
     column, row = np.floor(cloud.X[:, 0] / size), np.floor(-cloud.X[:, 1] / size)
     left, top = column.min(), row.min()
     columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
-    if rows * columns > MOST_CELLS:
+    if rows * columns > settings.max_cells:
         raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a larger size")
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
-    height, sigma, count = _means(cell, cloud.X[:, 2], cloud.sigma[:, 2], size, rows * columns)
+    Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
+    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, settings)
     shape = rows, columns
     found = Dsm(
         height.reshape(shape),
@@ -104,7 +124,7 @@ def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
         size,
         cloud.system,
     )
-    return _fill(found, fill) if fill else found
+    return _fill(found, fill, settings) if fill else found
 
 
 def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
@@ -126,7 +146,14 @@ def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) 
                 raster.describe([name])
 
 
-def _means(cell, Z, sigma, size, number):
+def _average_cells(
+    cell: Int[np.ndarray, " n"],
+    Z: Float[np.ndarray, " n"],
+    sigma: Float[np.ndarray, " n"],
+    size: float,
+    number: int,
+    settings: DsmSettings,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted means by cell, their σ and numbers of points."""
     order = np.lexsort((Z, cell))
     cell, Z, sigma = cell[order], Z[order], sigma[order]
@@ -135,10 +162,12 @@ def _means(cell, Z, sigma, size, number):
     middle = _sorted_medians(Z, first, count)
     away = np.abs(Z - middle[group])
     again = np.lexsort((away, group))
-    spread = 1.4826 * _sorted_medians(away[again], first, count)
-    keep = away <= ROBUST * np.maximum(spread, LEAST_SPREAD * size)[group]
+    spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
+    least = settings.min_spread * size
+    keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
     weight = np.where(np.isfinite(sigma) & (sigma > 0), 1 / sigma**2, np.nan)
     known = np.isfinite(weight)
+    # a point without σ counts as one of the median σ
     weight = np.where(known, weight, np.nanmedian(weight) if known.any() else 1.0) * keep
     total = np.bincount(group, weight)
     mean = np.bincount(group, weight * Z) / total
@@ -149,22 +178,27 @@ def _means(cell, Z, sigma, size, number):
     out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if known.any() else np.nan
     numbers = np.zeros(number, int)
     numbers[cells] = n
-    return *out, numbers
+    return out[0], out[1], numbers
 
 
-def _sorted_medians(values, first, count):
+def _sorted_medians(
+    values: Float[np.ndarray, " n"],
+    first: Int[np.ndarray, " groups"],
+    count: Int[np.ndarray, " groups"],
+) -> Float[np.ndarray, " groups"]:
     """Medians of sorted, consecutive groups."""
     low, high = first + (count - 1) // 2, first + count // 2
     return (values[low] + values[high]) / 2
 
 
-def _fill(dsm: Dsm, reach: int) -> Dsm:
+def _fill(dsm: Dsm, reach: int, settings: DsmSettings) -> Dsm:
     """Gaps near heights filled by the mean of those around, weighted by distance."""
     known = np.isfinite(dsm.height)
     if known.all():
         return dsm
     distance = np.asarray(ndimage.distance_transform_edt(~known))
     k = np.arange(-2 * reach, 2 * reach + 1)
+    # inverse squares of distances; a cell itself, at distance 0, has no height where this is used
     kernel = 1 / np.maximum(np.hypot(k[:, None], k), 0.5) ** 2
     weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
     weight = weigh(1.0 * known)
@@ -173,16 +207,22 @@ def _fill(dsm: Dsm, reach: int) -> Dsm:
     around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
     gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     safe = np.where(weight > 0, weight, 1.0)
+    # heights above their mean: squares of large heights would lose the digits of their scatter
     level = np.nanmean(dsm.height)
     mean, square = weigh(dsm.height - level) / safe, weigh((dsm.height - level) ** 2) / safe
     height = np.where(gap, level + mean, dsm.height)
-    at_wall = gap & (square - mean**2 > (STEP * dsm.size) ** 2)
-    height[at_wall] = _lower_means(dsm.height, kernel, at_wall, height[at_wall])
-    sigma = np.hypot(weigh(dsm.sigma) / safe, SLOPE * dsm.size * distance)
+    at_wall = gap & (square - mean**2 > (settings.wall * dsm.size) ** 2)
+    height[at_wall] = _mean_lower_heights(dsm.height, kernel, at_wall, height[at_wall])
+    sigma = np.hypot(weigh(dsm.sigma) / safe, settings.slope * dsm.size * distance)
     return dataclasses.replace(dsm, height=height, sigma=np.where(gap, sigma, dsm.sigma))
 
 
-def _lower_means(height, kernel, at, bound):
+def _mean_lower_heights(
+    height: Float[np.ndarray, "rows columns"],
+    kernel: Float[np.ndarray, "w w"],
+    at: Bool[np.ndarray, "rows columns"],
+    bound: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " k"]:
     """The weighted means of the heights around some cells that are not above a bound each."""
     reach = len(kernel) // 2
     wide = np.pad(height, reach, constant_values=np.nan)

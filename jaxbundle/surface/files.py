@@ -13,23 +13,25 @@ from jaxtyping import Float
 from jaxbundle.io.text.csv_tables import read_csv, write_text
 from jaxbundle.surface.accuracy import accuracy_of, at_check_points
 from jaxbundle.surface.cloud import Cloud
-from jaxbundle.surface.reconstruct import Surface
+from jaxbundle.surface.reconstruct import SurfaceResult
 
 COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
 REQUIRED_COLUMNS = COLUMNS[:3]
-POINTS_AT_ONCE = 1 << 16
 
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
     """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
     names = np.array([*map(_quote, cloud.images), ""], dtype=object)
-    starts = range(0, len(cloud), POINTS_AT_ONCE)
-    lines = (_lines(cloud, names, slice(k, k + POINTS_AT_ONCE)) for k in starts)
+    # 65 536 lines at once, about 8 MB of text, whatever the size of the cloud
+    together = 1 << 16
+    starts = range(0, len(cloud), together)
+    lines = (_format_rows(cloud, names, slice(k, k + together)) for k in starts)
     write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
 
 
-def _lines(cloud, names, part):
+def _format_rows(cloud: Cloud, names: np.ndarray, part: slice) -> str:
     """Some points as lines of text: much faster than the csv library."""
+    # repr is the shortest text that reads back as the same number; σ need no more than 8 digits
     exact = lambda a: ("" if x != x else repr(x) for x in a.tolist())
     short = lambda a: ("" if x != x else f"{x:.8g}" for x in a.tolist())
     C = cloud.covariance[part]
@@ -43,7 +45,7 @@ def _lines(cloud, names, part):
     return "".join(",".join(row) + "\n" for row in zip(*columns))
 
 
-def _quote(name):
+def _quote(name: str) -> str:
     """A name in the form of csv."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow([name])
@@ -74,7 +76,9 @@ def read_cloud_csv(path: str | Path) -> Cloud:
 
 
 def report_of(
-    surface: Surface, warnings: Sequence[str] = (), check: Float[np.ndarray, "n 3"] | None = None
+    surface: SurfaceResult,
+    warnings: Sequence[str] = (),
+    check: Float[np.ndarray, "n 3"] | None = None,
 ) -> dict[str, Any]:
     """Counts and accuracy, for JSON; RMS at check points, if there are any."""
     cloud = surface.cloud

@@ -7,15 +7,13 @@ the statistical filter: Rusu et al. (2008), Towards 3D point cloud based object 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.choices import CUBE_POINTS
 from jaxbundle.errors import InputError
 from jaxbundle.surface.cloud import Cloud
-
-NEIGHBOURS = 8
+from jaxbundle.surface.scatter import robust_sigma
 
 
 def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Cloud:
@@ -48,15 +46,19 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
         total = np.bincount(group, weight)
         mean = lambda a: np.bincount(group, weight * a) / total
         X = np.stack([mean(a) for a in cloud.X.T], 1)
-        own = count / total
-        C = found.covariance * (own / filled[best])[:, None, None]
+        # not 1/total: the errors of neighbours are not independent (see above)
+        harmonic = count / total
+        C = found.covariance * (harmonic / filled[best])[:, None, None]
         found = dataclasses.replace(found, X=X, covariance=C if known else found.covariance)
     return found.take(count >= least)
 
 
-def drop_isolated(cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0) -> Cloud:
+def drop_isolated(cloud: Cloud, neighbours: int = 8, limit: float = 3.0) -> Cloud:
     """Without the points whose mean distance to their nearest `neighbours` is more than the median
     of all by `limit` robust standard deviations.
+
+    Eight neighbours are those around a point of a grid: fewer keep pairs of wrong points, more of
+    them drop points of narrow surfaces.
 
     **Raises:** `InputError`."""
     neighbours, limit = integer("neighbours", neighbours), positive("limit", limit)
@@ -65,8 +67,9 @@ def drop_isolated(cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0
     distance, _ = cKDTree(cloud.X).query(cloud.X, neighbours + 1)
     mean = distance[:, 1:].mean(1)
     middle = np.median(mean)
-    spread = 1.4826 * np.median(np.abs(mean - middle))
-    return cloud.take(mean <= middle + limit * max(float(spread), 0.1 * float(middle)))
+    # at least a tenth of the median distance: the distances of a regular grid have no spread
+    spread = max(robust_sigma(mean), 0.1 * float(middle))
+    return cloud.take(mean <= middle + limit * spread)
 
 
 def drop_weak(
@@ -85,8 +88,3 @@ def drop_weak(
     if least_rays is not None:
         keep &= cloud.rays >= integer("least number of rays", least_rays)
     return cloud.take(keep)
-
-
-def inside(cloud: Cloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Cloud:
-    """The points of a box."""
-    return cloud.take(((cloud.X >= low) & (cloud.X <= high)).all(1))

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.formats import read_oriented
@@ -47,11 +48,11 @@ def read_views(
     files = find_photographs(network.images.id, Path(folder))
     greys = [read_photograph(file) for file in files]
     colours = [partial(read_photograph, file, colour=True) for file in files]
-    views = frame_views(network, greys, colours, _joint(Path(path), network))
+    views = frame_views(network, greys, colours, _read_joint_covariance(Path(path), network))
     return views, network, tuple(messages)
 
 
-def _joint(path: Path, network: Network) -> OrientationCovariance | None:
+def _read_joint_covariance(path: Path, network: Network) -> OrientationCovariance | None:
     """The covariance of the orientations beside a project, if an adjustment has written it."""
     folder = path if path.is_dir() else path.parent
     # a folder of results contains the folder of its project
@@ -98,7 +99,7 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
     return found
 
 
-def _foremost(files):
+def _foremost(files: Sequence[Path]) -> list[Path]:
     """Among files of one name the images, and of these those in the nearest folder."""
     files = [p for p in files if p.suffix.lower() in SUFFIXES] or files
     near = min((len(p.parts) for p in files), default=0)
@@ -111,7 +112,7 @@ def tie_points(network: Network) -> np.ndarray:
     return X[np.isfinite(X).all(1)]
 
 
-def check_points(network: Network) -> np.ndarray:
+def check_points(network: Network) -> Float[np.ndarray, "n 3"]:
     """Known coordinates [n, 3] of the check and control points of a network."""
     X = network.points.position
     return X[np.isfinite(X).all(1) & network.points.has_role("check", "control", "fixed")]

@@ -9,17 +9,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.surface.dsm import Dsm
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
-
-MARCH = 64
-"""Number of points along a line of sight compared with the surface."""
-CLEARANCE = 1.0
-"""Cells by which the surface must rise above the line of sight to hide."""
 
 ToViews = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 
@@ -86,7 +81,9 @@ def write_orthophoto(values: Float[np.ndarray, "rows columns"], dsm: Dsm, path: 
         raster.write(stored[None])
 
 
-def _are_hidden(dsm, X, d):
+def _are_hidden(
+    dsm: Dsm, X: Float[np.ndarray, "n 3"], d: Float[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " n"]:
     """Whether the surface rises above the lines of sight, towards their image."""
     top = np.nanmax(dsm.height)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,10 +93,13 @@ def _are_hidden(dsm, X, d):
     height = np.where(np.isfinite(dsm.height), dsm.height, -np.inf)
     rows, columns = height.shape
     hidden = np.zeros(len(X), bool)
-    for share in np.linspace(0, 1, MARCH + 1)[1:]:
+    # 64 points of the line of sight up to the height of the highest cell: a hidden cell is missed
+    # only beside something narrower than 1/64 of that length
+    for share in np.linspace(0, 1, 64 + 1)[1:]:
         there = X + (share * reach)[:, None] * d
         row, column = (np.rint(a).astype(int) for a in dsm.place(there))
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         Z = height[np.where(inside, row, 0), np.where(inside, column, 0)]
-        hidden |= inside & (Z > there[:, 2] + CLEARANCE * dsm.size)
+        # higher by a whole cell: a slope of 45° does not hide itself by the steps of its cells
+        hidden |= inside & (Z > there[:, 2] + dsm.size)
     return hidden

@@ -9,12 +9,6 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.surface.bounds import Bounds, angle_at
 from jaxbundle.surface.views import OrientedImage, is_inside
 
-GRID_POINTS = 9
-"""Points per side of the base image for testing the overlap."""
-LEAST_OVERLAP = 0.1
-NARROWEST, BEST, WIDEST = np.radians([1.0, 14.0, 60.0])
-"""Angles between lines of sight: minimum, best, and maximum for similar windows."""
-
 
 def choose_partners(
     views: Sequence[OrientedImage], bounds: Sequence[Bounds], most: int = 3
@@ -31,18 +25,25 @@ def choose_partners(
 
 def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     """Overlap times a weight of the angle of intersection, 0 to 1; 0: no pair."""
-    u, v = (np.linspace(0.05, 0.95, GRID_POINTS) * (n - 1) for n in view.size)
+    # The weight grows up to 14°, a ratio of base and height of 1/4, and falls to 0 at 60°, where
+    # windows are no longer alike; below 1° depths are hardly determined. Only these limits exclude
+    # pairs: the weight gives their order.
+    narrowest, best_angle, widest = np.radians([1.0, 14.0, 60.0])
+    # 9 × 9 points of the base image at three depths between the bounds
+    u, v = (np.linspace(0.05, 0.95, 9) * (n - 1) for n in view.size)
     uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
     q = bounds(uv)
     best = 0.0
     for share in (0.25, 0.5, 0.75):
         X = view.points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
         seen = is_inside(other, other.project(X))
-        if seen.mean() < LEAST_OVERLAP:
+        # a tenth of the image is a pair not worth its time
+        if seen.mean() < 0.1:
             continue
         angle = float(np.median(angle_at((view, other), X[seen])))
-        if NARROWEST <= angle <= WIDEST:
-            worth = min(angle / BEST, 1.0) * min(1.0, (WIDEST - angle) / (WIDEST - 2 * BEST))
+        if narrowest <= angle <= widest:
+            wide = (widest - angle) / (widest - 2 * best_angle)
+            worth = min(angle / best_angle, 1.0) * min(1.0, wide)
             best = max(best, float(seen.mean()) * worth)
     return best
 

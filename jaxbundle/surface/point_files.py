@@ -7,9 +7,13 @@ entities on the layer POINTS.
 
 import io
 import struct
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
@@ -17,6 +21,9 @@ from jaxbundle.io.text.csv_tables import write_bytes, write_text
 from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.files import read_cloud_csv, write_cloud_csv
+
+if TYPE_CHECKING:
+    import laspy
 
 SIGMAS = ("sX", "sY", "sZ")
 VERTEX = np.dtype([
@@ -29,9 +36,7 @@ PLY_READ = {"double": "<f8", "float64": "<f8", "float": "<f4", "float32": "<f4",
             "uint": "<u4", "uint32": "<u4", "short": "<i2", "int16": "<i2", "ushort": "<u2",
             "uint16": "<u2"}  # fmt: skip
 LAS_HEAD = 375
-"""Bytes of the header of LAS 1.4; shorter in earlier versions."""
-LEAST_SCALE = 1e-9
-MOST_DXF = 5_000_000
+"""Bytes of the header of LAS 1.4 (specification R15, table 3); shorter in earlier versions."""
 
 
 def write_cloud(cloud: Cloud, path: str | Path) -> None:
@@ -76,7 +81,7 @@ def read_cloud(path: str | Path) -> Cloud:
     return cloud
 
 
-def _write_ply(cloud, path):
+def _write_ply(cloud: Cloud, path: Path) -> None:
     rows = np.zeros(len(cloud), VERTEX)
     for k, axis in enumerate("xyz"):
         rows[axis] = cloud.X[:, k]
@@ -91,7 +96,7 @@ def _write_ply(cloud, path):
     write_bytes(path, ["\n".join([*head, "end_header\n"]).encode(), rows.tobytes()])
 
 
-def _read_ply(path):
+def _read_ply(path: Path) -> Cloud:
     content = path.read_bytes()
     head, mark, body = content.partition(b"end_header\n")
     lines = head.decode("ascii", "replace").splitlines()
@@ -116,12 +121,12 @@ def _read_ply(path):
             kinds = [(n, t.replace("<", order)) for n, t in fields]
             rows = np.frombuffer(body, np.dtype(kinds), number)
             column = lambda name: rows[name]
-        return _of_columns(column, names, number)
+        return _cloud_of_columns(column, names, number)
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _ply_head(path, lines):
+def _ply_head(path: Path, lines: Sequence[str]) -> tuple[str, int, list[tuple[str, str]]]:
     """The format, the number of vertices, and names and types of their fields."""
     form, number, fields, current = "", 0, [], ""
     for place, line in enumerate(lines, 1):
@@ -141,7 +146,7 @@ def _ply_head(path, lines):
     return form, number, fields
 
 
-def _of_columns(column, names, n):
+def _cloud_of_columns(column: Callable[[str], np.ndarray], names: Sequence[str], n: int) -> Cloud:
     X = np.stack([column(axis).astype(float) for axis in "xyz"], 1)
     sigma = np.stack(
         [column(s).astype(float) if s in names else np.full(n, np.nan) for s in SIGMAS], 1
@@ -156,7 +161,13 @@ def _of_columns(column, names, n):
     return _plain_cloud(X, sigma, rays, colour)
 
 
-def _plain_cloud(X, sigma, rays, colour, system=None):
+def _plain_cloud(
+    X: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n 3"],
+    rays: Int[np.ndarray, " n"],
+    colour: UInt8[np.ndarray, "n 3"] | None,
+    system: str | None = None,
+) -> Cloud:
     n = len(X)
     covariance = np.zeros((n, 3, 3))
     covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
@@ -165,7 +176,7 @@ def _plain_cloud(X, sigma, rays, colour, system=None):
     )
 
 
-def _laspy():
+def _laspy() -> ModuleType:
     try:
         import laspy
     except ImportError:
@@ -173,7 +184,7 @@ def _laspy():
     return laspy
 
 
-def _write_las(cloud, path):
+def _write_las(cloud: Cloud, path: Path) -> None:
     laspy = _laspy()
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         raise InputError("LAZ needs lazrs: pip install 'jaxbundle[files]'")
@@ -181,8 +192,9 @@ def _write_las(cloud, path):
     span = np.ptp(cloud.X, axis=0).max() if len(cloud) else 1.0
     s = cloud.sigma[np.isfinite(cloud.sigma)]
     fine = 1e-3 * float(np.median(s)) if len(s) else 1e-4
-    # 2³¹ steps hold the extent
-    scale = max(10.0 ** np.floor(np.log10(max(fine, LEAST_SCALE))), span / 2**30)
+    # coordinates are whole numbers of 32 bits: 2³¹ steps hold the extent; a power of ten above 1e-9
+    # otherwise, so that decimal coordinates stay what they are
+    scale = max(10.0 ** np.floor(np.log10(max(fine, 1e-9))), span / 2**30)
     header.scales = np.full(3, scale)
     header.offsets = np.floor(cloud.X.min(0)) if len(cloud) else np.zeros(3)
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in SIGMAS])
@@ -194,6 +206,7 @@ def _write_las(cloud, path):
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.X.T
     if cloud.colour is not None:
+        # LAS has colours of 16 bits: 255 becomes 65535
         las.red, las.green, las.blue = (257 * c.astype(np.uint16) for c in cloud.colour.T)
     for k, name in enumerate(SIGMAS):
         las[name] = cloud.sigma[:, k].astype(np.float32)
@@ -202,7 +215,7 @@ def _write_las(cloud, path):
         las.write(file, do_compress=path.suffix.lower() == ".laz")
 
 
-def _read_las(path):
+def _read_las(path: Path) -> Cloud:
     laspy = _laspy()
     _check_las_counts(path)
     try:
@@ -212,20 +225,23 @@ def _read_las(path):
         raise InputError(f"{path}: damaged, or not LAS as expected: {why}") from None
 
 
-def _check_las_counts(path):
+def _check_las_counts(path: Path) -> None:
     """Refuse counts in a header that the file has no room for: laspy would read records for hours,
     lazrs allocate for all chunks and abort the process (LAS 1.4 R15, table 3; LAZ 1.4)."""
     size = path.stat().st_size
     with path.open("rb") as file:
+        # offsets of the fields: 25 minor version, 96 first point, 100 records, 104 point format
+        # (bit 7: compressed), 235 and 243 first and number of the extended records
         head = file.read(LAS_HEAD)
-        at = lambda form, offset: (
+        unpack = lambda form, offset: (
             struct.unpack_from(form, head, offset)[0] if len(head) >= offset + 8 else 0
         )
-        begin = at("<I", 96)
-        room = {"records": (54 * at("<I", 100), size)}
-        if at("<B", 25) >= 4 and at("<I", 243):
-            room["extended records"] = 60 * at("<I", 243), size - at("<Q", 235)
-        if at("<B", 104) & 128:  # compressed: points begin with the offset of the chunk table
+        begin = unpack("<I", 96)
+        # a variable length record has 54 bytes at least, an extended one 60
+        room = {"records": (54 * unpack("<I", 100), size)}
+        if unpack("<B", 25) >= 4 and unpack("<I", 243):
+            room["extended records"] = 60 * unpack("<I", 243), size - unpack("<Q", 235)
+        if unpack("<B", 104) & 128:  # compressed: points begin with the offset of the chunk table
             file.seek(begin)
             (table,) = struct.unpack("<q", file.read(8).rjust(8, b"\0"))
             if table == -1:  # written at the end, by a program that could not go back
@@ -238,7 +254,7 @@ def _check_las_counts(path):
             raise InputError(f"{path}: damaged: its header counts more {what} than it has room for")
 
 
-def _las_cloud(las):
+def _las_cloud(las: "laspy.LasData") -> Cloud:
     names = {*las.point_format.dimension_names}
     n = len(las.points)
     X = np.stack([np.asarray(a, float) for a in (las.x, las.y, las.z)], 1)
@@ -255,12 +271,13 @@ def _las_cloud(las):
     return _plain_cloud(X, sigma, rays, colour, system)
 
 
-def _write_dxf(cloud, path):
+def _write_dxf(cloud: Cloud, path: Path) -> None:
     try:
         import ezdxf.filemanagement
     except ImportError:
         raise InputError("DXF needs ezdxf: pip install 'jaxbundle[files]'") from None
-    if len(cloud) > MOST_DXF:
+    # the drawing of 5 million points takes some GB of memory, and no CAD program reads it
+    if len(cloud) > 5_000_000:
         raise InputError(f"{path}: {len(cloud)} points are too many for a drawing; thin the cloud")
     drawing = ezdxf.filemanagement.new("R2010")
     drawing.layers.add("POINTS", color=7)

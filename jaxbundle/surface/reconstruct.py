@@ -5,38 +5,50 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.surface.bounds import Bounds, bounds_from_geometry, bounds_from_points
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
+from jaxbundle.surface.dense import DenseSettings
 from jaxbundle.surface.dense_cloud import dense_cloud
 from jaxbundle.surface.dense_ground import dense_ground_cloud
 from jaxbundle.surface.ground import RpcView
-from jaxbundle.surface.guide import MOST_NODES, Guide, coarsest_level, make_guide
-from jaxbundle.surface.interest import interest_points
-from jaxbundle.surface.matching import Matches, Settings, match_points
+from jaxbundle.surface.guide import (
+    Guide,
+    GuideSettings,
+    ImagePyramids,
+    coarsest_level,
+    make_guide,
+)
+from jaxbundle.surface.interest import interest_points, sample_percentiles, to_eight_bits
+from jaxbundle.surface.matching import MatchingSettings, match_points
 from jaxbundle.surface.orientation import is_uncertain
 from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
-from jaxbundle.surface.views import FrameView, OrientedImage
+from jaxbundle.surface.views import FrameView, OrientedImage, Places
 from jaxbundle.types import Progress
-
-MOST_PYRAMIDS = 6
-"""Maximum pyramids in memory."""
-POINTS = 40_000
-"""Points of a base image by default."""
-DENSE_NODES = 25_000
-"""Maximum nodes of the guides of dense matching, which only give the range of depths."""
-MOST_POINTS = 16_000_000
-"""Maximum points of a dense cloud by default; they take 2.5 GB."""
-SAMPLED_PIXELS = 1 << 20
-"""Number of pixels sampled for the darkest and the brightest."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Surface:
+class SurfaceSettings:
+    """The stages of a surface."""
+
+    guide: GuideSettings = GuideSettings()
+    matching: MatchingSettings = MatchingSettings()
+    dense: DenseSettings = DenseSettings()
+    points: int = 40_000
+    """Points of a base image by default. Time and memory grow with it; σ of the points does not
+    depend on it."""
+    max_pyramids: int = 6
+    """Maximum pyramids in memory, each of a third of the pixels of its image more, in 4 bytes:
+    those of a base image with its three partners, and two that the next may share. With fewer,
+    pyramids are made again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceResult:
     """A cloud, statistics of the points of each base image, and messages; `orientation`: whether
     the σ of the orientations are included in those of the points."""
 
@@ -59,17 +71,18 @@ def find_bounds(
     for view in views:
         others = [o for o in views if o is not view]
         # a view between the heights is not bounded by them
-        among = heights is not None and low <= view.X0[2] <= high
-        q = bounds_from_points(view, tie) if len(tie) and (heights is None or among) else None
+        between = heights is not None and low <= view.X0[2] <= high
+        q = bounds_from_points(view, tie) if len(tie) and (heights is None or between) else None
         if q is None:
             wide = bounds_from_geometry(view, others)
             if wide is None:
                 raise InputError(
                     f"{view.name}: all images are at one position: a surface needs a base"
                 )
-            # given heights are searched at any distance
-            q = wide if heights is None or among else (1e-2 * wide[0], 1e2 * wide[1])
-            if heights is None or among:
+            # given heights are searched at any distance: q of the geometry says only the order
+            bounded = heights is not None and not between
+            q = (1e-2 * wide[0], 1e2 * wide[1]) if bounded else wide
+            if not bounded:
                 guessed.append((view.name, q))
         found.append(Bounds(view, q, low, high))
     if guessed:
@@ -104,17 +117,23 @@ def ground_bounds(
 class _Pyramids:
     """Pyramids of the images, the last few kept in memory."""
 
-    def __init__(self, views, levels):
-        self.views, self.levels, self.kept = views, levels, {}
+    def __init__(self, views: Sequence[OrientedImage], levels: int, number: int) -> None:
+        self.views, self.levels, self.number = views, levels, number
+        self.cache: dict[int, Pyramid] = {}
 
-    def __getitem__(self, k) -> Pyramid:
-        if k in self.kept:
-            self.kept[k] = self.kept.pop(k)
-        else:
-            while len(self.kept) >= MOST_PYRAMIDS:
-                self.kept.pop(next(iter(self.kept)))
-            self.kept[k] = make_pyramid(self.views[k].grey, self.levels)
-        return self.kept[k]
+    def __getitem__(self, k: int) -> Pyramid:
+        # a dictionary keeps the order of insertion: the first is the one not used for longest
+        pyramid = self.cache.pop(k, None)
+        if pyramid is None:
+            while len(self.cache) >= self.number:
+                self.cache.pop(next(iter(self.cache)))
+            pyramid = make_pyramid(self.views[k].grey, self.levels)
+        self.cache[k] = pyramid
+        return pyramid
+
+    def select(self, base: int, others: Sequence[int]) -> ImagePyramids:
+        """Those of a base image and others."""
+        return self[base], [self[k] for k in others]
 
 
 def reconstruct(
@@ -125,9 +144,9 @@ def reconstruct(
     points: str = "grid",
     step: int | None = None,
     dense: bool = False,
-    settings: Settings | None = None,
+    settings: SurfaceSettings = SurfaceSettings(),
     progress: Progress | None = None,
-) -> Surface:
+) -> SurfaceResult:
     """The cloud of all base images.
 
     **Arguments:** `partners`: indices of the matching partners of each base, by default selected;
@@ -143,46 +162,32 @@ def reconstruct(
             "orientation and its units, --zmin and --zmax"
         )
     tell = progress or (lambda *_: None)
-    levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
-    pyramids = _Pyramids(views, levels)
-    guides = _guides(views, bounds, partners, pyramids, tell, dense)
-    clouds, told, messages = [], [], []
-    every = step or _dense_step(views[i] for i in partners)
-    if dense and not step and every > 1:
-        messages.append(
-            f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"
-        )
+    levels = max(_level(views, bounds, i, others, settings.guide) for i, others in partners.items())
+    pyramids = _Pyramids(views, levels, settings.max_pyramids)
+    guides = _make_guides(views, bounds, partners, pyramids, tell, dense, settings)
+    # pixels between the points of a dense cloud, so that those of all base images fit into memory
+    pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
+    every = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
+    thinned = f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"
+    messages = [thinned] if dense and not step and every > 1 else []
+    clouds, told = [], []
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
-        row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others]}
-        if i not in guides:
-            row |= {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
-        elif dense:
-            cloud, counts, left_out = _dense(views, i, others, guides[i], bounds[i], every)
-            clouds.append(cloud)
-            row |= counts
-            messages += [
-                f"{views[i].name} with {name}: cannot be rectified, left out" for name in left_out
-            ]
-        else:
-            uv = interest_points(views[i].grey, points, step or _step(views[i]))
-            found = match_points(
-                views[i],
-                [views[j] for j in others],
-                (pyramids[i], [pyramids[j] for j in others]),
-                guides[i],
-                uv,
-                [guides.get(j) for j in others],
-                settings or Settings(),
+        base, used = views[i], [views[j] for j in others]
+        counts = {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
+        if i in guides and dense:
+            cloud, counts, more = _match_every_pixel(
+                base, used, guides[i], bounds[i], every, settings.dense
             )
-            clouds.append(_cloud(views[i], found))
-            row |= {
-                "points": len(uv),
-                "matched": len(found.X),
-                "variance_factor": found.factor,
-                "rejected": found.rejected,
-            }
-        told.append(row)
+            clouds.append(cloud)
+            messages += more
+        elif i in guides:
+            group, others_guides = pyramids.select(i, others), [guides.get(j) for j in others]
+            cloud, counts = _match_interest_points(
+                base, used, group, guides[i], others_guides, points, step, settings
+            )
+            clouds.append(cloud)
+        told.append({"image": base.name, "with": [view.name for view in used], **counts})
     tell("matching", len(partners), len(partners))
     if not any(len(c) for c in clouds):
         raise NotSolvedError(
@@ -190,17 +195,58 @@ def reconstruct(
             "orientation or the bounds of the heights are wrong"
         )
     uncertain = any(is_uncertain(views[j]) for i, others in partners.items() for j in (i, *others))
-    return Surface(merge(clouds), tuple(told), tuple(messages), uncertain)
+    return SurfaceResult(merge(clouds), tuple(told), tuple(messages), uncertain)
 
 
-def _dense(views, i, others, guide, bounds, step):
-    """The cloud of most pixels of an image, its counts, images that cannot be rectified with it."""
-    base = views[i]
-    partners = [views[j] for j in others]
+def _match_interest_points(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    pyramids: ImagePyramids,
+    guide: Guide,
+    guides: Sequence[Guide | None],
+    points: str,
+    step: int | None,
+    settings: SurfaceSettings,
+) -> tuple[Cloud, dict[str, Any]]:
+    """The cloud of some pixels of an image, and its counts."""
+    columns, rows = base.size
+    spacing = step or max(2, int(np.ceil(np.sqrt(columns * rows / settings.points))))
+    uv = interest_points(base.grey, points, spacing)
+    found = match_points(
+        base, others, pyramids, guide, uv, guides, settings.guide, settings.matching
+    )
+    n = len(found.X)
+    cloud = Cloud(
+        found.X,
+        found.covariance,
+        found.rays,
+        np.zeros(n, int),
+        found.uv,
+        (base.name,),
+        _colour(base, found.uv),
+    )
+    return cloud, {
+        "points": len(uv),
+        "matched": n,
+        "variance_factor": found.factor,
+        "rejected": found.rejected,
+    }
+
+
+def _match_every_pixel(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    guide: Guide,
+    bounds: Bounds,
+    step: int,
+    settings: DenseSettings,
+) -> tuple[Cloud, dict[str, Any], list[str]]:
+    """The cloud of most pixels of an image, its counts, messages on images left out."""
     if isinstance(base, FrameView):
-        cloud, used, left_out = dense_cloud(base, partners, guide, bounds, step)
+        photographs = [view for view in others if isinstance(view, FrameView)]
+        cloud, used, left_out = dense_cloud(base, photographs, guide, bounds, step, settings)
     else:
-        cloud, used, left_out = dense_ground_cloud(base, partners, guide, bounds, step)
+        cloud, used, left_out = dense_ground_cloud(base, others, guide, bounds, step, settings)
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)
@@ -216,11 +262,19 @@ def _dense(views, i, others, guide, bounds, step):
             "variance_factor": factor,
             "rejected": {reason: number - len(cloud)},
         },
-        left_out,
+        [f"{base.name} with {name}: cannot be rectified, left out" for name in left_out],
     )
 
 
-def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
+def _make_guides(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    partners: Mapping[int, Sequence[int]],
+    pyramids: _Pyramids,
+    tell: Progress,
+    dense: bool,
+    settings: SurfaceSettings,
+) -> dict[int, Guide]:
     """Guides of every base and its partners; dense matching needs only those of the
     bases, coarser ones."""
     with_whom = {i: list(others) for i, others in partners.items()}
@@ -228,15 +282,17 @@ def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
         for j in others:
             if j not in partners and not dense:
                 with_whom.setdefault(j, []).append(i)
+    nodes = settings.dense.max_guide_nodes if dense else settings.guide.max_nodes
+    guide_settings = dataclasses.replace(settings.guide, max_nodes=nodes)
     guides = {}
     for done, (i, others) in enumerate(with_whom.items()):
         tell("depths", done, len(with_whom))
         guide = make_guide(
             views[i],
             [views[j] for j in others],
-            (pyramids[i], [pyramids[j] for j in others]),
+            pyramids.select(i, others),
             bounds[i],
-            DENSE_NODES if dense else MOST_NODES,
+            guide_settings,
         )
         if guide is not None:
             guides[i] = guide
@@ -244,51 +300,32 @@ def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
     return guides
 
 
-def _level(views, bounds, i, others):
+def _level(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    i: int,
+    others: Sequence[int],
+    settings: GuideSettings,
+) -> int:
     """The coarsest level required for a base image."""
+    # 5 × 5 lines of sight: lengths of segments change slowly over an image
     u, v = (np.linspace(0.1, 0.9, 5) * (n - 1) for n in views[i].size)
     uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-    q = bounds(uv)
+    q = bounds[i](uv)
     lengths = [
         segments(views[i], views[j], uv, visible_range(views[i], views[j], uv, q)).length
         for j in others
     ]
     seen = np.concatenate(lengths)
     seen = seen[np.isfinite(seen)]
-    return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0)
+    return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0, settings)
 
 
-def _dense_step(bases):
-    """Pixels between points, so that those of all base images fit into memory."""
-    pixels = sum(view.size[0] * view.size[1] for view in bases)
-    return max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
-
-
-def _step(view):
-    columns, rows = view.size
-    return max(2, int(np.ceil(np.sqrt(columns * rows / POINTS))))
-
-
-def _cloud(view, found: Matches) -> Cloud:
-    n = len(found.X)
-    return Cloud(
-        found.X,
-        found.covariance,
-        found.rays,
-        np.zeros(n, int),
-        found.uv,
-        (view.name,),
-        _colour(view, found.uv),
-    )
-
-
-def _colour(view, uv):
+def _colour(view: OrientedImage, uv: Places) -> UInt8[np.ndarray, "n 3"]:
     place = np.rint(uv).astype(int)
     if isinstance(view, FrameView) and view.colours is not None:
         return view.colours()[place[:, 1], place[:, 0]]
     grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
     if grey.dtype != np.uint8:
-        every = max(1, view.grey.size // SAMPLED_PIXELS)
-        low, high = np.percentile(view.grey.ravel()[::every], [0.5, 99.5])
-        grey = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+        grey = to_eight_bits(grey, sample_percentiles(view.grey, 0.5, 99.5))
     return np.repeat(grey[:, None], 3, axis=1)

@@ -7,65 +7,87 @@ hundred corners the best correlation along segments is searched at several dista
 then least squares matching gives the rest.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surface.bounds import Bounds
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
-from jaxbundle.surface.guide import search
+from jaxbundle.surface.ground import GroundView
+from jaxbundle.surface.guide import GuideSettings, ImagePyramids, search
 from jaxbundle.surface.interest import interest_points
-from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, visible_range, windows
-
-POINTS = 400
-SEARCH_WIDTH = 16
-"""Pixels searched across the epipolar lines."""
-HALF_WINDOW = 6
-LEVELS = 2
-SMALLEST_REPORTED = 0.1
-"""Minimum shift that is reported, pixels."""
-FEWEST_MATCHES = 12
-"""Minimum matches for the rest."""
-SMALLEST_CORRELATION = 0.6
-LIKELY_CORRELATION = 0.75
-"""Minimum ρ of a match."""
+from jaxbundle.surface.subpixel_matching import refine
+from jaxbundle.surface.views import Places
 
 
-def align(base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds) -> float | None:
+@dataclasses.dataclass(frozen=True)
+class AlignmentSettings:
+    """The search for the error across the epipolar lines; pixels of the full images."""
+
+    points: int = 400
+    """Corners that are compared: the median of 400 matches of 0.3 pixel has a σ of 0.02 pixel."""
+    search_width: int = 16
+    """Largest error that is found, pixels on each side. Coefficients of satellite images have
+    errors of up to some ten pixels. The time grows with it."""
+    half_window: int = 6
+    """Half the side of the windows of least squares matching, pixels."""
+    levels: int = 2
+    """Levels of the pyramids: at the coarsest, shifts of 4 pixels are tried."""
+    min_reported: float = 0.1
+    """Minimum shift that is reported, pixels: less does not matter for matching."""
+    min_matches: int = 12
+    """Minimum matches for an error; one third may be wrong, and the median is still good."""
+    likely_correlation: float = 0.75
+    """ρ above which a corner counts for a shift. Higher than `min_correlation`: by chance, the best
+    of many positions has a high ρ, too."""
+    min_correlation: float = 0.6
+    """Minimum ρ of a match for the rest, as for points of the surface."""
+
+
+def align(
+    base: GroundView,
+    other: GroundView,
+    pyramids: tuple[Pyramid, Pyramid],
+    bounds: Bounds,
+    settings: AlignmentSettings = AlignmentSettings(),
+) -> float | None:
     """Shift the projections of the other image; returns the shift in pixels, None if too few points
     match."""
     grey = base.grey
-    spread = max(8, int(np.sqrt(grey.size / POINTS)))
+    spread = max(8, int(np.sqrt(grey.size / settings.points)))
     uv = interest_points(grey, "corners", spread)
-    q = visible_range(base, other, uv, bounds(uv), margin=2 * HALF_WINDOW)
+    q = visible_range(base, other, uv, bounds(uv), margin=2 * settings.half_window)
     seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
-    chosen = np.flatnonzero(seen)[:: max(1, -(-int(seen.sum()) // POINTS))]
+    chosen = np.flatnonzero(seen)[:: max(1, -(-int(seen.sum()) // settings.points))]
     uv, q = uv[chosen], q[chosen]
-    if len(uv) < FEWEST_MATCHES:
+    if len(uv) < settings.min_matches:
         return None
     shape = windows(base, other, base.points(uv, q.mean(1)))
-    along = np.median(shape.other_along[shape.usable], axis=0)
+    along = np.median(shape.other_axis[shape.usable], axis=0)
     across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    both, guide_settings = (pyramids[0], [pyramids[1]]), GuideSettings()
     first = np.array(other.shift, float)
     levels = len(pyramids[0].levels) - 1
     best, step = 0.0, 2.0**levels
-    tries = np.arange(-SEARCH_WIDTH, SEARCH_WIDTH + 1, step)
+    width = settings.search_width
+    tries = np.arange(-width, width + 1, step)
     for level in range(levels, -1, -1):
         scores = []
         for t in tries:
             other.shift = tuple(first + t * across)
-            _, rho, _ = search(
-                base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, level, HALF_WINDOW
-            )
-            scores.append(float(np.mean(np.nan_to_num(rho) > LIKELY_CORRELATION)))
+            _, rho, _ = search(base, [other], both, uv, q, None, level, guide_settings)
+            scores.append(float(np.mean(np.nan_to_num(rho) > settings.likely_correlation)))
         best = float(tries[int(np.argmax(scores))])
         step /= 2
         tries = best + step * np.arange(-2, 3)
     other.shift = tuple(first + best * across)
+    # twice: the first matches may start a pixel beside
     for _ in range(2):
-        rest = _rest(base, other, pyramids, uv, q, across)
+        rest = _median_offset(base, other, both, uv, q, across, settings)
         if rest is None:
             other.shift = tuple(first)
             return None
@@ -74,33 +96,46 @@ def align(base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds) -> flo
     return best
 
 
-def _rest(base, other, pyramids, uv, q, across) -> float | None:
-    """The median distance of matches from their epipolar lines."""
-    found, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, 0, HALF_WINDOW)
+def _median_offset(
+    base: GroundView,
+    other: GroundView,
+    pyramids: ImagePyramids,
+    uv: Places,
+    q: Float[np.ndarray, "n 2"],
+    across: Float[np.ndarray, "2"],
+    settings: AlignmentSettings,
+) -> float | None:
+    """The median distance of matches from their epipolar lines; None for too few."""
+    found, rho, _ = search(base, [other], pyramids, uv, q, None, 0, GuideSettings())
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(found) & (rho > SMALLEST_CORRELATION)
+        good = np.isfinite(found) & (rho > settings.min_correlation)
     uv, found = uv[good], found[good]
-    if len(uv) < FEWEST_MATCHES:
+    if len(uv) < settings.min_matches:
         return None
     shape = windows(base, other, base.points(uv, found))
     start = positions(base, other, uv, found[:, None])[:, 0]
-    match = refine(base, other, uv, start, shape.A, HALF_WINDOW)
-    good = (match.status == int(MatchingStatus.CONVERGED)) & (match.rho > SMALLEST_CORRELATION)
-    if good.sum() < FEWEST_MATCHES:
+    match = refine(base, other, uv, start, shape.A, settings.half_window)
+    good = match.status == int(MatchingStatus.CONVERGED)
+    good &= match.rho > settings.min_correlation
+    if good.sum() < settings.min_matches:
         return None
     return float(np.median((match.uv - start)[good] @ across))
 
 
-def align_all(views: Sequence, bounds: Sequence[Bounds]) -> tuple[str, ...]:
+def align_all(
+    views: Sequence[GroundView],
+    bounds: Sequence[Bounds],
+    settings: AlignmentSettings = AlignmentSettings(),
+) -> tuple[str, ...]:
     """Align every image with the first; returns messages."""
     said = []
-    pyramids = [make_pyramid(view.grey, LEVELS) for view in views]
+    pyramids = [make_pyramid(view.grey, settings.levels) for view in views]
     for k in range(1, len(views)):
-        found = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0])
+        found = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0], settings)
         pair = f"{views[k].name} and {views[0].name}"
         if found is None:
             said.append(f"{pair}: too few matches to align them across the epipolar lines")
-        elif abs(found) > SMALLEST_REPORTED:
+        elif abs(found) > settings.min_reported:
             said.append(
                 f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
                 "off the second"

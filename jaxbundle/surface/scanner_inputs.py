@@ -9,12 +9,13 @@ scanner file; the raster of the last two has the same name and is beside them, o
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
 from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
@@ -23,22 +24,28 @@ from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surface.cloud import Cloud
-from jaxbundle.surface.ground import Neighbourhood, RpcView, ScannerView, neighbourhood
+from jaxbundle.surface.ground import (
+    GroundView,
+    Neighbourhood,
+    RpcView,
+    ScannerView,
+    neighbourhood,
+)
+from jaxbundle.surface.views import Grey
+
+if TYPE_CHECKING:
+    import pyproj
 
 IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
 COMPANION_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
 ENDINGS = ("_rpc", "_RPC")
-BANDS = (0.3, 0.59, 0.11)
-"""Weights of red, green and blue."""
-AT_ONCE, TOGETHER = 1 << 23, 1 << 18
-"""Pixels read together; points transformed to a map system together."""
-
-View = RpcView | ScannerView
+Orientation = Rpc | tuple[PushbroomImage, Ellipsoid | None]
+"""The polynomials; or the scanner's image, and its Earth, None in a local frame."""
 
 
 def read_ground_views(
     files: Sequence[Path], folder: Path | None
-) -> tuple[tuple[View, ...], Neighbourhood | None]:
+) -> tuple[tuple[GroundView, ...], Neighbourhood | None]:
     """The oriented images and the origin of their coordinates, None in a local frame.
 
     **Raises:** `InputError` for another kind of file, a missing raster, or another size.
@@ -50,7 +57,7 @@ def read_ground_views(
         raise InputError(
             f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
         )
-    around = None if all(local) else _middle(found[0][0])
+    around = None if all(local) else _central_neighbourhood(found[0][0])
     names = [raster.name for _, raster in found]
     if len({*names}) < len(names):
         names = [str(raster) for _, raster in found]
@@ -81,11 +88,11 @@ def is_ground_image(path: Path) -> bool:
     return path.suffix == ".toml" and path.is_file() and b"[scanner]" in path.read_bytes()
 
 
-def read_grey(path: Path) -> np.ndarray:
+def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
     """The grey values of a raster; for colours their luminance. No-data is 0.
 
     One band of 8 or 16 bits keeps its type, all else becomes float32; so large rasters, which are
-    read by blocks of lines, need no more memory than their pixels.
+    read by blocks of lines of `pixels_at_once`, need no more memory than their pixels.
 
     **Raises:** `InputError` if it cannot be read.
     """
@@ -95,21 +102,23 @@ def read_grey(path: Path) -> np.ndarray:
             bands = list(range(1, min(source.count, 3) + 1))
             plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
             out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
-            rows = max(1, AT_ONCE // source.width)
+            # red, green and blue in the luminance (ITU-R BT.601, two digits)
+            weights = np.array([0.3, 0.59, 0.11], np.float32)
+            rows = max(1, pixels_at_once // source.width)
             for first in range(0, source.height, rows):
                 window = package.windows.Window(
                     0, first, source.width, min(rows, source.height - first)
                 )
                 values = source.read(bands, window=window, masked=True).filled(0)
-                out[first : first + rows] = values[0] if plain else _luminance(values)
+                if not plain:
+                    values = np.nan_to_num(values.astype(np.float32))
+                colour = len(values) == 3
+                out[first : first + rows] = (
+                    np.tensordot(weights, values, 1) if colour else values[0]
+                )
             return out
     except package.errors.RasterioError as error:
         raise unreadable(path, error) from None
-
-
-def _luminance(values):
-    values = np.nan_to_num(values.astype(np.float32))
-    return values[0] if len(values) < 3 else np.tensordot(np.array(BANDS, np.float32), values, 1)
 
 
 def system_of(around: Neighbourhood, crs: str | None) -> str:
@@ -119,6 +128,7 @@ def system_of(around: Neighbourhood, crs: str | None) -> str:
     if crs is not None:
         return crs
     longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
+    # zones of 6° from 180° W; EPSG 32601 to 32660 are those of the north, 32701 on of the south
     zone = int((longitude + 180) // 6) % 60 + 1
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
 
@@ -128,15 +138,20 @@ def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
 
     **Raises:** `InputError` for a system unknown to pyproj."""
     X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
-    for first in range(0, len(cloud), TOGETHER):
-        part = slice(first, first + TOGETHER)
+    # the arrays of 262 144 points take about 50 MB
+    together = 1 << 18
+    for first in range(0, len(cloud), together):
+        part = slice(first, first + together)
         X[part], J = _with_derivative(cloud.X[part], around, crs)
         covariance[part] = J @ cloud.covariance[part] @ np.swapaxes(J, 1, 2)
     return dataclasses.replace(cloud, X=X, covariance=covariance, system=crs)
 
 
-def _with_derivative(X, around, crs):
+def _with_derivative(
+    X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Points in a map system, and their derivatives by the coordinates of the neighbourhood."""
+    # differences over one metre: a map's curvature within it is 1e-7
     x, y = map_coordinates(X, around, crs)
     columns = []
     for axis in range(2):
@@ -155,14 +170,20 @@ def map_coordinates(
     return np.asarray(x), np.asarray(y)
 
 
-def from_map(x, y, h, around: Neighbourhood, crs: str) -> Float[np.ndarray, "n 3"]:
+def from_map(
+    x: Float[np.ndarray, " n"],
+    y: Float[np.ndarray, " n"],
+    h: Float[np.ndarray, " n"],
+    around: Neighbourhood,
+    crs: str,
+) -> Float[np.ndarray, "n 3"]:
     """Points of map coordinates."""
     degrees = _transformer(crs).transform(x, y, direction="INVERSE")
     east, north = np.radians(degrees)
     return np.asarray(around.local(east, north, np.asarray(h, float))).T
 
 
-def _transformer(crs):
+def _transformer(crs: str) -> "pyproj.Transformer":
     try:
         import pyproj
         import pyproj.exceptions
@@ -174,7 +195,7 @@ def _transformer(crs):
         raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
 
 
-def _orientation(path: Path, folder: Path | None):
+def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
     """The polynomials, or the scanner's image and Earth; and the raster."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -209,7 +230,7 @@ def _raster_of(path: Path, folder: Path | None) -> Path:
     raise InputError(f"{path}: no raster {stem}.tif {where}")
 
 
-def _middle(orientation) -> Neighbourhood:
+def _central_neighbourhood(orientation: Orientation) -> Neighbourhood:
     """The neighbourhood of the middle of the first image."""
     if isinstance(orientation, Rpc):
         return neighbourhood(

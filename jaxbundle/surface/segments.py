@@ -16,14 +16,14 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight, over_plane
-
-SIGHT_POINTS = 17
-"""Number of points along a line of sight tested for visibility in the other image."""
-LEAST_STRETCH, MOST_STRETCH = 0.25, 4.0
-"""Limits of the ratio of lengths in the other image and in the base for comparing windows."""
-FLATTEST = 0.2
-"""Minimum sine of the angle between a plane and a line of sight."""
+from jaxbundle.surface.views import (
+    OrientedImage,
+    Places,
+    Points,
+    is_inside,
+    line_of_sight,
+    steps_on_plane,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Windows:
     """Axes of the windows: e [n, 2] in the base, A·e and A·e⊥ [n, 2] in the other image; `A`;
     `usable`: the plane is visible in both, at similar scales."""
 
-    along: Float[np.ndarray, "n 2"]
-    other_along: Float[np.ndarray, "n 2"]
-    other_across: Float[np.ndarray, "n 2"]
+    axis: Float[np.ndarray, "n 2"]
+    other_axis: Float[np.ndarray, "n 2"]
+    other_cross_axis: Float[np.ndarray, "n 2"]
     A: Float[np.ndarray, "n 2 2"]
     usable: Bool[np.ndarray, " n"]
 
@@ -56,7 +56,7 @@ class Segments:
         x = length / (self.alpha[:, None] - self.gamma[:, None] * length)
         return self.q[:, :1] + x * (self.q[:, 1:] - self.q[:, :1])
 
-    def along(self, q: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    def length_at(self, q: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """Lengths along the segments at q."""
         x = (q - self.q[:, :1]) / (self.q[:, 1:] - self.q[:, :1])
         return self.alpha[:, None] * x / (1 + self.gamma[:, None] * x)
@@ -69,14 +69,19 @@ def visible_range(
     q: Float[np.ndarray, "n 2"],
     margin: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
-    """The part of a range of q visible in the other image, to about 1/`SIGHT_POINTS` of it; NaN:
-    none."""
-    x = np.linspace(0, 1, SIGHT_POINTS)
+    """The part of a range of q visible in the other image, to about a sixteenth of it; NaN: none.
+
+    The range reaches one sample beyond the visible ones, so that nothing visible is cut off.
+    """
+    # Sampled, since a curved segment may leave an image and return. A segment that crosses only a
+    # corner, between two samples, is lost. Half and double: the same points within 1.
+    number = 17
+    x = np.linspace(0, 1, number)
     sampled = q[:, :1] + x * (q[:, 1:] - q[:, :1])
     places = other.project(_points(base, uv, sampled))
-    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, SIGHT_POINTS)
+    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, number)
     first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
-    last = np.minimum(SIGHT_POINTS - np.argmax(inside[:, ::-1], axis=1), SIGHT_POINTS - 1)
+    last = np.minimum(number - np.argmax(inside[:, ::-1], axis=1), number - 1)
     rows = np.arange(len(q))
     found = np.stack([sampled[rows, first], sampled[rows, last]], axis=1)
     return np.where(np.any(inside, axis=1)[:, None], found, np.nan)
@@ -89,6 +94,7 @@ def segments(
     q: Float[np.ndarray, "n 2"],
 ) -> Segments:
     """The segments of lines of sight between two parameters."""
+    # λ(½) and λ(1) determine α and γ
     three = np.stack([q[:, 0], q.mean(1), q[:, 1]], axis=1)
     a, b, c = np.moveaxis(other.project(_points(base, uv, three)).reshape(-1, 3, 2), 1, 0)
     half = np.linalg.norm(b - a, axis=1)
@@ -118,24 +124,30 @@ def windows(
     across the mean of both lines of sight."""
     J, K = base.derivative(X), other.derivative(X)
     d, f = line_of_sight(J), line_of_sight(K)
-    d, f = (a * np.sign(np.sum(a * (d if a is f else d), 1, keepdims=True)) for a in (d, f))
+    # J₁ × J₂ has either sign: both in the direction of that of the base
+    f = f * np.sign(np.sum(f * d, 1, keepdims=True))
     across = d + f
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     if normal is not None:
         steep = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
-        across = np.where((steep > FLATTEST)[:, None], normal, across)
+        # A plane seen from nearly its side is stretched without limit. Below a sine of 0.2 (12°)
+        # the windows would be five times as long in one direction; a normal of the guide is rarely
+        # that steep, and mostly by an error.
+        across = np.where((steep > 0.2)[:, None], normal, across)
     with np.errstate(invalid="ignore", divide="ignore"):
-        A = K @ over_plane(J, across)
+        A = K @ steps_on_plane(J, across)
+        # the image in the base of the line of sight of the other: its epipolar line
         e = np.einsum("nij,nj->ni", J, f)
         e = e / np.linalg.norm(e, axis=1, keepdims=True)
         along = np.einsum("nij,nj->ni", A, e)
         beside = np.einsum("nij,nj->ni", A, np.stack([-e[:, 1], e[:, 0]], 1))
         singular = np.linalg.svd(np.nan_to_num(A), compute_uv=False)
-        usable = (singular[:, 1] > LEAST_STRETCH) & (singular[:, 0] < MOST_STRETCH)
+        # windows of scales that differ by more than 4 show different details
+        usable = (singular[:, 1] > 1 / 4) & (singular[:, 0] < 4)
     usable &= np.isfinite(e).all(1)
     return Windows(e, along, beside, A, usable)
 
 
-def _points(base, uv, q):
+def _points(base: OrientedImage, uv: Places, q: Float[np.ndarray, "n k"]) -> Points:
     """Points [n·k, 3] of lines of sight at q [n, k]."""
     return base.points(np.repeat(uv, q.shape[1], axis=0), q.ravel())

@@ -11,20 +11,16 @@ Source: Hirschmüller (2008), Stereo processing by semiglobal matching, equation
 import numpy as np
 from jaxtyping import Float
 
-SMALL_CHANGE, LARGE_CHANGE = 0.08, 0.5
-"""P₁ and P₂ for costs 1 − ρ."""
-
 
 def aggregate(
-    cost: Float[np.ndarray, "rows columns k"],
-    small: float = SMALL_CHANGE,
-    large: float = LARGE_CHANGE,
+    cost: Float[np.ndarray, "rows columns k"], small: float, large: float
 ) -> Float[np.ndarray, "rows columns k"]:
-    """The sum of the costs of all eight paths."""
+    """The sum of the costs of all eight paths; `small` and `large`: P₁ and P₂."""
     total = np.zeros_like(cost)
     for axis in (0, 1):
         turned = np.moveaxis(cost, axis, 0)
         out = np.moveaxis(total, axis, 0)
+        # the four diagonals run from row to row, with a shift of one column
         shifts = (0, 1, -1) if axis == 0 else (0,)
         for shift in shifts:
             for order in (1, -1):
@@ -32,7 +28,13 @@ def aggregate(
     return total
 
 
-def _sweep(cost, total, shift, small, large):
+def _sweep(
+    cost: Float[np.ndarray, "lines nodes k"],
+    total: Float[np.ndarray, "lines nodes k"],
+    shift: int,
+    small: float,
+    large: float,
+) -> None:
     """Along one direction: from line to line, each moved by `shift` nodes."""
     before = None
     for line, out in zip(cost, total):
@@ -44,13 +46,15 @@ def _sweep(cost, total, shift, small, large):
             path = np.minimum(came, least + large)
             np.minimum(path[:, 1:], came[:, :-1] + small, out=path[:, 1:])
             np.minimum(path[:, :-1], came[:, 1:] + small, out=path[:, :-1])
+            # min L(p') is subtracted: it changes no decision, and without it L grows with the path
             path += line - least
         out += path
         before = path
 
 
-def _move(a, shift):
-    """Shifted rows; missing costs are 0."""
+def _move(a: Float[np.ndarray, "nodes k"], shift: int) -> Float[np.ndarray, "nodes k"]:
+    """The nodes of a line shifted by one; a node at the edge has no predecessor, and its path
+    begins with 0."""
     if shift == 0:
         return a
     out = np.zeros_like(a)

@@ -25,24 +25,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Bool, Float, PyTree, Shaped, UInt8
 
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray, project
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance
-from jaxbundle.network.tables import Camera
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
-
-LANES = 1 << 13
-FEWEST_POINTS = 1 << 9
-"""Points of one call; fewer are padded to one of these sizes: two programs suffice."""
-RAY_MARGIN = 1.02
-"""A ray farther from the axis than the farthest of the image, times this, is outside."""
 
 Points = Float[np.ndarray, "n 3"]
 Places = Float[np.ndarray, "n 2"]
+Grey = Shaped[np.ndarray, "rows columns"]
+"""Grey values of an image as its file has them: 8 or 16 bits, or floating point."""
 
 
 class OrientedImage(Protocol):
@@ -53,7 +49,7 @@ class OrientedImage(Protocol):
 
     name: str
     size: tuple[int, int]
-    grey: Float[np.ndarray, "rows columns"]
+    grey: Grey
 
     def points(self, uv: Places, q: Float[np.ndarray, " n"]) -> Points:
         """The points of lines of sight."""
@@ -85,14 +81,14 @@ class FrameView:
     def __init__(
         self,
         name: str,
-        grey,
+        grey: Grey,
         camera: Camera,
-        X0,
-        M,
-        sigma=None,
+        X0: Float[np.ndarray, "3"],
+        M: Float[np.ndarray, "3 3"],
+        sigma: Float[np.ndarray, "6"] | None = None,
         colours: Callable[[], UInt8[np.ndarray, "rows columns 3"]] | None = None,
         joint: OrientationCovariance | None = None,
-    ):
+    ) -> None:
         self.name, self.grey, self.colours, self.joint = name, grey, colours, joint
         self.sigma = np.nan_to_num(np.zeros(6) if sigma is None else np.asarray(sigma, float))
         self.size = (grey.shape[1], grey.shape[0])
@@ -110,40 +106,48 @@ class FrameView:
         given = {**default_parameters(model), **camera.parameters}
         self.camera, self.X0, self.M = camera, np.asarray(X0, float), np.asarray(M, float)
         p = np.array([float(given.get(n, 0.0)) for n in model.parameters])
-        self.frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
+        self.frame = PhotographFrame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
         edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
-        self._farthest = RAY_MARGIN * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
+        # Far outside the image the polynomials of distortion may turn back and project a point into
+        # it, so that rays farther from the axis than those of the image are excluded. 2 %: the
+        # farthest ray of the image may be between the sampled ones.
+        self._farthest = 1.02 * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
 
     def edge(self) -> Places:
         """Positions along and across the whole image, including its edges."""
+        # 17 positions a side: distortion is smooth, and only the extent of the rays is used
         u, v = (np.linspace(-0.5, n - 0.5, 17) for n in self.size)
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
-    def points(self, uv, q):
+    def points(self, uv: Places, q: Float[np.ndarray, " n"]) -> Points:
         return run_in_lanes(_points, self.frame, uv, q)
 
-    def parameter(self, X):
+    def parameter(self, X: Points) -> Float[np.ndarray, " n"]:
         return 1 / np.linalg.norm(X - self.X0, axis=1)
 
-    def project(self, X):
+    def project(self, X: Points) -> Places:
         d = X - self.X0
         with np.errstate(invalid="ignore", divide="ignore"):
+            # M[2] points backwards: the camera looks along −z, as in photogrammetry
             angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
         uv = run_in_lanes(_project, self.frame, X)
         return np.where((angle <= self._farthest)[:, None], uv, np.nan)
 
-    def derivative(self, X):
+    def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
         return run_in_lanes(_derivative, self.frame, X)
 
-    def bounds(self, uv, low, high):
+    def bounds(self, uv: Places, low: float, high: float) -> Float[np.ndarray, "n 2"]:
         d = self.points(uv, np.ones(len(uv))) - self.X0
         with np.errstate(divide="ignore", invalid="ignore"):
+            # X0 + t·d has the height Z at t = (Z − Z0)/d_z, and q = 1/t: the order turns round. A
+            # ray that reaches only one of the heights in front of the camera is not bounded there
+            # (q = 0), one that reaches neither has no range (NaN).
             t = np.sort((np.array([low, high]) - self.X0[2]) / d[:, 2:], axis=1)
             return 1 / np.where(t[:, ::-1] > 0, t[:, ::-1], [np.nan, 0.0])
 
 
-class _Frame(eqx.Module):
+class PhotographFrame(eqx.Module):
     """The quantities on which image coordinates of a photograph depend."""
 
     model: CameraModel = eqx.field(static=True)
@@ -155,7 +159,7 @@ class _Frame(eqx.Module):
 
 
 def frame_views(
-    network,
+    network: Network,
     greys: Sequence[np.ndarray],
     colours: Sequence[Callable | None] | None = None,
     joint: OrientationCovariance | None = None,
@@ -178,7 +182,7 @@ def line_of_sight(J: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 3"]:
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def over_plane(
+def steps_on_plane(
     J: Float[np.ndarray, "n 2 3"], normal: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3 2"]:
     """T: the displacement on a plane for a step of one pixel."""
@@ -186,7 +190,7 @@ def over_plane(
     return np.linalg.inv(stacked)[:, :, :2]
 
 
-def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarray:
+def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> Bool[np.ndarray, " n"]:
     """Which positions are in the image, at least `margin` pixels from its edge."""
     columns, rows = view.size
     with np.errstate(invalid="ignore"):
@@ -198,10 +202,14 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
         )
 
 
-def run_in_lanes(program: Callable, frame, *arrays):
-    """The program for arrays [n, …], in blocks of `LANES`, padded."""
+def run_in_lanes(
+    program: Callable, frame: PyTree, *arrays: Shaped[np.ndarray, "n ..."]
+) -> np.ndarray:
+    """The results of a compiled program for arrays [n, …], in padded blocks."""
     n = len(arrays[0])
-    lanes = LANES if n > FEWEST_POINTS else FEWEST_POINTS
+    # XLA compiles for one shape: with only two block sizes no number of points compiles again.
+    # The small one is for the few points of bounds and overlaps.
+    lanes = 8192 if n > 512 else 512
     parts = []
     for first in range(0, max(n, 1), lanes):
         chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))
@@ -212,13 +220,13 @@ def run_in_lanes(program: Callable, frame, *arrays):
     return np.concatenate(parts)[:n]
 
 
-def _point(frame, uv, q):
+def _point(frame: PhotographFrame, uv: Float[Array, "2"], q: Float[Array, ""]) -> Float[Array, "3"]:
     xy = (uv - frame.origin) / frame.step
     ray = jnp.stack(image_ray(frame.model, tuple(frame.p), xy[0], xy[1]))
     return frame.X0 + frame.M.T @ ray / q
 
 
-def pixel_of(frame: _Frame, X: Float[Array, "3"]) -> Float[Array, "2"]:
+def pixel_of(frame: PhotographFrame, X: Float[Array, "3"]) -> Float[Array, "2"]:
     """(u, v) of a point, by the frame of a photograph."""
     r, s, q = frame.M @ (X - frame.X0)
     xy = jnp.stack(project(frame.model, tuple(frame.p), r, s, q))
@@ -226,15 +234,17 @@ def pixel_of(frame: _Frame, X: Float[Array, "3"]) -> Float[Array, "2"]:
 
 
 @compile_once
-def _points(frame, uv, q):
+def _points(
+    frame: PhotographFrame, uv: Float[Array, "n 2"], q: Float[Array, " n"]
+) -> Float[Array, "n 3"]:
     return jax.vmap(partial(_point, frame))(uv, q)
 
 
 @compile_once
-def _project(frame, X):
+def _project(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
     return jax.vmap(partial(pixel_of, frame))(X)
 
 
 @compile_once
-def _derivative(frame, X):
+def _derivative(frame: PhotographFrame, X: Float[Array, "n 3"]) -> Float[Array, "n 2 3"]:
     return jax.vmap(jax.jacfwd(partial(pixel_of, frame)))(X)

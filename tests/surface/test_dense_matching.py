@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from jaxbundle.surface import dense, disparity_refinement, disparity_search
-from jaxbundle.surface.dense import match_dense
+from jaxbundle.surface import disparity_search
+from jaxbundle.surface.dense import DenseSettings, match_dense
+from jaxbundle.surface.disparity_refinement import (
+    DisparityRefinementSettings,
+    refine_disparities,
+)
+from jaxbundle.surface.disparity_search import DisparitySearchSettings, semi_global
 
 SHAPE, SHIFT, SPAN = (160, 460), 50, 90
 
@@ -39,11 +44,11 @@ def test_strips_of_a_large_image_match_as_the_whole(monkeypatch):
     y, x = np.indices(right.shape)
     true = 20 + 8 * np.sin(y / 60) + 5 * np.sin(x / 50)
     left = ndimage.map_coordinates(right, [y, x - true], order=3, mode="nearest")
-    monkeypatch.setattr(disparity_search, "MOST_COSTS", 0)
+    always_in_strips = DisparitySearchSettings(max_costs=0)
 
     def match(cores):
         monkeypatch.setattr(disparity_search, "available_cores", lambda: cores)
-        return disparity_search.semi_global(left, right, 47)
+        return semi_global(left, right, 47, always_in_strips)
 
     whole, strips = match(1), match(4)
     inner = np.s_[10:-10, 60:-10]
@@ -65,11 +70,11 @@ def wavy_pair():
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2])
-def test_a_large_pair_is_matched_at_half_its_size_first(monkeypatch, levels):
+def test_a_large_pair_is_matched_at_half_its_size_first(levels):
     pair, true = wavy_pair()
     span = 80
-    monkeypatch.setattr(dense, "MOST_SEARCHED", pair.left.size * span / 8**levels * 1.2)
-    found = match_dense(pair, span)
+    settings = DenseSettings(max_searched=pair.left.size * span / 8**levels * 1.2)
+    found = match_dense(pair, span, settings)
     e, inner = found.disparity - true, np.s_[10:-10, span:-10]
     known = np.isfinite(e[inner])
     assert known.mean() > 0.9
@@ -79,13 +84,13 @@ def test_a_large_pair_is_matched_at_half_its_size_first(monkeypatch, levels):
     assert (np.abs(w) < 3).mean() > 0.98
 
 
-def test_pieces_do_not_matter(monkeypatch):
+def test_pieces_do_not_matter():
     pair, true = wavy_pair()
     start = np.where(true > 0, np.rint(4 * true) / 4, np.nan).astype(np.float32)
     found = []
     for piece in ((256, 512), (120, 200)):
-        monkeypatch.setattr(disparity_refinement, "PIECE", piece)
-        found.append(disparity_refinement.refine_disparities(pair.left, pair.right, start))
+        settings = DisparityRefinementSettings(piece=piece)
+        found.append(refine_disparities(pair.left, pair.right, start, settings))
     one, other = found
     assert (np.isfinite(one.disparity) == np.isfinite(other.disparity)).mean() > 0.999
     off = np.abs(one.disparity - other.disparity)

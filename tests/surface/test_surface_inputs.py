@@ -145,7 +145,7 @@ def test_a_colmap_folder_gives_oriented_photographs_in_colour(tmp_path):
     assert (found[0].colours()[..., ::-1] == colour).all() and found[0].grey.ndim == 2
 
 
-def test_a_raster_is_read_by_blocks_and_keeps_its_bits(tmp_path, monkeypatch):
+def test_a_raster_is_read_by_blocks_and_keeps_its_bits(tmp_path):
     rng = np.random.default_rng(1)
     deep = rng.integers(0, 4000, (1, 70, 50), np.uint16)
     bands = rng.integers(0, 255, (3, 70, 50), np.uint8)
@@ -154,11 +154,10 @@ def test_a_raster_is_read_by_blocks_and_keeps_its_bits(tmp_path, monkeypatch):
                            count=len(values), dtype=values.dtype,
                            transform=rasterio.Affine.scale(2)) as raster:  # fmt: skip
             raster.write(values)
-    monkeypatch.setattr(scanner_inputs, "AT_ONCE", 50 * 9)
-    found = scanner_inputs.read_grey(tmp_path / "deep.tif")
+    found = scanner_inputs.read_grey(tmp_path / "deep.tif", pixels_at_once=50 * 9)
     assert found.dtype == np.uint16
     np.testing.assert_array_equal(found, np.where(deep[0] == 7, 0, deep[0]))
-    grey = scanner_inputs.read_grey(tmp_path / "colour.tif")
+    grey = scanner_inputs.read_grey(tmp_path / "colour.tif", pixels_at_once=50 * 9)
     expected = np.tensordot([0.3, 0.59, 0.11], np.where(bands == 7, 0, bands), 1)
     np.testing.assert_allclose(grey, expected, rtol=1e-5)
 

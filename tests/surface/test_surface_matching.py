@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
-from jaxbundle.surface.correlation import slide, top
+from jaxbundle.surface.correlation import find_peaks, slide
 from jaxbundle.surface.dense_cloud import combine
 from jaxbundle.surface.reconstruct import find_bounds, reconstruct
 from jaxbundle.surface.rectification import rectify
-from jaxbundle.surface.views import FrameView, is_inside, line_of_sight, over_plane
+from jaxbundle.surface.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
 
 NONE = np.zeros((0, 3))
@@ -83,7 +83,7 @@ def test_the_plane_carries_windows_from_one_image_to_the_other(pair):
     X = np.array([[0.3, 0.4, 0.5], [1.0, -2.0, 0.1]])
     normal = np.array([[0.1, 0.2, 1.0], [0.0, 0.0, 1.0]])
     J, K = (view.derivative(X) for view in views)
-    T = over_plane(J, normal)
+    T = steps_on_plane(J, normal)
     np.testing.assert_allclose(np.einsum("ni,nij->nj", normal, T), 0, atol=1e-12)
     step = 1e-4 * np.array([0.6, -0.8])
     there = X + T @ step
@@ -109,7 +109,7 @@ def test_correlation_along_a_strip_is_that_of_every_window():
             else:
                 expected = np.corrcoef(template[n].ravel(), window.ravel())[0, 1]
                 np.testing.assert_allclose(rho[n, k], expected, atol=1e-5)
-    peak, best, second = top(np.array([[0.1, 0.5, 0.9, 0.5, 0.1, 0.3], [np.nan] * 6]))
+    peak, best, second = find_peaks(np.array([[0.1, 0.5, 0.9, 0.5, 0.1, 0.3], [np.nan] * 6]))
     np.testing.assert_allclose([peak[0], best[0], second[0]], [0.9, 2.0, 0.3])
     assert np.isnan([peak[1], best[1], second[1]]).all()
 
