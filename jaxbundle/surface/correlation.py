@@ -144,7 +144,7 @@ def slide(
     t = template - template.mean((1, 2), keepdims=True)
     norm = np.sqrt(np.einsum("nyx,nyx->n", t, t))
     outside = np.isnan(strip)
-    lost = _sliding_sum(outside.any(1).astype(np.float64), w) > 0
+    lost = _sliding_sum(np.asarray(outside.any(1), np.float64), w) > 0
     # without the mean of the strip: the sums of squares below would lose digits
     s = np.where(outside, 0, strip)
     s -= s.sum((1, 2), keepdims=True) / np.maximum((~outside).sum((1, 2), keepdims=True), 1)
@@ -156,7 +156,7 @@ def slide(
         for x in range(w):
             np.multiply(s[:, y, x : x + steps], t[:, y, x, None], out=product)
             cross += product
-    total, square = (_sliding_sum(np.sum(a, 1, dtype=np.float64), w) for a in (s, s * s))
+    total, square = (_sliding_sum(np.asarray(a.sum(1, dtype=np.float64)), w) for a in (s, s * s))
     spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
     # a standard deviation of 0.001 grey values is the rounding of float32, no texture;
     # half and double: no difference

@@ -159,7 +159,7 @@ def _intersect(
         number = np.maximum(matched.sum(0), 1)
         shared = 0.5 * np.where(matched, sigma, 0.0) ** 2
         in_base = np.expand_dims(shared.sum(0) / number, (1, 2)) * np.eye(2)
-        used = np.concatenate([matched.any(0)[None], matched]).T
+        used = np.concatenate([np.expand_dims(matched.any(0), 0), matched]).T
         covariance = np.concatenate([in_base[:, None], in_others], 1)
         return intersect(views, np.nan_to_num(places), covariance, used, start)
 
