@@ -112,7 +112,8 @@ def images(pixels):
         view = RpcView(f"pass_{k}", np.zeros((pixels, pixels), np.float32), rpc,
                        neighbourhood(*target))  # fmt: skip
         shot = photograph(view, scene, Sensor(noise=1.5, seed=k, gain=1 - 0.25 * k, offset=20 * k))
-        views.append(RpcView(view.name, shot.grey.astype(np.uint16) * 9 + 200, rpc, view.neighbourhood))
+        grey = shot.grey.astype(np.uint16) * 9 + 200
+        views.append(RpcView(view.name, grey, rpc, view.neighbourhood))
     v, u = np.indices((pixels, pixels)) / pixels
     cloud = np.hypot(u - 0.7, (v - 0.3) * 1.5) + 0.02 * np.sin(40 * u) * np.cos(33 * v) < 0.1
     white = np.clip(2300 + 60 * np.sin(70 * u) * np.cos(50 * v), 0, 2495)
