@@ -1,9 +1,11 @@
 """OpenCV and Pillow (extra `images`), imported on demand."""
 
+from types import ModuleType
+
 from jaxbundle.errors import InputError
 
 
-def need_opencv():
+def need_opencv() -> ModuleType:
     """The module cv2, or an error that says what to install."""
     try:
         import cv2
@@ -14,7 +16,7 @@ def need_opencv():
     return cv2
 
 
-def need_pillow():
+def need_pillow() -> ModuleType:
     """The module PIL.Image, or an error that says what to install."""
     try:
         from PIL import Image
