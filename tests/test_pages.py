@@ -14,7 +14,7 @@ from jaxbundle.batch.page import compose_batch
 from jaxbundle.batch.run import result_rows
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.reconstruction.adjusting import Weighted
-from jaxbundle.reconstruction.block import Block
+from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.result import Part, Reconstruction
 from jaxbundle.report.page import Addition, Finding, Section, compose
@@ -93,7 +93,7 @@ def test_lines_of_other_inputs_are_not_of_the_batch(tmp_path, rows):
 # --- reconstructions ------------------------------------------------------------------------
 
 
-BLOCK = Block(
+BLOCK = BlockFacts(
     photographs=4, taken=None, computed=datetime.datetime(2026, 5, 4), system="", unit="m",
     ground_sample_distance=0.01, object_distance=10.0, flying_height=None, area=None,
     rays_per_point=4.0, points_per_photograph=10.0, photographs_per_place=None, positions=None,

@@ -8,7 +8,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.columns import count
 from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
-from jaxbundle.reconstruction.block import Block
+from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.report.head import count_points
 
@@ -23,7 +23,7 @@ class Part:
     adjustment: Adjustment
     colours: Mapping[str, tuple[int, int, int]]
     factors: Mapping[str, float]
-    block: Block
+    block: BlockFacts
     control: ControlTable | None = None
     no_control: str = ""
 

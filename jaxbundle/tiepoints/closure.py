@@ -29,26 +29,46 @@ from jaxtyping import Float, Int
 
 from jaxbundle.tiepoints.verification import Pair, rotation_angle, turn_pairs
 
-ANGLE = np.radians(0.3)
-"""ω₀, the error of ω of right pairs."""
-SIGMA_C, SIGMA_K1 = 0.25, 0.15
-"""σ of ln c about the value stated by the files, or else the start value, and of K1 about zero."""
-FIRST = (1.0, 1.25, 0.8)
-"""First principal distances, relative to the start value."""
-STEP_C, STEP_K1 = 0.1, 0.04
-"""First steps of the search, in ln c and K1."""
-LAST_STEP, EVALUATIONS = 0.01, 40
-CLEAR = 0.5
-"""Sum per independent loop below which no other first principal distance is tried."""
-FEWEST = 3
-"""Minimum number of independent loops."""
+
+@dataclasses.dataclass(frozen=True)
+class ClosureSettings:
+    """Settings of the search for the interior orientation with which rotations close."""
+
+    sigma_rotation: float = np.radians(0.3)
+    """ω₀, the error of ω of right pairs, radians: of three rotations with 0.17 degrees each.
+    Smaller: with a first camera that is a few per cent wrong all loops count as wrong, and the sum
+    is flat; larger: wrong loops take part in the result."""
+    sigma_log_distance: float = 0.25
+    """σ of ln c about the value stated by the files, or else the start value. Weak on purpose: it
+    decides only where loops do not."""
+    sigma_k1: float = 0.15
+    """σ of K1 about zero: that of most lenses is between −0.3 and 0.1."""
+    first_factors: tuple[float, ...] = (1.0, 1.25, 0.8)
+    """First principal distances, relative to the start value: one σ of ln c on either side."""
+    step_log_distance: float = 0.1
+    """First step of the search in ln c, less than half its σ."""
+    step_k1: float = 0.04
+    """First step of the search in K1, about a quarter of its σ."""
+    last_step: float = 0.01
+    """Size of the last steps, in ln c, K1 and the sum: the adjustment estimates both anew, and
+    starts from values that are a few per cent wrong."""
+    max_evaluations: int = 40
+    """Maximum evaluations of one search, each a refinement of all pairs. What is not
+    reached then, the adjustment does."""
+    clear_sum: float = 0.5
+    """Sum per independent loop below which no other first principal distance is tried: that of
+    loops with ω = 0.8·ω₀."""
+    min_loops: int = 3
+    """Minimum number of independent loops, one more than the two unknowns: four photographs with
+    all their pairs."""
+
 
 Interior = Float[np.ndarray, "2"]
 """ln c and K1."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Oriented:
+class OrientedPairs:
     """Pairs oriented with a camera, and the coordinates, c = 1, of their matches with another."""
 
     pairs: Sequence[Pair]
@@ -56,7 +76,10 @@ class Oriented:
 
 
 def close_rotations(
-    orient: Callable[[Interior], Oriented], start: Interior, middle: float | None = None
+    orient: Callable[[Interior], OrientedPairs],
+    start: Interior,
+    middle: float | None = None,
+    settings: ClosureSettings = ClosureSettings(),
 ) -> Interior:
     """ln c and K1 with which rotations close; the start value if there are too few loops.
 
@@ -64,23 +87,26 @@ def close_rotations(
     before; default: that of `start`.
     """
     middle = float(start[0]) if middle is None else middle
-    found = []
-    for factor in FIRST:
+    minima = []
+    for factor in settings.first_factors:
         first = start + [np.log(factor), 0.0]
-        one = _search(orient(first), first, middle)
-        if one is not None:
-            if one.sum < CLEAR:
-                return one.interior
-            found.append(one)
-    if not found:
+        minimum = _search(orient(first), first, middle, settings)
+        if minimum is not None:
+            if minimum.sum < settings.clear_sum:
+                return minimum.interior
+            minima.append(minimum)
+    if not minima:
         return start
-    most = max(one.loops for one in found)
-    best = min((one for one in found if 2 * one.loops > most), key=lambda one: one.sum).interior
-    again = _search(orient(best), best, middle)
+    # with a wrong camera few pairs are oriented, and a few loops may close by chance: only minima
+    # with more than half of the largest number of loops are compared
+    most = max(minimum.loops for minimum in minima)
+    many = [minimum for minimum in minima if 2 * minimum.loops > most]
+    best = min(many, key=lambda minimum: minimum.sum).interior
+    again = _search(orient(best), best, middle, settings)
     return best if again is None else again.interior
 
 
-class Minimum(NamedTuple):
+class ClosureMinimum(NamedTuple):
     """A minimum, the sum per independent loop, and their number."""
 
     interior: Interior
@@ -88,40 +114,46 @@ class Minimum(NamedTuple):
     loops: int
 
 
-def _search(oriented: Oriented, first: Interior, middle: float) -> Minimum | None:
+def _search(
+    oriented: OrientedPairs, first: Interior, middle: float, settings: ClosureSettings
+) -> ClosureMinimum | None:
     """The minimum next to a first interior orientation; None with too few loops."""
     from scipy.optimize import minimize
 
     pairs = oriented.pairs
     loops = find_loops([pair.images for pair in pairs])
     independent = count_independent([pairs[k].images for k in np.unique(loops)])
-    if independent < FEWEST:
+    if independent < settings.min_loops:
         return None
 
-    def total(x):
+    def total(x: Interior) -> float:
         M = turn_pairs(pairs, oriented.ideal(x))
         ij, jk, ik = (M[column] for column in loops.T)
         angle = np.nan_to_num(rotation_angle(jk @ ij @ np.swapaxes(ik, 1, 2)), nan=np.pi)
-        misclosure = independent * np.log1p((angle / ANGLE) ** 2).mean()
-        return misclosure + ((x[0] - middle) / SIGMA_C) ** 2 + (x[1] / SIGMA_K1) ** 2
+        misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
+        off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1
+        return misclosure + off[0] ** 2 + off[1] ** 2
 
-    simplex = first + np.array([[0, 0], [STEP_C, 0], [0, STEP_K1]])
-    found = minimize(
+    # without derivatives: each evaluation re-weights every pair, and the sum has kinks where wrong
+    # loops close
+    simplex = first + np.array([[0, 0], [settings.step_log_distance, 0], [0, settings.step_k1]])
+    minimum = minimize(
         total,
         first,
         method="Nelder-Mead",
         options={
             "initial_simplex": simplex,
-            "xatol": LAST_STEP,
-            "fatol": LAST_STEP,
-            "maxfev": EVALUATIONS,
+            "xatol": settings.last_step,
+            "fatol": settings.last_step,
+            "maxfev": settings.max_evaluations,
         },
     )
-    return Minimum(found.x, float(found.fun) / independent, independent)
+    return ClosureMinimum(minimum.x, float(minimum.fun) / independent, independent)
 
 
 def count_independent(pairs: Sequence[tuple[int, int]]) -> int:
-    """The number of independent loops of pairs."""
+    """The number of independent loops of pairs: edges − nodes + connected components, the
+    dimension of the cycle space of a graph."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -140,9 +172,9 @@ def find_loops(pairs: Sequence[tuple[int, int]]) -> Int[np.ndarray, "loops 3"]:
     after: dict[int, set[int]] = {}
     for i, j in pairs:
         after.setdefault(i, set()).add(j)
-    found = [
+    loops = [
         (row[i, j], row[j, k], row[i, k])
         for i, j in pairs
         for k in sorted(after[i] & after.get(j, set()))
     ]
-    return np.array(found, int).reshape(-1, 3)
+    return np.array(loops, int).reshape(-1, 3)
