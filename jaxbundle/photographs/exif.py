@@ -81,6 +81,7 @@ class Exif:
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
         was taken; None if unknown."""
+        # without knowing which part of the sensor is left
         if self.cropped:
             return None
         long = max(self.size)

@@ -60,6 +60,8 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
     """M of an attitude, from east, north, up of a map to the camera: x to the right of the picture,
     y to its top, looking along −z; `convergence`: of the meridian, degrees, grid north less it."""
     yaw, pitch, roll = np.radians([attitude.yaw - convergence, attitude.pitch, attitude.roll])
+    # the axes of the picture in east, north, up: yaw about the vertical, then pitch about the right
+    # axis, then roll about the viewing direction
     right = np.array([math.cos(yaw), -math.sin(yaw), 0.0])
     level = np.array([math.sin(yaw), math.cos(yaw), 0.0])
     ahead = math.cos(pitch) * level + math.sin(pitch) * np.array([0.0, 0.0, 1.0])
@@ -73,7 +75,7 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
 
 def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
     dji, pix4d = ([number(name) for name in names] for names in (DJI, PIX4D))
-    # A missing or failed gimbal gives all zeros.
+    # a missing or failed gimbal gives all zeros
     if None not in dji and any(dji):
         yaw, pitch, roll = dji
     elif None not in pix4d and any(pix4d):

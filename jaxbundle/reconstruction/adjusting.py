@@ -74,14 +74,14 @@ class WeightingSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Weighted:
+class WeightedAdjustment:
     """The adjustment, and the factor of σ of each kind of measurement, which is also in it; the
-    number of measurements that agree with it, and of `unused` points of two rays."""
+    number of measurements that agree with it, and `unused_points` of two rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
-    agreeing: int
-    unused: int = 0
+    agreeing_rays: int
+    unused_points: int = 0
 
     def __post_init__(self):
         if self.adjustment.converged:
@@ -103,7 +103,7 @@ def adjust_weighted(
     significance: float,
     tell: Callable[[str], None],
     settings: WeightingSettings = WeightingSettings(),
-) -> Weighted:
+) -> WeightedAdjustment:
     """Adjust with variance components of the kinds and data snooping. Without a solution, or with
     a doubtful one, adjust again without points of two rays, whose gross errors can hardly be
     detected: where an object repeats itself, some agree with its photographs by chance.
@@ -125,6 +125,7 @@ def adjust_weighted(
         failed = error
     solved = every is not None and every.adjustment.converged
     rays = network.observations
+    # points of another role than tie are checked by their coordinates
     number = np.bincount(rays.point, minlength=len(network.points))
     several = (number > 2) | ~network.points.has_role("tie")
     clear, kinds = keep_points(network, several), kinds[several[rays.point]]
@@ -141,8 +142,8 @@ def adjust_weighted(
         if clearer.adjustment.converged and (replaced or clearer.worst < every.worst):
             return dataclasses.replace(
                 clearer,
-                agreeing=_count_agreeing(network, clearer, settings.agreeing_ray),
-                unused=len(network.points) - len(clear.points),
+                agreeing_rays=_count_agreeing(network, clearer, settings.agreeing_ray),
+                unused_points=len(network.points) - len(clear.points),
             )
     assert every is not None, "an attempt ends with a result or an error"
     if solved and _removed_more(every, many):
@@ -155,20 +156,20 @@ def adjust_weighted(
     return every
 
 
-def _is_doubtful(weighted: Weighted, settings: WeightingSettings) -> bool:
+def _is_doubtful(weighted: WeightedAdjustment, settings: WeightingSettings) -> bool:
     """Whether undetected gross errors, most of them in points of two rays, may distort a result."""
     return _removed_more(weighted, settings.many_errors) or (
         _removed_more(weighted, settings.some_errors) and weighted.worst > settings.some_misfit
     )
 
 
-def _removed_more(weighted: Weighted, share: float) -> bool:
+def _removed_more(weighted: WeightedAdjustment, share: float) -> bool:
     """Whether more than a share of the measurements were gross errors."""
     result = weighted.adjustment
     return len(result.removed) > share * len(result.network.observations)
 
 
-def _count_agreeing(network: Network, clearer: Weighted, tolerance: float) -> int:
+def _count_agreeing(network: Network, clearer: WeightedAdjustment, tolerance: float) -> int:
     """The number of measurements of all points that agree with the result of some of them."""
     result = clearer.adjustment
     cameras = tuple(
@@ -176,13 +177,14 @@ def _count_agreeing(network: Network, clearer: Weighted, tolerance: float) -> in
     )
     values, points = result.image_values, network.points
     tie = points.has_role("tie")[:, None]
+    # images are placed, tie points intersected anew: start values count the rays that agree
     images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
     points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
     placed = network.replace(cameras=cameras, images=images, points=points)
     try:
         return len(find_start_values(placed, tolerance=tolerance).network.observations)
     except NotSolvedError:  # control does not agree so closely
-        return clearer.agreeing
+        return clearer.agreeing_rays
 
 
 def adjust_determined(
@@ -231,7 +233,7 @@ def _weight(
     significance: float,
     tell: Callable[[str], None],
     settings: WeightingSettings,
-) -> Weighted:
+) -> WeightedAdjustment:
     """The steps of the module, for the points of a network."""
     tell("adjustment")
     result, network, kept = adjust_determined(network)
@@ -245,6 +247,7 @@ def _weight(
             settings.suspect_residual * total[rows, None]
         )
         suspects = _name(result, beyond.any(1))
+        # once: a datum that changes with each round would change all σ, too
         network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(settings.max_rounds):
         tell("data snooping")
@@ -270,7 +273,7 @@ def _weight(
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }
     used = np.asarray(result.problem.data.image_weight) > 0
-    return Weighted(result, factors, int(used.any(1).sum()))
+    return WeightedAdjustment(result, factors, int(used.any(1).sum()))
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:

@@ -89,6 +89,7 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
 
 def is_replicated(one: Ratio, other: Ratio) -> bool:
     """Whether two halves confirm each other that a ratio is not 1."""
+    # the difference of the halves shows the correlated errors that their σ does not contain
     apart = abs(one.deviation - other.deviation)
     clear = all(abs(r.deviation) > max(CRITICAL_DEVIATION * r.sigma, apart) for r in (one, other))
     return clear and one.deviation * other.deviation > 0

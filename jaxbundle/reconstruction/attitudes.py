@@ -64,6 +64,7 @@ def with_attitudes(
             f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
             "from those of the photographs and their positions: not used"
         )
+    # one σ about all axes: the largest that the file states
     angles = np.asarray(many.angles(M))
     columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}
     columns |= {axis: angles[:, k] for k, axis in enumerate(("omega", "phi", "kappa"))}

@@ -189,6 +189,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
             if (image == k).any()
         ]
         height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
+        # as much ground as the photographs cover, by how much there is
         footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
         places = sum(footprints) / area if area else None
     times = [exif[id].time for id in network.images.id if id in exif]
@@ -261,6 +262,7 @@ def camera_positions(result: Adjustment) -> CameraPositions | None:
     nothing = np.full(3, np.nan)
     antennas = next((one for one in network.further if isinstance(one, Antennas)), None)
     if antennas is not None:
+        # the shift of the one strip is the offset of the system; not estimated axes have none
         row = {id: k for k, id in enumerate(network.images.id)}
         (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
         found = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]

@@ -38,7 +38,7 @@ class Control:
     name."""
 
     points: Points
-    seen: tuple[tuple[str, str], ...]
+    sightings: tuple[tuple[str, str], ...]
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, " n"]
     system: str = ""
@@ -102,6 +102,7 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
             raise InputError(
                 f"{path}, line {number}: X Y Z u v photograph [name] are expected, not {line!r}"
             ) from None
+        # without a name rows of one point are known by their equal coordinates, as text
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
@@ -154,11 +155,13 @@ def _collect(
     for name, X, _, place, sigma, number in records:
         if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
+        # the table repeats the coordinates in each row of a point
         if name in position and position[name] != X:
             raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
         position[name] = X
         numbers.setdefault(name, number)
     X, said = to_map(np.array(list(position.values())), system, str(path))
+    # control without a σ, NaN, gets one from --control-sigma or from its residuals
     sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
     roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
     source = Source(str(path), np.array(list(numbers.values())), "line")

@@ -27,11 +27,11 @@ class ControlChoice:
     ones estimated; the reason for points that are not used, and remarks about wrong measurements,
     by id; the `assessment` of those that could be compared."""
 
-    measured: dict[str, MeasuredPoint]
+    points: dict[str, MeasuredPoint]
     used: Bool[np.ndarray, " n"]
     sigma: Float[np.ndarray, "n 3"]
-    why: dict[str, str]
-    wrong: dict[str, list[str]]
+    reasons: dict[str, str]
+    errors: dict[str, list[str]]
     assessment: Assessment
 
     def assessed(self, rows: Bool[np.ndarray, " n"]) -> Assessment:
@@ -40,14 +40,16 @@ class ControlChoice:
 
     def remarks(self) -> list[str]:
         """What is wrong, by point."""
-        wrong = [f"{id} in {said}" for id, lines in self.wrong.items() for said in lines]
-        return [*wrong, *(f"{id} is not used: {why}" for id, why in self.why.items())]
+        wrong = [f"{id} in {said}" for id, lines in self.errors.items() for said in lines]
+        return [*wrong, *(f"{id} is not used: {why}" for id, why in self.reasons.items())]
 
 
 def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     """Control whose heights are all 0 without heights, if satellite positions contradict them; and
     what was decided."""
     points = block.given.points
+    # spreadsheets and forms write 0 for what is not known: suspected if there are several points,
+    # all of them 0, without a σ that somebody stated for a height
     heights = points.position[:, 2]
     if len(points) < MIN_CONTROL or heights.any() or np.isfinite(points.sigma[:, 2]).any():
         return points, ""
@@ -66,7 +68,7 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
             "by the satellite positions: used as the file states them"
         )
     free = points.sigma.copy()
-    free[:, 2] = np.inf
+    free[:, 2] = np.inf  # infinite: not controlled, in all that follows
     return dataclasses.replace(points, sigma=free), (
         f"the heights of all control points are 0, but {middle:.1f} ± {sigma:.1f} m by the "
         "satellite positions: taken as unknown, control is used in the plane only (state sZ for "
@@ -109,6 +111,7 @@ def choose_control(
         unknown = np.isnan(sigma[:, k])
         estimated = np.isnan(control.sigma[list(usable), k])
         sigma[unknown, k] = assessed.sigma[estimated, k][0] if estimated.any() else assumed
+    # stated σ that most points contradict are multiplied by one factor, estimated ones fit already
     sigma[np.isfinite(control.sigma)] *= assessed.factor
     choice = ControlChoice(dict(measured), np.zeros(len(control), bool), sigma, {}, {}, assessed)
     row = {k: n for n, k in enumerate(usable)}
@@ -121,17 +124,17 @@ def choose_control(
     for k, id in enumerate(control.id):
         point = measured[id]
         if not len(point.rows):
-            choice.why[id] = "in no oriented photograph"
+            choice.reasons[id] = "in no oriented photograph"
         elif k in row:
             n = row[k]
             choice.used[k] = assessed.used[n]
             if not assessed.used[n]:
-                choice.why[id] = _describe_error(assessed, n)
+                choice.reasons[id] = _describe_error(assessed, n)
         elif point.good.any():
             choice.used[k] = control.role[k] != "check"
         else:
             _settle_by_coordinates(block, choice, k, control, shift)
-        if choice.measured[id].good.any() or id not in choice.why:
+        if choice.points[id].good.any() or id not in choice.reasons:
             _name_wrong(block, choice, id)
     _name_exchanged(block, control, choice, [k for k, n in row.items() if not assessed.used[n]])
     return choice
@@ -157,8 +160,9 @@ def _settle_by_coordinates(
 ) -> None:
     """A point whose rays do not meet, or that has only one: its rays are compared with its
     coordinates."""
-    id, point = control.id[k], choice.measured[control.id[k]]
+    id, point = control.id[k], choice.points[control.id[k]]
     X = control.position[k] + shift
+    # without a height, that of the points around
     if np.isinf(control.sigma[k, 2]):
         depth = [block.X[row, 2] for row in block.determined.values()]
         X[2] = np.median(depth) if depth else X[2]
@@ -168,19 +172,20 @@ def _settle_by_coordinates(
     # σ of the measurement and, in pixels, of the coordinates
     sigma = np.hypot(point.sigma, spread / (distance * point.pixel))
     agree = off < block.settings.wrong_ray * sigma
+    # of several rays that do not meet exactly one may pass the coordinates: then that one is right
     if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
         number = count(len(point.rows), "ray")
-        choice.why[id] = (
+        choice.reasons[id] = (
             f"its {number} do not meet"
             if len(point.rows) > 1
             else "a check point needs two rays, it has 1"
         )
     elif agree.any():
-        choice.measured[id] = dataclasses.replace(point, good=agree)
+        choice.points[id] = dataclasses.replace(point, good=agree)
         choice.used[k] = True
     else:
         ground = off[0] * point.pixel[0] * distance[0]
-        choice.why[id] = (
+        choice.reasons[id] = (
             f"its only ray, in {block.name_of(point, 0)}, misses its coordinates by "
             f"{off[0]:.0f} px, {ground:.1f} m"
         )
@@ -188,7 +193,7 @@ def _settle_by_coordinates(
 
 def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
     """Remarks about the measurements of a point that do not agree with the others."""
-    point = choice.measured[id]
+    point = choice.points[id]
     X = point.position
     if not np.isfinite(X).all():
         return
@@ -200,8 +205,8 @@ def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
             "from where the other photographs see it, its ray passes at "
             f"{passes:.2f} m"
         )
-        other = block.seen_there(point, n, id, choice.measured)
-        choice.wrong.setdefault(id, []).append(
+        other = block.seen_there(point, n, id, choice.points)
+        choice.errors.setdefault(id, []).append(
             said + (f"; it is at the place of {other}: a wrong name" if other else "")
         )
 
@@ -217,4 +222,4 @@ def _name_exchanged(
             sigma = np.where(np.isfinite(choice.sigma[j]), choice.sigma[j], np.inf)
             limit = block.settings.wrong_ray * np.hypot(sigma, block.offset_sigma)
             if i != j and np.all(np.abs(off) < limit):
-                choice.why[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"
+                choice.reasons[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"

@@ -44,6 +44,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
     )
     images, moved = network.images, [block.of_id[id] for id in network.points.id]
+    # check points are no points of the network, and distances to them are left out
     row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
     here = np.array([a in row and b in row for a, b in ends], bool)
     return network.replace(
@@ -63,7 +64,8 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
             source=Source("observations"),
         ),
         further=(
-            *(one for one in network.further if not isinstance(one, ExteriorPriors)),
+            # the positions come back as observations of antennas, with an offset
+            *(kind for kind in network.further if not isinstance(kind, ExteriorPriors)),
             *_positions(block, choice),
         ),
         distances=Distances(
@@ -89,10 +91,11 @@ def _measured_points(
     ids, roles, position, sigma, rows, point = [], [], [], [], [], []
     image, spread = [], []
     for k, id in enumerate(control.id):
-        measured = choice.measured[id]
-        # a point with wrong coordinates is a good tie point
+        measured = choice.points[id]
+        # a point with wrong coordinates is a good tie point: its rays agree
         role = "check" if control.role[k] == "check" else "tie"
         role = control.role[k] if choice.used[k] else role
+        # known coordinates and one ray leave a residual, a tie point with one ray leaves none
         if measured.good.sum() < (1 if choice.used[k] else 2):
             continue
         there = np.isfinite(measured.position).all()

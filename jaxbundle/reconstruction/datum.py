@@ -41,6 +41,7 @@ def choose_datum_points(
     otherwise, or all tie points are to define it."""
     problem = result.problem
     network = problem.network
+    # control or positions define the datum, or somebody chose it
     if network.datum != "inner" or network.datum_points:
         return ()
     if network.points.has_role("control", "fixed").any():

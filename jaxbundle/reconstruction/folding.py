@@ -19,7 +19,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
-from jaxbundle.reconstruction.adjusting import Weighted
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.tiepoints.search import ideal_features, present_size
 from jaxbundle.tiepoints.track_measurement import Measurements
 
@@ -55,7 +55,7 @@ class SuperpositionSettings:
 
 
 def refuse_folded(
-    weighted: Weighted,
+    weighted: WeightedAdjustment,
     measured: Measurements,
     names: Sequence[str],
     settings: SuperpositionSettings = SuperpositionSettings(),
@@ -65,10 +65,10 @@ def refuse_folded(
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
     number = int(rays[rays > 1].sum())
-    if weighted.agreeing < settings.min_agreeing * number:
+    if weighted.agreeing_rays < settings.min_agreeing * number:
         raise _folded(
-            f"of {number} measurements in {count(len(placed), 'photograph')} {weighted.agreeing} "
-            "agree with one object",
+            f"of {number} measurements in {count(len(placed), 'photograph')} "
+            f"{weighted.agreeing_rays} agree with one object",
             names,
         )
 
@@ -76,13 +76,13 @@ def refuse_folded(
 def refuse_superimposed(
     result: Adjustment,
     measured: Network,
-    tried: set[tuple[int, int]],
+    matched_pairs: set[tuple[int, int]],
     names: Sequence[str],
     settings: SuperpositionSettings = SuperpositionSettings(),
 ) -> list[str]:
     """Pairs of photographs that contradict a result, as notes.
 
-    **Arguments:** `measured`: the network with all measurements; `tried`: matched pairs, by the
+    **Arguments:** `measured`: the network with all measurements; `matched_pairs`: by the
     positions of their photographs in `names`.
 
     **Raises:** `NotSolvedError` if there are many of them.
@@ -97,8 +97,9 @@ def refuse_superimposed(
     )
     few = shared < settings.min_shared * expected
     for i, j in np.argwhere(np.triu(clear, 1)).tolist():
-        if (min(place[i], place[j]), max(place[i], place[j])) in tried:
+        if (min(place[i], place[j]), max(place[i], place[j])) in matched_pairs:
             compared += 1
+            # in one direction only: a blurred photograph, which lacks the points of the other
             if few[i, j] and few[j, i]:
                 contradictory.append((i, j))
     contradictory.sort(key=lambda pair: -number[pair])
@@ -141,6 +142,7 @@ def count_shared_points(
     ]
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
+        # measured counts, even if it was removed as a gross error: what is missing was not found
         there = np.zeros(len(X), bool)
         there[agreeing[j]] = there[seen[j]] = True
         # within both limits the base is shorter than the rays: others have no expected points

@@ -20,7 +20,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Points
-from jaxbundle.reconstruction.adjusting import Weighted, adjust_determined
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment, adjust_determined
 from jaxbundle.reconstruction.block import camera_positions
 from jaxbundle.reconstruction.control_choice import (
     ControlChoice,
@@ -40,12 +40,12 @@ from jaxbundle.types import present
 
 
 def georeference(
-    weighted: Weighted,
+    weighted: WeightedAdjustment,
     frame: FrameData,
     significance: float,
     tell: Callable[[str], None],
     settings: ControlSettings | None = None,
-) -> tuple[Weighted, ControlTable]:
+) -> tuple[WeightedAdjustment, ControlTable]:
     """The adjustment with control and positions, and the table of control and check points.
 
     **Raises:** `InputError` or `NotSolvedError` if control does not determine the frame.
@@ -59,6 +59,7 @@ def georeference(
         for k, id in enumerate(control.id)
         if control.role[k] != "check" and block.is_determined(id, measured[id])
     ]
+    # rays and intersections again, in the frame of control
     if not block.has_positions:
         block.move(usable, control)
         measured = block.resolve()
@@ -69,8 +70,9 @@ def georeference(
         raise InputError(
             f"expected {MIN_CONTROL} control points without contradictions, got "
             f"{choice.used.sum()}: "
-            + list_some((f"{id}: {why}" for id, why in choice.why.items()), 5, str)
+            + list_some((f"{id}: {why}" for id, why in choice.reasons.items()), 5, str)
         )
+    # snooping begins without what was removed before; control is judged anew
     doubtful = [pair for pair in block.removed() if pair[1] not in control.id]
     result, _, _ = adjust_determined(
         network_with_control(block, control, choice),
@@ -88,7 +90,7 @@ def georeference(
     notes = [heights] * bool(heights) + choice.remarks()
     notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")
     table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
-    return dataclasses.replace(weighted, adjustment=result, agreeing=int(used.sum())), table
+    return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(used.sum())), table
 
 
 def _tabulate(
@@ -100,7 +102,7 @@ def _tabulate(
     compared = {} if checks is None else {id: k for k, id in enumerate(checks.id)}
     snooped = [removed.name for removed in result.removed]
     for k, id in enumerate(control.id):
-        measured = dataclasses.replace(final.measure(id), good=choice.measured[id].good)
+        measured = dataclasses.replace(final.measure(id), good=choice.points[id].good)
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
         if id in compared:
             X = present(checks).position[compared[id]]
@@ -112,7 +114,10 @@ def _tabulate(
         used = "held exactly" if control.role[k] == "fixed" else "used"
         verdict = used if choice.used[k] else "left out"
         verdict = "check" if control.role[k] == "check" else verdict
-        reasons = [*([choice.why[id]] if id in choice.why else []), *choice.wrong.get(id, [])]
+        reasons = [
+            *([choice.reasons[id]] if id in choice.reasons else []),
+            *choice.errors.get(id, []),
+        ]
         reasons += [
             f"data snooping removed {name}" for name in snooped if f"point {id} " in f"{name} "
         ]

@@ -46,6 +46,7 @@ def find_misplaced(
     which of them are right."""
     contradicted = _compare(network, pairs, settings)
     misplaced: dict[str, str] = {}
+    # one at a time: the pairs of a misplaced photograph make its neighbours look wrong, too
     while True:
         number = Counter(id for pair in contradicted for id in pair)
         bad = Counter(id for pair, wrong in contradicted.items() if wrong for id in pair)

@@ -77,17 +77,17 @@ def find_named(
             f"{n} measurements of coded targets are left out: {why}" for why, n in left_out.items()
         ]
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
-    if control is not None and control.seen:
+    if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
-        unknown = sorted({file for file, _ in control.seen if file not in index})
-        if len(unknown) == len({file for file, _ in control.seen}):
+        unknown = sorted({file for file, _ in control.sightings if file not in index})
+        if len(unknown) == len({file for file, _ in control.sightings}):
             raise InputError(
                 f"{control.points.source.name}: measured in none of the photographs, but in "
                 f"{list_some(unknown, 3, str)}"
             )
         if unknown:
             notes.append(f"control measured in missing photographs: {list_some(unknown)}")
-        for (file, id), place, s in zip(control.seen, control.xy, control.sigma):
+        for (file, id), place, s in zip(control.sightings, control.xy, control.sigma):
             if file in index:
                 image.append(index[file])
                 name.append(id)
@@ -113,6 +113,7 @@ def name_unused(
         name: len(set(named.image[np.array(named.name) == name].tolist()))
         for name in set(named.name)
     }
+    # an end in one photograph has no position, and a distance to it says nothing
     ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):

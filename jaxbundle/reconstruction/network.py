@@ -65,10 +65,10 @@ def tie_network(
 
     **Arguments:** `aspect_sigma`: of fy/fx about 1; infinite: not observed."""
     rows = np.unique(measured.image).tolist()
-    of = [cameras.of[k] for k in rows]
+    of = [cameras.camera_of[k] for k in rows]
     used = sorted(set(of))
     free = [cameras.cameras[c] for c in used]
-    if not cameras.given:
+    if not cameras.calibrated:
         free = [dataclasses.replace(camera, free=PARAMETERS) for camera in free]
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     named = extra.named.take(np.isin(extra.named.image, rows))
@@ -97,11 +97,13 @@ def tie_network(
         image_unit="px",
         name=name,
         sigma_origin=ESTIMATED,
+        # positions give frame and scale; without them inner constraints define the frame, and scale
+        # bars the scale
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )
-    if not cameras.given:
-        stated = [cameras.stated[c] for c in used]
+    if not cameras.calibrated:
+        stated = [cameras.stated_distances[c] for c in used]
         lens = [cameras.lens[c] for c in used]
         # with pixels that may not be square, fx of portrait format is fy of landscape format
         of_lens = LENS_PARAMETERS if np.isfinite(aspect_sigma) else LENS_PARAMETERS[1:]
@@ -127,6 +129,7 @@ def _observe(
     for k, (camera, file) in enumerate(zip(network.cameras, stated)):
         side = max(camera.image_size or (1, 1))
         for name, relative in PRIORS.items():
+            # equal parameters are one unknown: a second observation would count its prior twice
             if name in of_lens and lens[k] in lens[:k]:
                 continue
             if name == "fx" and file is not None:

@@ -105,7 +105,7 @@ class OrientedBlock:
         named = set(frame.points.id)
         self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
         observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
-        self.has_positions = int(observed.sum()) > 2
+        self.has_positions = int(observed.sum()) > 2  # two leave a rotation open
         self.of_id = {id: k for k, id in enumerate(points)}
 
     def measure(self, id: str) -> MeasuredPoint:
@@ -256,6 +256,7 @@ class OrientedBlock:
             x = (X - X.mean(0)) / max(np.ptp(X, axis=0).max(), 1e-12)
             turn = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
             G = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turn, x[:, :, None]], 2)
+        # exact coordinates: σ 0, while NaN is to be estimated and infinity no observation
         fixed = np.array([points.role[k] == "fixed" for k in places])
         sigma[fixed] = 0.0
         return Discrepancies(X - given, C, sigma, G)
@@ -272,6 +273,7 @@ class OrientedBlock:
                 unknowns = np.append(np.asarray(self.result.values.point)[row], lengths[row])
                 D = np.asarray(derivative(jnp.asarray(unknowns)))
             tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
+        # A·D·Q·Dᵀ·Aᵀ of these points, row by row, without the covariance matrix of the network
         Q = self.result.cofactors.solution.propagate_rows(tables)
         return self.result.sigma0**2 * np.asarray(Q).reshape(n, 3, n, 3)
 

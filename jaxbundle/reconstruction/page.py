@@ -7,7 +7,7 @@ import numpy as np
 from jaxbundle.network.columns import count
 from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WRONG_MISFIT
 from jaxbundle.reconstruction.control_table import HEADER
-from jaxbundle.reconstruction.result import Part, Reconstruction
+from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.head import count_points
 from jaxbundle.report.layout import clean, heading, significant, table
 from jaxbundle.report.layout import facts as text_facts
@@ -31,17 +31,21 @@ CONTROL = ("Control",)
 """The finding of an adjustment in place of which that of the control table stands."""
 
 
-def compose_part(whole: Reconstruction, part: Part, origin: Origin = UNKNOWN) -> Iterator[str]:
+def compose_part(
+    whole: Reconstruction, part: ReconstructedPart, origin: Origin = UNKNOWN
+) -> Iterator[str]:
     """The page of a part of a `Reconstruction`: HTML, in pieces."""
     return compose(part.adjustment, origin, also=_describe(whole, part))
 
 
-def conclude_part(whole: Reconstruction, part: Part) -> Verdict:
+def conclude_part(whole: Reconstruction, part: ReconstructedPart) -> Verdict:
     """The verdict on a part, with the use of the photographs."""
     return conclude(part.adjustment, *_findings(whole, part), len(whole.warnings))
 
 
-def _findings(whole: Reconstruction, part: Part) -> tuple[list[Finding], tuple[str, ...]]:
+def _findings(
+    whole: Reconstruction, part: ReconstructedPart
+) -> tuple[list[Finding], tuple[str, ...]]:
     """The findings of a part, and those of its adjustment that they replace."""
     fit = [_fit(part)] if part.factors else []
     controlled = part.control is not None or part.no_control
@@ -51,7 +55,7 @@ def _findings(whole: Reconstruction, part: Part) -> tuple[list[Finding], tuple[s
     )
 
 
-def describe_part(whole: Reconstruction, part: Part) -> str:
+def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
     """What a surveyor asks of a part, as text: the block, control and check points."""
     lines = heading(_name(whole, part))[1:]
     lines += text_facts(part.block.facts())
@@ -68,7 +72,7 @@ def describe_part(whole: Reconstruction, part: Part) -> str:
     return "\n".join([*lines, "", ""])
 
 
-def _describe(whole: Reconstruction, part: Part) -> Addition:
+def _describe(whole: Reconstruction, part: ReconstructedPart) -> Addition:
     sections = [*_control(part), *_positions(part)]
     sections += [_factors(part)] if part.factors else []
     if whole.left_out:
@@ -91,7 +95,7 @@ def _describe(whole: Reconstruction, part: Part) -> Addition:
     )
 
 
-def _name(whole: Reconstruction, part: Part) -> str:
+def _name(whole: Reconstruction, part: ReconstructedPart) -> str:
     """The name of the reconstruction, with that of the part if there are several."""
     return (
         whole.name
@@ -100,7 +104,7 @@ def _name(whole: Reconstruction, part: Part) -> str:
     )
 
 
-def _fit(part: Part) -> Finding:
+def _fit(part: ReconstructedPart) -> Finding:
     """The fit of the measurements, relative to their σ from matching."""
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
@@ -114,7 +118,7 @@ def _fit(part: Part) -> Finding:
     )
 
 
-def _photographs(whole: Reconstruction, part: Part) -> Finding:
+def _photographs(whole: Reconstruction, part: ReconstructedPart) -> Finding:
     used, total = len(part.adjustment.network.images), len(whole.photographs)
     words = f"{used} of {count(total, 'photograph')} in this part"
     if len(whole.parts) > 1:
@@ -126,7 +130,7 @@ def _photographs(whole: Reconstruction, part: Part) -> Finding:
     return Finding("Photographs", GOOD if complete else DOUBTFUL, words, brief)
 
 
-def _judge_control(part: Part) -> list[Finding]:
+def _judge_control(part: ReconstructedPart) -> list[Finding]:
     """Control and check points in one line each."""
     if part.no_control:
         return [Finding("Control", BAD, f"not used: {part.no_control}")]
@@ -163,7 +167,7 @@ def _judge_control(part: Part) -> list[Finding]:
     return findings
 
 
-def _control(part: Part) -> list[Section]:
+def _control(part: ReconstructedPart) -> list[Section]:
     """Control and check points."""
     if part.control is None:
         return []
@@ -173,7 +177,7 @@ def _control(part: Part) -> list[Section]:
     return [Section("control", title, points + said, "Control")]
 
 
-def _positions(part: Part) -> list[Section]:
+def _positions(part: ReconstructedPart) -> list[Section]:
     """Camera positions against the given ones."""
     positions = part.block.positions
     if positions is None:
@@ -184,7 +188,7 @@ def _positions(part: Part) -> list[Section]:
     return [Section("positions", title, grid(("photograph", "dX", "dY", "dZ"), rows), "Positions")]
 
 
-def _counts(whole: Reconstruction, part: Part) -> list[tuple[str, str]]:
+def _counts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
     """The parts, this one marked, and the pairs."""
     rows = []
     for one in whole.parts:
@@ -200,7 +204,7 @@ def _counts(whole: Reconstruction, part: Part) -> list[tuple[str, str]]:
     return [*rows, ("Verified pairs", str(len(whole.pairs)))]
 
 
-def _factors(part: Part) -> Section:
+def _factors(part: ReconstructedPart) -> Section:
     """Factors of σ of the kinds of measurements."""
     rows = [(kind, significant(factor, 4)) for kind, factor in part.factors.items()]
     note = ("kind of measurement", "factor of its a priori σ")

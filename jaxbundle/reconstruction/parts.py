@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.verification import Pair
 
 SMALLEST_PART = 3
@@ -30,7 +30,7 @@ def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
 
 
 def why_alone(
-    k: int, names: Sequence[str], matches: Sequence[Matches], pairs: Sequence[Pair]
+    k: int, names: Sequence[str], matches: Sequence[FeatureMatches], pairs: Sequence[Pair]
 ) -> str:
     """The reason why a photograph is in no part."""
     overlapping = sorted({names[j] for p in pairs if k in p.images for j in p.images if j != k})

@@ -89,7 +89,7 @@ def _list_files(given: Sequence[str | Path]) -> list[Path]:
             raise InputError(f"{path}: no such file")
         else:
             paths.append(path)
-    unique = {path.resolve(): path for path in paths}
+    unique = {path.resolve(): path for path in paths}  # a file, its folder and a link to it
     return list(unique.values())
 
 
@@ -108,9 +108,9 @@ class Cameras:
     distance and radial distortion."""
 
     cameras: tuple[Camera, ...]
-    of: tuple[int, ...]
-    stated: tuple[StatedDistance | None, ...]
-    given: bool
+    camera_of: tuple[int, ...]
+    stated_distances: tuple[StatedDistance | None, ...]
+    calibrated: bool
     notes: tuple[str, ...]
     lens: tuple[int, ...] = (0,)
 
@@ -133,6 +133,7 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
         groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
     cameras, stated, of = [], [], [0] * len(photographs)
+    # the key of a lens is that of a camera with the sides in order
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):

@@ -23,7 +23,7 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.at_once import photographs_at_once
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
-from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, Weighted, adjust_weighted
+from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WeightedAdjustment, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.block import describe_block
 from jaxbundle.reconstruction.control import Control
@@ -42,7 +42,7 @@ from jaxbundle.reconstruction.photographs import (
     name_other_files,
 )
 from jaxbundle.reconstruction.result import (
-    Part,
+    ReconstructedPart,
     Reconstruction,
     misfit_in_words,
     principal_distances,
@@ -55,7 +55,7 @@ from jaxbundle.tiepoints import track_measurement
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features, memory_of_features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.search import (
     detect,
     match,
@@ -103,6 +103,7 @@ def reconstruct(
     notes += said
     framed = positions is not None and positions.define_frame
     notes += name_unused(named, control, distances, 1 if framed else MIN_CONTROL)
+    # attitudes are those of the map: without positions in it the frame has another orientation
     attitudes = None
     if positions is not None and framed:
         attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
@@ -111,6 +112,8 @@ def reconstruct(
     if control is not None:
         points = control.points.take(~control.points.has_role("tie"))
         frame = FrameData(points, named, names, control.system, positions and positions[:2])
+        # measurements of check points take no part, in the first adjustment either: a wrong one
+        # would be judged by what it has changed
         checks = {id for id, role in zip(points.id, points.role) if role == "check"}
         named = named.take(np.array([id not in checks for id in named.name], bool))
     further = FurtherData(
@@ -148,7 +151,7 @@ class _ReconstructionRun:
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.warnings: list[tuple[float, str]] = []
-        self.tried: set[tuple[int, int]] = set()
+        self.matched_pairs: set[tuple[int, int]] = set()
         self.frame: FrameData | None = None
         self.system = self.title = ""
 
@@ -160,14 +163,14 @@ class _ReconstructionRun:
             prepared = [ahead.submit(program) for program in programs]
             features, matches = self._match()
             for first in prepared[:1]:
-                first.result()
+                first.result()  # an error of the compilation is raised here, not lost
             self._find_cameras(features, matches)
             pairs = self._verify(features, matches)
             for program in prepared:
                 program.result()
         parts = self._make_parts(features, matches, pairs)
         said = tuple(
-            (self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
+            (self.names[p.images[0]], self.names[p.images[1]], p.match_count, len(p), p.kind)
             for p in pairs
         )
         files = {p.name: p.path for p in self.photographs}
@@ -176,7 +179,7 @@ class _ReconstructionRun:
             tuple(parts), self.left_out, tuple(self.notes), said, files, tuple(warnings), self.title
         )
 
-    def _match(self) -> tuple[list[Features], list[Matches]]:
+    def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
         """Features and matches, without those of duplicates and marks."""
         features = self._detect()
         settings = self.settings
@@ -194,6 +197,7 @@ class _ReconstructionRun:
             settings.candidates,
         )
         self.store.drop_unused()
+        # before marks: all matches of a duplicate are at the same pixels, too
         sizes = [p.size for p in self.photographs]
         duplicates = find_duplicates(matches, features, sizes, settings.duplicates)
         for k, (other, still, number) in duplicates.items():
@@ -204,7 +208,7 @@ class _ReconstructionRun:
             )
         self._require_two()
         matches = [m for m in matches if not {*m.images} & duplicates.keys()]
-        self.tried = {m.images for m in matches}
+        self.matched_pairs = {m.images for m in matches}
         matches, marked = without_marks(matches, features, sizes, settings.marks)
         if marked:
             self.notes.append(
@@ -254,19 +258,22 @@ class _ReconstructionRun:
             except InputError as error:
                 why = str(error).removeprefix(f"{photograph.path}: ")
                 self.left_out[photograph.name] = why
+                # a header may be sound and the pixels not; the others go on without features of it
                 return np.zeros((8, 8), np.uint8)
 
         return read
 
-    def _find_cameras(self, features: Sequence[Features], matches: Sequence[Matches]) -> None:
+    def _find_cameras(
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches]
+    ) -> None:
         """Start values of the unknown cameras."""
-        if self.cameras.given:
+        if self.cameras.calibrated:
             return
         cameras, notes = start_cameras(
             self.cameras.cameras,
-            self.cameras.of,
+            self.cameras.camera_of,
             self.cameras.lens,
-            [stated is not None for stated in self.cameras.stated],
+            [stated is not None for stated in self.cameras.stated_distances],
             features,
             matches,
             self.settings.camera_starts,
@@ -275,9 +282,11 @@ class _ReconstructionRun:
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
 
-    def _verify(self, features: Sequence[Features], matches: Sequence[Matches]) -> list[Pair]:
+    def _verify(
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches]
+    ) -> list[Pair]:
         """The verified pairs that do not contradict each other."""
-        cameras, settings = (self.cameras.cameras, self.cameras.of, features), self.settings
+        cameras, settings = (self.cameras.cameras, self.cameras.camera_of, features), self.settings
         pairs = verify(*cameras, matches, self.tell, settings.verification)
         pairs, wrong = without_contradicted(*cameras, pairs, settings.loops)
         if wrong:
@@ -295,13 +304,14 @@ class _ReconstructionRun:
         return pairs
 
     def _make_parts(
-        self, features: Sequence[Features], matches: Sequence[Matches], pairs: Sequence[Pair]
-    ) -> list[Part]:
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches], pairs: Sequence[Pair]
+    ) -> list[ReconstructedPart]:
         """The adjusted parts, the largest first. What is left of a part is tried as another one:
         two scenes may be connected by a few wrong pairs."""
+        # two photographs in all are a part, two of many are not
         least = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
         waiting = group_connected(len(self.photographs), pairs)
-        parts: list[Part] = []
+        parts: list[ReconstructedPart] = []
         failed: list[str] = []
         while waiting:
             group = waiting.pop(0)
@@ -327,6 +337,7 @@ class _ReconstructionRun:
             ]
             for rows in group_connected(len(rest), renumbered):
                 again = [rest[k] for k in rows]
+                # a smaller group than before: the loop ends
                 if len(again) >= SMALLEST_PART and len(again) < len(group):
                     waiting.append(again)
                 else:
@@ -350,6 +361,7 @@ class _ReconstructionRun:
     def _explain_failure(self, pairs: Sequence[Pair], failed: Sequence[str]) -> str:
         """Why no part could be oriented, with a remedy."""
         kinds = {p.kind for p in pairs}
+        # the remedy depends on what the verified pairs show
         if kinds == {"rotation"} or kinds == {"rotation", "plane"}:
             return (
                 "not solved: a rotation or a plane explains every pair: the photographs were taken "
@@ -380,7 +392,7 @@ class _ReconstructionRun:
 
     def _make_part(
         self, group: Sequence[int], features: Sequence[Features], pairs: Sequence[Pair], name: str
-    ) -> tuple[Part, dict[str, str]]:
+    ) -> tuple[ReconstructedPart, dict[str, str]]:
         """An adjusted part; the photographs left out of it, with the reasons."""
         settings = self.settings
         inside = [p for p in pairs if set(p.images) <= set(group)]
@@ -393,18 +405,20 @@ class _ReconstructionRun:
         oriented, weighted, note = self._adjust_first(network, measured, named)
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
+        # before control, which fits a folded part as well as it can
         refuse_folded(weighted, measured, self.names, settings.superposition)
         doubts = refuse_superimposed(
-            weighted.adjustment, network, self.tried, self.names, settings.superposition
+            weighted.adjustment, network, self.matched_pairs, self.names, settings.superposition
         )
         self.notes += [note] if note else []
-        if weighted.unused:
+        if weighted.unused_points:
             self.notes.append(
-                f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
-                "measurements contradict each other, as on an object that repeats itself"
+                f"{name}: {count(weighted.unused_points, 'point')} of two rays not used: with "
+                "them the measurements contradict each other, as on an object that repeats itself"
             )
         control, no_control = None, ""
         if self.frame is not None:
+            # wrong control costs the frame, not the reconstruction
             try:
                 weighted, control = georeference(
                     weighted, self.frame, settings.significance, self._begin, settings.control
@@ -420,7 +434,7 @@ class _ReconstructionRun:
         template = measured.is_template
         tracks, colours = measured.track[template].tolist(), measured.colour[template].tolist()
         colour_of = {track_name(track): tuple(colour) for track, colour in zip(tracks, colours)}
-        part = Part(
+        part = ReconstructedPart(
             name, weighted.adjustment, colour_of, weighted.factors, block, control, no_control
         )
         if part.misfit >= DOUBTFUL_MISFIT:
@@ -431,12 +445,14 @@ class _ReconstructionRun:
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
         """Principal distances that contradict those of the files, in words."""
-        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated)}
+        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated_distances)}
         said = []
         for id, adjusted in principal_distances(result).items():
             file = stated.get(id)
             if file is None or not adjusted["sigma"]:
                 continue
+            # the file's value is also an observation of the adjustment, which draws the result
+            # towards it: a contradiction is larger than it looks, and the test is cautious
             sigma = np.hypot(file.sigma, adjusted["sigma"])
             off = abs(adjusted["value"] - file.value)
             if off > aspect_ratio.CRITICAL_DEVIATION * sigma:
@@ -449,13 +465,13 @@ class _ReconstructionRun:
 
     def _adjust_first(
         self, network: Network, measured: Measurements, pairs: NamedPairs
-    ) -> tuple[Oriented, Weighted, str]:
+    ) -> tuple[Oriented, WeightedAdjustment, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
         guessed = [
             camera.id
-            for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
-            if stated is None and not self.cameras.given
+            for camera, stated in zip(self.cameras.cameras, self.cameras.stated_distances)
+            if stated is None and not self.cameras.calibrated
         ]
         failed: NotSolvedError | None = None
         settings = self.settings.start_values
@@ -483,8 +499,8 @@ class _ReconstructionRun:
         raise failed
 
     def _check_ratios(
-        self, oriented: Oriented, weighted: Weighted, measured: Measurements, note: str
-    ) -> tuple[Weighted, str]:
+        self, oriented: Oriented, weighted: WeightedAdjustment, measured: Measurements, note: str
+    ) -> tuple[WeightedAdjustment, str]:
         """The adjustment with square pixels, unless halves of the photographs agree that they are
         not."""
         contradicted = aspect_ratio.contradicted_ratios(weighted.adjustment)
@@ -510,10 +526,11 @@ class _ReconstructionRun:
                 )
         if not released:
             return weighted, note
+        # from the start values: the result's gross errors were judged with square pixels
         network = aspect_ratio.release(oriented.network, released)
         return self._adjust(dataclasses.replace(oriented, network=network), measured)
 
-    def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[Weighted, str]:
+    def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
         """The adjustment from start values, and a note on attitudes."""
         placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
         kinds, names = _kinds_of_measurements(placed, measured, self.names)

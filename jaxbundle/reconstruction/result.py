@@ -14,7 +14,7 @@ from jaxbundle.report.head import count_points
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class ReconstructedPart:
     """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
     kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
     could not be used, with the reason in `no_control`."""
@@ -41,7 +41,7 @@ class Reconstruction:
     matches, agreeing matches, kind; `photographs`: the examined files, by name;
     `name` of the whole."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[ReconstructedPart, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
@@ -88,7 +88,7 @@ def distances_found(result: Adjustment) -> str:
     )
 
 
-def misfit_in_words(part: Part) -> str:
+def misfit_in_words(part: ReconstructedPart) -> str:
     """Measurements that contradict each other by far more than their σ."""
     wrong = part.misfit >= WRONG_MISFIT
     return (

@@ -157,6 +157,7 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
         return network
     value, sigma = observed.value.copy(), observed.sigma.copy()
     for row, (id, name) in enumerate(zip(observed.camera, observed.parameter)):
+        # the prior moves with the start value, with the same relative σ: else it would pull back
         if id in distances and name == "fx":
             value[row], sigma[row] = distances[id], distances[id] * sigma[row] / value[row]
     return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))

@@ -22,7 +22,7 @@ from jaxbundle.tiepoints.closure import (
 )
 from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.search import ideal_features, present_size, verify
 from jaxbundle.tiepoints.verification import SLOTS, Pair, VerificationSettings
 
@@ -50,32 +50,32 @@ class CameraStartSettings:
 
 def start_cameras(
     cameras: Sequence[Camera],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     lens: Sequence[int],
     known: Sequence[bool],
     features: Sequence[Features],
-    matches: Sequence[Matches],
+    matches: Sequence[FeatureMatches],
     settings: CameraStartSettings = CameraStartSettings(),
     verification: VerificationSettings | None = None,
 ) -> tuple[list[Camera], list[str]]:
     """Cameras with the principal distance and K1 of consistent pairs of their lens, and notes.
 
-    **Arguments:** `of`: the camera of every photograph; `lens` of every camera; `known`: whether
-    its principal distance is stated by the files: then it is also the result if that of the matches
-    contradicts it (`CameraStartSettings.believed_ratio`); `verification`: settings of the
-    verification of pairs, which also says how many matches are sufficient.
+    **Arguments:** `camera_of`: the camera of every photograph; `lens` of every camera; `known`:
+    whether its principal distance is stated by the files: then it is also the result if that of the
+    matches contradicts it (`CameraStartSettings.believed_ratio`).
     """
     verification = verification or VerificationSettings()
-    better, notes = list(cameras), []
+    better, notes, sufficient = list(cameras), [], verification.sufficient_matches
     for number in dict.fromkeys(lens):
         own = [c for c in range(len(cameras)) if lens[c] == number]
-        sufficient = verification.sufficient_matches
         pairs = [
-            _prefer_single(m, sufficient) for m in matches if {of[k] for k in m.images} <= {*own}
+            _prefer_single(m, sufficient)
+            for m in matches
+            if {camera_of[k] for k in m.images} <= {*own}
         ]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
         # relative to the image centres, which are taken as principal points
-        centred = lambda k: features[k].xy - (np.array(present_size(cameras[of[k]])) - 1) / 2
+        centred = lambda k: features[k].xy - (np.array(present_size(cameras[camera_of[k]])) - 1) / 2
         xy = [
             tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T))
             for m in _choose_pairs(pairs, settings, sufficient)
@@ -84,10 +84,17 @@ def start_cameras(
         start = estimate_interior(begin, xy, told, settings.coplanarity)
         better = with_lens(better, own, start.camera)
         if start.pairs:
-            middle = first.parameters["fx"] if told else start.camera.parameters["fx"]
+            prior = first.parameters["fx"] if told else start.camera.parameters["fx"]
             chosen = _choose_loops(pairs, settings.loop_pairs, verification.min_matches)
             better = _close(
-                better, own, of, features, chosen, np.log(middle), settings.closure, verification
+                better,
+                own,
+                camera_of,
+                features,
+                chosen,
+                np.log(middle),
+                settings.closure,
+                verification,
             )
             p = better[own[0]].parameters
             said = f"start values from matches: principal distance {p['fx']:.0f} px"
@@ -120,9 +127,9 @@ def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> 
 def _close(
     cameras: Sequence[Camera],
     own: Sequence[int],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
-    matches: Sequence[Matches],
+    matches: Sequence[FeatureMatches],
     middle: float,
     settings: ClosureSettings,
     verification: VerificationSettings,
@@ -138,14 +145,14 @@ def _close(
 
     def orient(x: Interior) -> OrientedPairs:
         quiet = lambda *_: None
-        pairs = verify(with_interior(x), of, features, matches, quiet, verification)
+        pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
         # only the matches that refine a rotation in every evaluation of the search
         pairs = [
             dataclasses.replace(pair, matches=pair.matches[many.spread(len(pair), SLOTS)])
             for pair in pairs
             if pair.kind != "rotation"
         ]
-        return OrientedPairs(pairs, _ideal_matches(pairs, own, of, features, with_interior))
+        return OrientedPairs(pairs, _ideal_matches(pairs, own, camera_of, features, with_interior))
 
     start = np.array([np.log(lens.parameters["fx"]), lens.parameters["k1"]])
     return with_interior(close_rotations(orient, start, middle, settings))
@@ -154,7 +161,7 @@ def _close(
 def _ideal_matches(
     pairs: Sequence[Pair],
     own: Sequence[int],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
     with_interior: Callable[[Interior], list[Camera]],
 ) -> Callable[[Interior], list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]]:
@@ -163,7 +170,7 @@ def _ideal_matches(
         return lambda _: []
     sides = [(k, rows) for p in pairs for k, rows in zip(p.images, p.matches.T)]
     uv = np.concatenate([features[k].xy[rows] for k, rows in sides])
-    camera = np.concatenate([np.full(len(rows), of[k]) for k, rows in sides])
+    camera = np.concatenate([np.full(len(rows), camera_of[k]) for k, rows in sides])
     ends = np.cumsum([len(rows) for _, rows in sides])[:-1]
 
     # one call for each camera instead of two for each pair
@@ -177,15 +184,15 @@ def _ideal_matches(
     return ideal
 
 
-def _prefer_single(matches: Matches, sufficient: int) -> Matches:
+def _prefer_single(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
     """The unique matches, if they are enough."""
     use = matches.single
     return matches.take(use) if use.sum() >= sufficient else matches
 
 
 def _choose_pairs(
-    pairs: Sequence[Matches], settings: CameraStartSettings, sufficient: int
-) -> list[Matches]:
+    pairs: Sequence[FeatureMatches], settings: CameraStartSettings, sufficient: int
+) -> list[FeatureMatches]:
     """The pairs with the most matches, and others with enough, spread over their numbers."""
     pairs = sorted(pairs, key=lambda m: -len(m.rows))
     if not pairs:
@@ -198,7 +205,9 @@ def _choose_pairs(
     return alike + others[: number * step : step]
 
 
-def _choose_loops(own: Sequence[Matches], most: int, min_matches: int) -> list[Matches]:
+def _choose_loops(
+    own: Sequence[FeatureMatches], most: int, min_matches: int
+) -> list[FeatureMatches]:
     """The pairs of loops of three photographs, those whose weakest pair has the most matches, each
     next to others."""
     number = {m.images: len(m.rows) for m in own if len(m.rows) >= min_matches}

@@ -129,6 +129,7 @@ def _search(
     def total(x: Interior) -> float:
         M = turn_pairs(pairs, oriented.ideal(x))
         ij, jk, ik = (M[column] for column in loops.T)
+        # a pair that cannot be refined with this camera counts as a half turn
         angle = np.nan_to_num(rotation_angle(jk @ ij @ np.swapaxes(ik, 1, 2)), nan=np.pi)
         misclosure = independent * np.log1p((angle / settings.sigma_rotation) ** 2).mean()
         off = (x[0] - middle) / settings.sigma_log_distance, x[1] / settings.sigma_k1

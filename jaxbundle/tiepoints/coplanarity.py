@@ -1,6 +1,6 @@
 """The principal distance and K1 of a camera from pairs of its photographs, without prior knowledge.
 
-Matches of two photographs satisfy the coplanarity condition only for the right interior
+FeatureMatches of two photographs satisfy the coplanarity condition only for the right interior
 orientation. Every pair is oriented relatively with principal distances over a wide range, and the
 distance with the smallest robust sum of Sampson's distances (in pixels) starts an adjustment of
 
@@ -119,6 +119,7 @@ def estimate_interior(
     M, b, part, costs, _ = _orient([_with(camera, f) for f in tried], xy1, xy2, limit)
     unusual = np.abs(np.log(np.array(tried) / (settings.usual * size)))
     doubt = 1 + settings.doubt * unusual * (1 + unusual) / 2
+    # of all pairs together: one pair alone often has a minimum at the end of the range
     best = int(np.argmin(costs.sum(1) * (1 if known else doubt)))
     f, M, b, part = tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > settings.min_agreeing)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DuplicateSettings:
 
 
 def find_duplicates(
-    matches: Sequence[Matches],
+    matches: Sequence[FeatureMatches],
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     settings: DuplicateSettings = DuplicateSettings(),
@@ -79,7 +79,7 @@ def _choose_left_out(
 
 
 def _count_still(
-    m: Matches,
+    m: FeatureMatches,
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     settings: DuplicateSettings,
@@ -98,6 +98,7 @@ def _count_still(
         for k, rows in zip((i, j), m.rows.T)
     ]
     limit = settings.max_motion + np.maximum(*blur)
+    # one of them may have been saved upright, in either direction, or upside down
     for turns in range(4):
         still = _are_still(a, b, sizes[i], limit, turns, sizes[j])
         number = int(still.sum())

@@ -91,6 +91,7 @@ def find_features(
         # the mean over the area of a pixel: the other interpolations alias when they reduce
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     points, descriptors = _search(cv2, grey, settings, settings.contrast)
+    # a low threshold for all would fill sharp photographs with features of noise
     if settings.kind == "sift" and len(points) < settings.faint_share * settings.number:
         points, descriptors = _search(cv2, grey, settings, settings.faint_contrast)
     if not points or not descriptors:

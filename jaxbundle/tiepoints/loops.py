@@ -73,6 +73,7 @@ def split_contradicted(
     **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
     """
     loops = _Loops(pairs, ideal, settings)
+    # first with all pairs, wrong ones included, which only orders them
     votes = {ids: [loops.closes(ids, k) for k in loops.thirds(ids)] for ids in loops.pairs}
 
     def strength(pair: Pair) -> tuple[bool, float]:
@@ -93,6 +94,7 @@ def split_contradicted(
             for k in loops.thirds((i, j))
             if {_pair(i, k), _pair(j, k)} <= accepted
         ]
+        # a pair by repeated features must be confirmed, unless nothing else connects its sides
         needed = pair.sure or group[i] != group[j]
         if closed.count(False) <= closed.count(True) and (needed or any(closed)):
             accepted.add((i, j))
@@ -146,11 +148,11 @@ class _Loops:
         self.settings = settings
         self.pairs = {p.images: p for p in pairs if p.kind != "rotation"}
         self.depth = {p.images: _depths(p, ideal) for p in self.pairs.values()}
-        self.next: dict[int, set[int]] = {}
+        self.neighbours: dict[int, set[int]] = {}
         for i, j in self.pairs:
-            self.next.setdefault(i, set()).add(j)
-            self.next.setdefault(j, set()).add(i)
-        self.known: dict[tuple[int, ...], bool | None] = {}
+            self.neighbours.setdefault(i, set()).add(j)
+            self.neighbours.setdefault(j, set()).add(i)
+        self.closed: dict[tuple[int, ...], bool | None] = {}
 
     def thirds(self, ids: Ids) -> list[int]:
         """Photographs that form a pair with both, those with the most matches first."""
@@ -158,15 +160,15 @@ class _Loops:
             return []
         i, j = ids
         fewest = lambda k: min(len(self.pairs[_pair(i, k)]), len(self.pairs[_pair(j, k)]))
-        common = sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))
+        common = sorted(self.neighbours[i] & self.neighbours[j], key=lambda k: (-fewest(k), k))
         return common[: self.settings.max_loops]
 
     def closes(self, ids: Ids, k: int) -> bool | None:
         """Whether a loop closes; None if the bases are unknown."""
         loop = tuple(sorted((*ids, k)))
-        if loop not in self.known:
-            self.known[loop] = self._closes(*loop)
-        return self.known[loop]
+        if loop not in self.closed:
+            self.closed[loop] = self._closes(*loop)
+        return self.closed[loop]
 
     def _closes(self, i: int, j: int, k: int) -> bool | None:
         ij, jk, ik = (self.pairs[ids] for ids in ((i, j), (j, k), (i, k)))
@@ -177,6 +179,7 @@ class _Loops:
         # photograph that they share; two of the three ratios suffice
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
+        # without two of them the bases can have any lengths: β > 0 is left of the second equation
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
             between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
             return None if between or ik.angle < self.settings.narrow_angle else False

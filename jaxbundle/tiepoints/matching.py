@@ -44,7 +44,7 @@ class MatchingSettings:
     unique, and pairs are oriented by all matches."""
 
 
-class Matches(NamedTuple):
+class FeatureMatches(NamedTuple):
     """Rows of matching features of two photographs, the most distinct first; their clarity (ratio
     of distances, the smaller the clearer); and which are unique in the photographs."""
 
@@ -53,9 +53,11 @@ class Matches(NamedTuple):
     clarity: Float[np.ndarray, " n"]
     single: Bool[np.ndarray, " n"]
 
-    def take(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Matches":
+    def take(self, chosen: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "FeatureMatches":
         """The chosen matches."""
-        return Matches(self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen])
+        return FeatureMatches(
+            self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen]
+        )
 
 
 def match_features(

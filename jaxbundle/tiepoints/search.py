@@ -16,7 +16,7 @@ from jaxbundle.tiepoints import coplanarity, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import LoopSettings, split_contradicted
 from jaxbundle.tiepoints.matching import (
-    Matches,
+    FeatureMatches,
     MatchingSettings,
     distances_within,
     match_features,
@@ -68,7 +68,7 @@ def match(
     tell: Progress,
     settings: MatchingSettings,
     candidates: CandidateSettings,
-) -> list[Matches]:
+) -> list[FeatureMatches]:
     """The matches of candidate pairs, stored ones if available."""
     with ThreadPoolExecutor(workers) as pool:
         pairs = candidate_pairs(features, way, place, pool.map, candidates)
@@ -76,10 +76,11 @@ def match(
     names = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
     stored = {pair: store.load_matches(*names(pair)) for pair in pairs}
     needed = sorted({k for pair, columns in stored.items() if columns is None for k in pair})
+    # once for each photograph, not for each of its pairs: as much work as a pair
     with ThreadPoolExecutor(workers) as pool:
         within = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
 
-    def match_pair(pair: tuple[int, int]) -> Matches:
+    def match_pair(pair: tuple[int, int]) -> FeatureMatches:
         columns = stored[pair]
         if columns is None:
             i, j = pair
@@ -87,26 +88,28 @@ def match(
             rows, clarity = match_features(features[i], features[j], settings, both)
             columns = rows, clarity, single_matches(rows, both, settings)
             store.save_matches(*names(pair), *columns)
-        return Matches(pair, *columns)
+        return FeatureMatches(pair, *columns)
 
     return map_in_threads(match_pair, pairs, workers, lambda n: tell("matching", n, len(pairs)))
 
 
 def verify(
     cameras: Sequence[Camera],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
-    matches: Sequence[Matches],
+    matches: Sequence[FeatureMatches],
     tell: Progress,
     settings: VerificationSettings,
 ) -> list[Pair]:
     """The pairs explained by one object, with the agreeing matches.
 
-    **Arguments:** `of`: the camera of every photograph.
+    **Arguments:** `camera_of`: the camera of every photograph.
     """
-    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
+    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
     # the longer side in units of c
-    size = np.array([max(present_size(cameras[c])) / _central_distance(cameras[c]) for c in of])
+    size = np.array(
+        [max(present_size(cameras[c])) / _central_distance(cameras[c]) for c in camera_of]
+    )
     matches = [m for m in matches if len(m.rows)]
     # 64 pairs at once fill eight runs of eight lanes; in between the progress is shown
     pairs, chunk = [], 64
@@ -126,13 +129,13 @@ def verify(
 
 def without_contradicted(
     cameras: Sequence[Camera],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
     pairs: Sequence[Pair],
     settings: LoopSettings,
 ) -> tuple[list[Pair], list[Pair]]:
     """The pairs consistent in loops of three, and the others."""
-    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
+    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
     return split_contradicted(pairs, ideal, settings)
 
 
@@ -155,7 +158,9 @@ def _central_distance(camera: Camera) -> float:
     return 1 / np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0))
 
 
-def _with_ideal(ideal: Sequence[Float[np.ndarray, "_ 2"]], matches: Matches) -> Matches:
+def _with_ideal(
+    ideal: Sequence[Float[np.ndarray, "_ 2"]], matches: FeatureMatches
+) -> FeatureMatches:
     """The matches whose rays point forward in both photographs."""
     there = [np.isfinite(ideal[k][rows]).all(1) for k, rows in zip(matches.images, matches.rows.T)]
     return matches.take(there[0] & there[1])

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 
 Cell = tuple[tuple[int, int], int, int]
 """Size of the photographs, column and row of a cell of a grid over them."""
@@ -51,11 +51,11 @@ class MarkSettings:
 
 
 def without_marks(
-    matches: Sequence[Matches],
+    matches: Sequence[FeatureMatches],
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     settings: MarkSettings = MarkSettings(),
-) -> tuple[list[Matches], int]:
+) -> tuple[list[FeatureMatches], int]:
     """The matches without those of marks, and the number of photographs with marks."""
     still = [_find_still(m, features, sizes, settings) for m in matches]
     images_of_cell: dict[Cell, set[int]] = {}
@@ -89,7 +89,7 @@ def without_marks(
 
 
 def _find_still(
-    m: Matches,
+    m: FeatureMatches,
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     settings: MarkSettings,
@@ -107,7 +107,7 @@ def _find_still(
 
 
 def _cells(
-    m: Matches,
+    m: FeatureMatches,
     features: Sequence[Features],
     sizes: Sequence[tuple[int, int]],
     rows: Bool[np.ndarray, " n"],

@@ -19,7 +19,8 @@ from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.matching import MatchingSettings
 
 RULES = "6"
-"""Version of features and matches: files of others are not used."""
+"""Version of features and matches: files of others are not used. To be raised with every change of
+the program, other than of settings, that changes either."""
 
 
 class Store:
@@ -104,6 +105,7 @@ class Store:
     def _save(self, name: str, **arrays: np.ndarray) -> None:
         if self.folder is None:
             return
+        # renamed when it is complete, which is atomic; by process, as two may run in one folder
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
             with part.open("wb") as file:
                 np.savez(file, **arrays)

@@ -157,6 +157,7 @@ def measure_tracks(
     rays = _place_windows(tracks, features, settings)
     cutouts = _cut_out(rays, len(features), read, advance, settings)
     inside = cutouts.inside
+    # the window inside its own photograph, and a place for it in the other
     others = np.flatnonzero(~rays.is_template & inside & inside[rays.template])
     start = rays.start[others]
     start[:, :, 2] -= rays.corner[others]

@@ -1,6 +1,6 @@
 """Tracks: one point in all its photographs, from matches of pairs.
 
-Matches are joined, the most distinct first (union-find); one that would put two points of a
+FeatureMatches are joined, the most distinct first (union-find); one that would put two points of a
 photograph into a track contradicts better ones and is left out. The kept tracks cover
 every photograph evenly, long ones first, and none next to another.
 """

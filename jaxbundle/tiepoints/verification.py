@@ -6,11 +6,10 @@ matches: the coplanarity misclosure (Sampson), and both rays in front. A pure ro
 homography, that explains nearly all of them as well is reported: two photographs from one position,
 or of a plane, which do not start a model.
 
-Unique matches come first (`Matches.single`): in a row of windows, matches of each window to its
-neighbour are consistent with a wrong orientation, shifted by their distance. All matches are used
-only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
-`SUFFICIENT_MATCHES` unique matches the others are left out: windows follow one another along an
-epipolar line.
+Unique matches come first (`FeatureMatches.single`): in a row of windows, matches of each window to
+its neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
+used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with sufficient
+unique matches the others are left out: windows follow one another along an epipolar line.
 
 Agreeing matches must be distributed over both photographs, not in one corner: a common sign
 in two scenes does not prove that they are the same.
@@ -88,7 +87,7 @@ class Pair:
     """Two overlapping photographs: rows of matching features; M from the first camera to
     the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or a
     sufficient simpler relation: `"plane"`, `"rotation"` (b is then zero or without meaning);
-    `found`: matches before verification; `sure`: oriented by unique matches."""
+    `match_count`: before verification; `sure`: oriented by unique matches."""
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
@@ -97,14 +96,14 @@ class Pair:
     b: Float[np.ndarray, "3"]
     angle: float
     kind: str
-    found: int
+    match_count: int
     sure: bool = True
 
     def __len__(self) -> int:
         return len(self.matches)
 
 
-class Verified(NamedTuple):
+class VerifiedPair(NamedTuple):
     """The matches of a pair explained by one object; M, b, angle and kind as of `Pair`."""
 
     good: Bool[np.ndarray, " n"]
@@ -125,7 +124,7 @@ def verify_pairs(
     tolerance: Float[np.ndarray, " pairs"],
     single: Sequence[Bool[np.ndarray, " _"]] | None = None,
     settings: VerificationSettings = VerificationSettings(),
-) -> list[Verified | None]:
+) -> list[VerifiedPair | None]:
     """The part of each pair explained by one object; None if too few matches agree.
 
     **Arguments:** matches, the most distinct first, as ideal image coordinates, c = 1; `tolerance`:
@@ -134,7 +133,7 @@ def verify_pairs(
     single = [np.ones(len(xy), bool) for xy in xy1] if single is None else single
     least = settings.min_matches
     usable = [k for k, xy in enumerate(xy1) if len(xy) >= least]
-    verified: list[Verified | None] = [None] * len(xy1)
+    verified: list[VerifiedPair | None] = [None] * len(xy1)
     if not usable:
         return verified
     find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
@@ -165,9 +164,9 @@ def verify_pairs(
     )
     for k, (good, angle, kind) in zip(left, kinds):
         _, M, b = agreed[k]
-        verified[k] = Verified(good, M, b, angle, kind, k in sure)
+        verified[k] = VerifiedPair(good, M, b, angle, kind, k in sure)
     for k, (good, M) in turned.items():
-        verified[k] = Verified(good, M, np.zeros(3), 0.0, "rotation", True)
+        verified[k] = VerifiedPair(good, M, np.zeros(3), 0.0, "rotation", True)
     return verified
 
 
@@ -214,6 +213,7 @@ def _orient_by_rows(
         settings.first_tolerance * tolerance[keys],
     )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
+    # matches and orientation by turns, the second time with those of the final tolerance
     for factor in (settings.first_tolerance, 1.0):
         poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
     agreed = {}
@@ -330,6 +330,7 @@ def turn_pairs(
     rows = [many.spread(len(pair), SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
+    # with a strong K1 rays of the border have no image: without weight
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
     start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
@@ -338,6 +339,7 @@ def turn_pairs(
 
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """The angle of rotations, radians."""
+    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)

@@ -10,7 +10,7 @@ from jaxbundle import Camera
 from jaxbundle.network.tables import Points
 from jaxbundle.planning.simulate import simulate_with_truth
 from jaxbundle.planning.stations import Stations
-from jaxbundle.reconstruction.adjusting import Weighted
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.reconstruction.named import NamedMeasurements
 from jaxbundle.reconstruction.oriented_block import FrameData
 
@@ -45,14 +45,14 @@ class Drone:
         return FrameData(points, named or self.named, self.images, "EPSG:32611",
                      self.positions if positions else None)  # fmt: skip
 
-    def block(self, positions=True) -> Weighted:
+    def block(self, positions=True) -> WeightedAdjustment:
         """The block adjusted without control, in the system of the positions or in its own; once
         for all tests."""
         if positions not in self.blocks:
             self.blocks[positions] = self._block(positions)
         return self.blocks[positions]
 
-    def _block(self, positions: bool) -> Weighted:
+    def _block(self, positions: bool) -> WeightedAdjustment:
         network = self.network
         if not positions:
             images, points = network.images, network.points
@@ -64,7 +64,7 @@ class Drone:
             )  # fmt: skip
         result = jaxbundle.adjust(network)
         assert result.converged
-        return Weighted(result, {}, len(network.observations))
+        return WeightedAdjustment(result, {}, len(network.observations))
 
 
 def swapped(named: NamedMeasurements, point: str, other: str) -> tuple[NamedMeasurements, int]:

@@ -33,7 +33,7 @@ def test_gcp_list_of_opendronemap(tmp_path):
         "544157.7 5320899.2 5.5 4193 1552 a.jpg\n"
     )))  # fmt: skip
     assert found.points.id == ("gcp1", "544157.7,5320899.2") and found.system == "EPSG:32633"
-    assert found.seen[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
+    assert found.sightings[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
     np.testing.assert_allclose(found.xy[1], [1022.5, 18])
     assert np.isnan(found.points.sigma).all()
 
@@ -55,7 +55,7 @@ def test_tables_with_and_without_measurements(tmp_path):
     np.testing.assert_allclose(found.points.sigma, [[0.01, 0.01, 0.02]])
     np.testing.assert_allclose(found.sigma, [0.5, 1.0])
     plain = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n"))
-    assert plain.points.id == ("45",) and plain.seen == ()
+    assert plain.points.id == ("45",) and plain.sightings == ()
 
 
 @pytest.mark.parametrize("text, said", [

@@ -19,7 +19,7 @@ from jaxbundle.tiepoints.closure import (
 from jaxbundle.tiepoints.coplanarity import estimate_interior
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import Matches, distances_within, match_features
+from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
@@ -91,7 +91,7 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
         rows = np.tile(np.arange(len(X))[:, None], 2)
         wrong = rng.random(len(X)) < (0.2 if (i, j) != (1, 4) else 1.0)
         rows[wrong, 1] = rng.permutation(rows[wrong, 1])
-        matches.append(Matches((i, j), rows, np.full(len(X), 0.5), np.ones(len(X), bool)))
+        matches.append(FeatureMatches((i, j), rows, np.full(len(X), 0.5), np.ones(len(X), bool)))
     told = {"fx": 1.2 * F, "fy": 1.2 * F, "cx": 599.5, "cy": 449.5, "k1": 0.0}
     camera = jaxbundle.Camera("c", "opencv", told, image_size=SIZE)
     (found,), notes = start_cameras([camera], [0] * 6, [0], [True], features, matches)
@@ -359,7 +359,8 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
         for view in views
     ]  # fmt: skip
     rows = np.tile(np.arange(len(size))[:, None], 2)
-    pair = lambda i, j: Matches((i, j), rows, np.full(len(rows), 0.5), np.ones(len(rows), bool))
+    clarity, single = np.full(len(rows), 0.5), np.ones(len(rows), bool)
+    pair = lambda i, j: FeatureMatches((i, j), rows, clarity, single)
     matches = [pair(i, j) for i in range(5) for j in range(i)]
     found, marked = without_marks(matches, photographs, [SIZE] * 5)
     assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)
