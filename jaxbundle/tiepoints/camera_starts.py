@@ -86,16 +86,8 @@ def start_cameras(
         if start.pairs:
             prior = first.parameters["fx"] if told else start.camera.parameters["fx"]
             chosen = _choose_loops(pairs, settings.loop_pairs, verification.min_matches)
-            better = _close(
-                better,
-                own,
-                camera_of,
-                features,
-                chosen,
-                np.log(middle),
-                settings.closure,
-                verification,
-            )
+            search = np.log(prior), settings.closure, verification
+            better = _close(better, own, camera_of, features, chosen, *search)
             p = better[own[0]].parameters
             said = f"start values from matches: principal distance {p['fx']:.0f} px"
             stated, ratio = first.parameters["fx"], settings.believed_ratio
