@@ -82,7 +82,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
 
     start, processor = time.perf_counter(), time.process_time()
     try:
-        found = reconstruct([folder], tell=tell)
+        found = reconstruct([folder], progress=tell)
     except NotSolvedError as error:
         return {"failed": str(error), "parts": [], "left_out": dict.fromkeys(truth, "")}
     return {
