@@ -113,7 +113,7 @@ class _Rays:
     """The features of all tracks, by measurement; `is_template`, `level` as of `Measurements`;
     `template`: the measurement that gives the window of its track; `corner`: the first column and
     row of its window or search window, and `start`: A, from pixels about the centre of the window
-    to those of its level."""
+    to those of the search window."""
 
     track: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
@@ -159,15 +159,13 @@ def measure_tracks(
     inside = cutouts.inside
     # the window inside its own photograph, and a place for it in the other
     others = np.flatnonzero(~rays.is_template & inside & inside[rays.template])
-    start = rays.start[others]
-    start[:, :, 2] -= rays.corner[others]
     half = settings.window // 2
     bend = settings.second_order_sigma * half**2 * rays.scale / cutouts.longer[rays.image]
     matches = _match_in_chunks(
         cutouts.windows[rays.track[others]],
         cutouts.pieces,
         others,
-        start.astype(np.float32),
+        rays.start[others].astype(np.float32),
         bend[others].astype(np.float32),
         settings.correlation_length,
     )
@@ -203,6 +201,7 @@ def _place_windows(
     start = _predict_affine(xy, size, angle, scale, centre, template)
     corner = np.rint(start[:, :, 2]) - settings.search_window // 2
     corner[is_template] = centre[is_template] - settings.window // 2
+    start[:, :, 2] -= corner
     return _Rays(track, image, xy, size, is_template, level, template, corner, start)
 
 
@@ -385,7 +384,7 @@ def _collect(
     templates = np.flatnonzero(rays.is_template)
     number = np.bincount(track[rows], minlength=len(templates))
     # the point is the centre of the window, if that is matched, else the feature
-    from_window = rays.start[:, :, 2] * scale[:, None]
+    from_window = (rays.start[:, :, 2] + corner) * scale[:, None]
     xy = np.where(number[track, None] > 0, from_window, rays.xy)
     xy[rows] = place[good] * scale[rows, None]
     # the share of the window, from each of its matches, and their mean
