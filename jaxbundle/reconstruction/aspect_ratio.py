@@ -71,6 +71,7 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
         # three photographs leave the principal point of an unknown camera to its prior
         if len(half.images) < 4:
             return {}
+        # a half that does not determine its cameras confirms nothing
         try:
             alone = adjust(half)
         except (InputError, NotSolvedError):
@@ -104,6 +105,7 @@ def release(network: Network, cameras: Collection[str]) -> Network:
     keep = [
         name != ASPECT or id not in cameras for id, name in zip(observed.camera, observed.parameter)
     ]
+    # of a lens in portrait format fy lies along the other axis: fx of both are then two unknowns
     network = with_observed(network, observed.take(np.array(keep)))
     return network.replace(
         further=tuple(

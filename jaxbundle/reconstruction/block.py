@@ -172,6 +172,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     known = np.isfinite(X[point]).all(1)
     image, point = image[known], point[known]
     depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
+    # by photograph first: one with many points does not decide for all
     of_image = np.array(
         [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
     )

@@ -77,6 +77,7 @@ def read_control_measurements(path: str | Path) -> Control:
     ]
     if not rows:
         raise InputError(f"{path}: the file is empty")
+    # three formats, told apart by the first line: column names, a coordinate system, anything else
     head = [cell.strip().lower() for cell in rows[0][1].split(",")]
     if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
         return _read_table(path, head, rows[1:])

@@ -39,7 +39,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     # the rows of the points in the new network, −1: named ones, which are added anew
     new_row = np.array([row.get(id, -1) for id in whole.points.id])
     rays = whole.observations.take(new_row[whole.observations.point] >= 0)
-    added = _measured_points(block, control, choice, len(row))
+    added = _gather_points(block, control, choice, len(row))
     xy, sigma = from_image_unit(
         block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
     )
@@ -66,7 +66,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         further=(
             # the positions come back as observations of antennas, with an offset
             *(kind for kind in network.further if not isinstance(kind, ExteriorPriors)),
-            *_positions(block, choice),
+            *_observe_positions(block, choice),
         ),
         distances=Distances(
             np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep], int).reshape(
@@ -84,7 +84,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     )
 
 
-def _measured_points(
+def _gather_points(
     block: OrientedBlock, control: Points, choice: ControlChoice, first: int
 ) -> _NamedPoints:
     """Control and check points that can be determined, with their good measurements."""
@@ -131,7 +131,7 @@ def _place_on_ray(block: OrientedBlock, measured: MeasuredPoint) -> Float[np.nda
     return X0 + depth * measured.rays[first]
 
 
-def _positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
+def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
     """Satellite positions as observations, with an offset on the axes that control has."""
     if block.frame.positions is None:
         return []

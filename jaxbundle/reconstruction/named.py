@@ -80,6 +80,7 @@ def find_named(
     if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
         unknown = sorted({file for file, _ in control.sightings if file not in index})
+        # all: another folder was given; some: photographs that were left out of it
         if len(unknown) == len({file for file, _ in control.sightings}):
             raise InputError(
                 f"{control.points.source.name}: measured in none of the photographs, but in "

@@ -47,17 +47,17 @@ def _findings(
     whole: Reconstruction, part: ReconstructedPart
 ) -> tuple[list[Finding], tuple[str, ...]]:
     """The findings of a part, and those of its adjustment that they replace."""
-    fit = [_fit(part)] if part.factors else []
+    fit = [_judge_fit(part)] if part.factors else []
     controlled = part.control is not None or part.no_control
     return (
-        [*fit, _photographs(whole, part), *_judge_control(part)],
+        [*fit, _judge_photographs(whole, part), *_judge_control(part)],
         (*INAPPLICABLE, *CONTROL) if controlled else INAPPLICABLE,
     )
 
 
 def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
     """What a surveyor asks of a part, as text: the block, control and check points."""
-    lines = heading(_name(whole, part))[1:]
+    lines = heading(_name(whole, part))[1:]  # without the empty line before it
     lines += text_facts(part.block.facts())
     if part.no_control:
         lines += ["", *text_paragraph(f"Control is not used: {part.no_control}")]
@@ -73,13 +73,13 @@ def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
 
 
 def _describe(whole: Reconstruction, part: ReconstructedPart) -> Addition:
-    sections = [*_control(part), *_positions(part)]
-    sections += [_factors(part)] if part.factors else []
+    sections = [*_list_control(part), *_list_positions(part)]
+    sections += [_list_factors(part)] if part.factors else []
     if whole.left_out:
         rows = grid(("photograph", "reason"), whole.left_out.items(), "words")
         sections.append(Section("left-out", "Photographs left out", rows, "Left out"))
     overview = f"<h3>Block {clean(whole.name)}</h3>\n{facts(part.block.facts())}"
-    overview += f"<h3>Reconstruction</h3>\n{facts(_counts(whole, part))}"
+    overview += f"<h3>Reconstruction</h3>\n{facts(_count_parts(whole, part))}"
     if whole.notes:
         overview += items(whole.notes)
     findings, without = _findings(whole, part)
@@ -89,7 +89,7 @@ def _describe(whole: Reconstruction, part: ReconstructedPart) -> Addition:
         overview=overview,
         warnings=whole.warnings,
         sections=tuple(sections),
-        tables={"pairs": _pairs(whole)},
+        tables={"pairs": _list_pairs(whole)},
         name=_name(whole, part),
         without=without,
     )
@@ -104,7 +104,7 @@ def _name(whole: Reconstruction, part: ReconstructedPart) -> str:
     )
 
 
-def _fit(part: ReconstructedPart) -> Finding:
+def _judge_fit(part: ReconstructedPart) -> Finding:
     """The fit of the measurements, relative to their σ from matching."""
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
@@ -118,13 +118,14 @@ def _fit(part: ReconstructedPart) -> Finding:
     )
 
 
-def _photographs(whole: Reconstruction, part: ReconstructedPart) -> Finding:
+def _judge_photographs(whole: Reconstruction, part: ReconstructedPart) -> Finding:
     used, total = len(part.adjustment.network.images), len(whole.photographs)
     words = f"{used} of {count(total, 'photograph')} in this part"
     if len(whole.parts) > 1:
         words += f", {len(whole.parts)} unconnected parts"
     if whole.left_out:
         words += f", {len(whole.left_out)} left out"
+    # a verdict is about the photographs that somebody took, not about those that were used
     complete = len(whole.parts) == 1 and not whole.left_out
     brief = f"{total - used} of {count(total, 'photograph')} not in this result"
     return Finding("Photographs", GOOD if complete else DOUBTFUL, words, brief)
@@ -150,6 +151,7 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     )
     if left:
         words += f"; left out: {', '.join(left)}"
+    # the verdicts of the table, which name photograph and point, are its only source
     wrong = sum("wrong measurement" in p.verdict for p in part.control.points)
     if wrong:
         words += f"; {count(wrong, 'point')} with a wrong measurement"
@@ -167,7 +169,7 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     return findings
 
 
-def _control(part: ReconstructedPart) -> list[Section]:
+def _list_control(part: ReconstructedPart) -> list[Section]:
     """Control and check points."""
     if part.control is None:
         return []
@@ -177,7 +179,7 @@ def _control(part: ReconstructedPart) -> list[Section]:
     return [Section("control", title, points + said, "Control")]
 
 
-def _positions(part: ReconstructedPart) -> list[Section]:
+def _list_positions(part: ReconstructedPart) -> list[Section]:
     """Camera positions against the given ones."""
     positions = part.block.positions
     if positions is None:
@@ -188,7 +190,7 @@ def _positions(part: ReconstructedPart) -> list[Section]:
     return [Section("positions", title, grid(("photograph", "dX", "dY", "dZ"), rows), "Positions")]
 
 
-def _counts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
+def _count_parts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
     """The parts, this one marked, and the pairs."""
     rows = []
     for one in whole.parts:
@@ -204,14 +206,14 @@ def _counts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, s
     return [*rows, ("Verified pairs", str(len(whole.pairs)))]
 
 
-def _factors(part: ReconstructedPart) -> Section:
+def _list_factors(part: ReconstructedPart) -> Section:
     """Factors of σ of the kinds of measurements."""
     rows = [(kind, significant(factor, 4)) for kind, factor in part.factors.items()]
     note = ("kind of measurement", "factor of its a priori σ")
     return Section("factors", "Variance factors", grid(note, rows), "Variance factors")
 
 
-def _pairs(whole: Reconstruction) -> Listing:
+def _list_pairs(whole: Reconstruction) -> Listing:
     one, other, matches, verified, kind = zip(*whole.pairs) if whole.pairs else ((),) * 5
     words = lambda values: np.array(values, dtype=object)
     return Listing(

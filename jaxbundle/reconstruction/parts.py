@@ -22,7 +22,7 @@ def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
 
     for pair in pairs:
         a, b = (find_root(k) for k in pair.images)
-        root[max(a, b)] = min(a, b)
+        root[max(a, b)] = min(a, b)  # by the smallest: groups do not depend on the order of pairs
     groups: dict[int, list[int]] = {}
     for k in range(number):
         groups.setdefault(find_root(k), []).append(k)

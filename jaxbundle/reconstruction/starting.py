@@ -81,6 +81,7 @@ def start_values(
         except NotSolvedError as error:
             failed = error
         else:
+            # a wide tolerance lets wrong points in: only if the narrow one loses photographs
             if not candidates[-1].images:
                 break
     # those that leave out the fewest photographs first
