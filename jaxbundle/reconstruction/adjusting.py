@@ -118,8 +118,8 @@ def adjust_weighted(
     try:
         every = weight(network, kinds)
         # two photographs have no points of three rays to compare with
-        sound = len(network.images) < 3 or not _is_doubtful(every, settings)
-        if every.adjustment.converged and sound:
+        few = len(network.images) < 3
+        if every.adjustment.converged and (few or not _is_doubtful(every, settings)):
             return every
     except NotSolvedError as error:
         failed = error
