@@ -1,11 +1,12 @@
-"""OpenCV and Pillow (extra `images`), imported on demand."""
+"""OpenCV and Pillow (extra `images`), imported on demand: modules that a type checker may not
+have."""
 
-from types import ModuleType
+from typing import Any
 
 from jaxbundle.errors import InputError
 
 
-def need_opencv() -> ModuleType:
+def need_opencv() -> Any:
     """The module cv2, or an error that says what to install."""
     try:
         import cv2
@@ -16,7 +17,7 @@ def need_opencv() -> ModuleType:
     return cv2
 
 
-def need_pillow() -> ModuleType:
+def need_pillow() -> Any:
     """The module PIL.Image, or an error that says what to install."""
     try:
         from PIL import Image

@@ -74,17 +74,16 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
 
 
 def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
-    dji, pix4d = ([number(name) for name in names] for names in (DJI, PIX4D))
-    # a missing or failed gimbal gives all zeros
-    if None not in dji and any(dji):
-        yaw, pitch, roll = dji
-    elif None not in pix4d and any(pix4d):
-        yaw, pitch, roll = pix4d
-        pitch -= 90
-    else:
-        return None
     stated = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
-    return CameraAttitude(yaw, pitch, roll, stated if stated and stated > 0 else SIGMA_ATTITUDE)
+    sigma = stated if stated and stated > 0 else SIGMA_ATTITUDE
+    # the pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's
+    for names, horizon in ((DJI, 0.0), (PIX4D, 90.0)):
+        angles = [angle for angle in map(number, names) if angle is not None]
+        # a missing or failed gimbal gives all zeros
+        if len(angles) == 3 and any(angles):
+            yaw, pitch, roll = angles
+            return CameraAttitude(yaw, pitch - horizon, roll, sigma)
+    return None
 
 
 def _fields(packet: bytes | str) -> Mapping[str, str]:

@@ -138,8 +138,9 @@ def adjust_weighted(
     else:
         if not clearer.adjustment.converged and not solved:
             return every or clearer
-        replaced = every is None or not solved or _removed_more(every, many)
-        if clearer.adjustment.converged and (replaced or clearer.worst < every.worst):
+        if clearer.adjustment.converged and (
+            every is None or not solved or _removed_more(every, many) or clearer.worst < every.worst
+        ):
             return dataclasses.replace(
                 clearer,
                 agreeing_rays=_count_agreeing(network, clearer, settings.agreeing_ray),
@@ -246,7 +247,7 @@ def _weight(
         beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > (
             settings.suspect_residual * total[rows, None]
         )
-        suspects = _name(result, beyond.any(1))
+        suspects = _name(result, np.any(beyond, axis=1))
         # once: a datum that changes with each round would change all σ, too
         network = network.replace(datum_points=choose_datum_points(result))
     for _ in range(settings.max_rounds):
@@ -268,7 +269,7 @@ def _weight(
             break
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0
-        suspects = _name(result, ~used.any(1))
+        suspects = _name(result, ~np.any(used, axis=1))
     factors = {
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }

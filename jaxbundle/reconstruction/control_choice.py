@@ -47,7 +47,7 @@ class ControlChoice:
 def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     """Control whose heights are all 0 without heights, if satellite positions contradict them; and
     what was decided."""
-    points = block.given.points
+    points = block.frame.points
     # spreadsheets and forms write 0 for what is not known: suspected if there are several points,
     # all of them 0, without a σ that somebody stated for a height
     heights = points.position[:, 2]

@@ -135,14 +135,12 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     """Control and check points in one line each."""
     if part.no_control:
         return [Finding("Control", BAD, f"not used: {part.no_control}")]
-    if part.control is None:
+    if (control := part.control) is None:
         return []
-    given = [p for p in part.control.points if p.role != "check"]
-    checks = [p for p in part.control.points if p.role == "check"]
+    given = [p for p in control.points if p.role != "check"]
+    checks = [p for p in control.points if p.role == "check"]
     rms = lambda role: " ".join(
-        f"{axis} {significant(x)}"
-        for axis, x in zip("XYZ", part.control.rms(role))
-        if np.isfinite(x)
+        f"{axis} {significant(x)}" for axis, x in zip("XYZ", control.rms(role)) if np.isfinite(x)
     )
     used, left = [p for p in given if p.used], part.control.left_out
     words = (

@@ -190,7 +190,7 @@ def _adjust(
     limit: float,
 ) -> tuple[float, float, Float[np.ndarray, "pairs slots"]]:
     """f, k1 and the misclosures after an adjustment of all pairs together."""
-    rows = np.arange(PAIRS) % len(pairs)
+    rows = [k % len(pairs) for k in range(PAIRS)]
     weight = (np.arange(PAIRS) < len(pairs)).astype(float)
     xy1, xy2 = (np.stack([_fill(pairs[k][i]) for k in rows]) for i in (0, 1))
     model = get_model(camera.model)

@@ -120,7 +120,7 @@ def _are_still(
 ) -> Bool[np.ndarray, " n"]:
     """Which matches are at the same place, the second photograph turned by quarters."""
     if turns % 2:
-        other_size = other_size[::-1]
+        other_size = other_size[1], other_size[0]
     ratio = size[0] / size[1] * other_size[1] / other_size[0]
     # 1 %: whole pixels of a reduced photograph; cropped ones do not show the same
     if abs(np.log(ratio)) > 0.01:

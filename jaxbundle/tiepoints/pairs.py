@@ -76,7 +76,8 @@ def _most_similar(
     features: Sequence[Features], run: Callable, settings: CandidateSettings
 ) -> list[tuple[int, int]]:
     every = list(combinations(range(len(features)), 2))
-    count = lambda pair: number_alike(*(features[k] for k in pair), settings.largest_features)
+    most = settings.largest_features
+    count = lambda pair: number_alike(features[pair[0]], features[pair[1]], most)
     similar = [[] for _ in features]
     for (i, j), number in zip(every, run(count, every)):
         if number >= settings.min_matches:

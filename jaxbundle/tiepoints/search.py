@@ -155,12 +155,13 @@ def _central_distance(camera: Camera) -> float:
     """The principal distance in pixels, from the images of two points near the centre."""
     columns, rows = present_size(camera)
     middle = np.array([[columns / 2 - 0.5, rows / 2 - 0.5], [columns / 2 + 0.5, rows / 2 - 0.5]])
-    return 1 / np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0))
+    return 1 / float(np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0)))
 
 
 def _with_ideal(
     ideal: Sequence[Float[np.ndarray, "_ 2"]], matches: FeatureMatches
 ) -> FeatureMatches:
     """The matches whose rays point forward in both photographs."""
-    there = [np.isfinite(ideal[k][rows]).all(1) for k, rows in zip(matches.images, matches.rows.T)]
+    xy = [ideal[k][rows] for k, rows in zip(matches.images, matches.rows.T)]
+    there = [np.all(np.isfinite(a), axis=1) for a in xy]
     return matches.take(there[0] & there[1])

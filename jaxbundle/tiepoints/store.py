@@ -108,5 +108,5 @@ class Store:
         # renamed when it is complete, which is atomic; by process, as two may run in one folder
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
             with part.open("wb") as file:
-                np.savez(file, **arrays)
+                np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
             part.replace(self.folder / f"{name}.npz")

@@ -147,7 +147,7 @@ def measure_tracks(
     tracks: Sequence[Sequence[tuple[int, int]]],
     features: Sequence[Features],
     read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[], object] = lambda: None,
     settings: TrackMatchingSettings = TrackMatchingSettings(),
 ) -> Measurements:
     """Measure all points of every track; each photograph is read once.
@@ -252,7 +252,7 @@ def _cut_out(
     rays: _Rays,
     photographs: int,
     read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
-    advance: Callable[[], None],
+    advance: Callable[[], object],
     settings: TrackMatchingSettings,
 ) -> _Cutouts:
     """Windows and search windows of all photographs, each of which is in memory only once."""
