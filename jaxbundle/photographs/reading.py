@@ -54,7 +54,8 @@ def image_errors(path: str | Path | None = None) -> Iterator[None]:
             raise PhotographMemoryError(_describe_shortage(path)) from None
         if isinstance(error, need_opencv().error):
             where = "" if path is None else f"{path}: "
-            raise InputError(f"{where}OpenCV cannot process this image: {error.err}") from None
+            words = getattr(error, "err", error)
+            raise InputError(f"{where}OpenCV cannot process this image: {words}") from None
         raise
 
 
