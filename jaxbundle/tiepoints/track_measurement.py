@@ -109,7 +109,7 @@ class Measurements:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Rays:
+class _TrackRays:
     """The features of all tracks, by measurement; `is_template`, `level` as of `Measurements`;
     `template`: the measurement that gives the window of its track; `corner`: the first column and
     row of its window or search window, and `start`: A, from pixels about the centre of the window
@@ -132,7 +132,7 @@ class _Rays:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Cutouts:
+class _TrackWindows:
     """Windows by track; search windows, whether they are inside, and the colours of the points by
     measurement; the longer sides of the photographs."""
 
@@ -185,7 +185,7 @@ def _place_windows(
     tracks: Sequence[Sequence[tuple[int, int]]],
     features: Sequence[Features],
     settings: TrackMatchingSettings,
-) -> _Rays:
+) -> _TrackRays:
     """Where the windows of all tracks are cut out, and where they are expected in the others."""
     track, image, feature = flatten(tracks)
     n = len(track)
@@ -202,7 +202,7 @@ def _place_windows(
     corner = np.rint(start[:, :, 2]) - settings.search_window // 2
     corner[is_template] = centre[is_template] - settings.window // 2
     start[:, :, 2] -= corner
-    return _Rays(track, image, xy, size, is_template, level, template, corner, start)
+    return _TrackRays(track, image, xy, size, is_template, level, template, corner, start)
 
 
 def _choose_templates(
@@ -249,12 +249,12 @@ def _predict_affine(
 
 
 def _cut_out(
-    rays: _Rays,
+    rays: _TrackRays,
     photographs: int,
     read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     advance: Callable[[], object],
     settings: TrackMatchingSettings,
-) -> _Cutouts:
+) -> _TrackWindows:
     """Windows and search windows of all photographs, each of which is in memory only once."""
     cv2 = need_opencv()
     n, is_template = len(rays.image), rays.is_template
@@ -287,7 +287,7 @@ def _cut_out(
                     pyramid, rays.corner[other].astype(int), side, margins[side]
                 )
         advance()
-    return _Cutouts(windows, pieces, inside, colour, longer)
+    return _TrackWindows(windows, pieces, inside, colour, longer)
 
 
 def _cut_squares(
@@ -360,7 +360,7 @@ def _match_in_chunks(
 
 
 def _collect(
-    rays: _Rays,
+    rays: _TrackRays,
     others: Int[np.ndarray, " m"],
     matches: Matched,
     colour: UInt8[np.ndarray, "n 3"],
