@@ -36,7 +36,7 @@ def scale(settings, name: str, factor: float):
     if rest:
         value, new = scale(value, rest, factor)
         return dataclasses.replace(settings, **{first: value}), new
-    new = value * factor
+    new = tuple(factor * v for v in value) if isinstance(value, tuple) else value * factor
     if isinstance(value, int):
         new = max(1, round(new)) if "window" not in first else 2 * round(new / 2 - 0.5) + 1
     return dataclasses.replace(settings, **{first: new}), new
