@@ -32,7 +32,7 @@ from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import reconstruct
-from jaxbundle.reconstruction.result import Part
+from jaxbundle.reconstruction.result import ReconstructedPart
 from jaxbundle.system.configuration import allow_programs_at_once
 
 SETS = SETS | LIFELIKE
@@ -82,7 +82,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
 
     start, processor = time.perf_counter(), time.process_time()
     try:
-        found = reconstruct([folder], tell=tell)
+        found = reconstruct([folder], progress=tell)
     except NotSolvedError as error:
         return {"failed": str(error), "parts": [], "left_out": dict.fromkeys(truth, "")}
     return {
@@ -93,7 +93,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
     }  # fmt: skip
 
 
-def of_part(part: Part, truth: dict[str, Shot]) -> dict:
+def of_part(part: ReconstructedPart, truth: dict[str, Shot]) -> dict:
     """The accuracy of a part; none for centres that belong elsewhere."""
     result = part.adjustment
     network, ids = result.network, result.network.images.id

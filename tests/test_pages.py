@@ -13,10 +13,10 @@ from page_reader import Page, column
 from jaxbundle.batch.page import compose_batch
 from jaxbundle.batch.run import result_rows
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.reconstruction.adjusting import Weighted
-from jaxbundle.reconstruction.block import Block
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment
+from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.page import compose_part
-from jaxbundle.reconstruction.result import Part, Reconstruction
+from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.page import Addition, Finding, Section, compose
 from jaxbundle.report.page.charts import draw_field, draw_histogram
 from jaxbundle.report.verdict import BAD
@@ -93,7 +93,7 @@ def test_lines_of_other_inputs_are_not_of_the_batch(tmp_path, rows):
 # --- reconstructions ------------------------------------------------------------------------
 
 
-BLOCK = Block(
+BLOCK = BlockFacts(
     photographs=4, taken=None, computed=datetime.datetime(2026, 5, 4), system="", unit="m",
     ground_sample_distance=0.01, object_distance=10.0, flying_height=None, area=None,
     rays_per_point=4.0, points_per_photograph=10.0, photographs_per_place=None, positions=None,
@@ -101,7 +101,7 @@ BLOCK = Block(
 
 
 def test_a_reconstruction_names_what_it_left_out(convergent4):
-    part = Part("part 1", convergent4, {}, {"sift": 1.75}, BLOCK)
+    part = ReconstructedPart("part 1", convergent4, {}, {"sift": 1.75}, BLOCK)
     found = Reconstruction(
         (part,), {f"{HOSTILE}.jpg": "too few matches"}, ("a note",),
         (("a.jpg", "b.jpg", 100, 60, "general"),), {name: None for name in "abcde"},
@@ -121,7 +121,7 @@ def test_a_reconstruction_names_what_it_left_out(convergent4):
 def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
     """The adjustment to control takes the place of that of the measurements alone."""
     again = lambda: Adjustment(convergent4.network, convergent4.problem, convergent4.minimum)
-    found = dataclasses.replace(Weighted(again(), {"sift": 3.2}, 40), adjustment=again())
+    found = dataclasses.replace(WeightedAdjustment(again(), {"sift": 3.2}, 40), adjustment=again())
     assert found.adjustment.global_test()["passed"] is None
     for text in (found.adjustment.report(), "".join(compose(found.adjustment))):
         assert "not done: the σ were estimated from these" in text.replace("\n" + " " * 18, " ")
@@ -131,7 +131,7 @@ def test_estimated_sigma_are_not_confirmed_after_control_either(convergent4):
     (3.0, "met", ""), (5.0, "doubtful", "doubtful: "), (19.7, "not met", "most likely wrong: ")
 ])  # fmt: skip
 def test_a_reconstruction_that_fits_badly_says_so_first(convergent4, factor, state, words):
-    part = Part("part 1", convergent4, {}, {"sift": factor, "other": 1.0}, BLOCK)
+    part = ReconstructedPart("part 1", convergent4, {}, {"sift": factor, "other": 1.0}, BLOCK)
     warnings = (f"part 1: {words}measurements fit {factor} times worse",) if words else ()
     found = Reconstruction((part,), {}, ("a note",), (), {"a": None}, warnings)
     first = str(found).splitlines()[0]

@@ -71,14 +71,14 @@ def reconstruct_command(
     from jaxbundle.reconstruction.page import conclude_part
     from jaxbundle.reconstruction.photographs import find_photographs
     from jaxbundle.reconstruction.reconstruct import reconstruct
-    from jaxbundle.reconstruction.settings import Settings
+    from jaxbundle.reconstruction.settings import ReconstructionSettings
     from jaxbundle.tiepoints.features import Detection
 
     if surface and not (len(photos) == 1 and photos[0].is_dir()):
         raise InputError("--surface: give one folder of photographs")
     if targets is not None:
         check_kind(targets)
-    settings = Settings(Detection(features), pairs, points, targets=targets)
+    settings = ReconstructionSettings(Detection(features), pairs, points, targets=targets)
     if not square_pixels:
         settings = replace(settings, aspect_sigma=inf)
     given = None if camera is None else camera_given(camera)

@@ -19,7 +19,7 @@ from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
 from jaxbundle.reconstruction.page import compose_part, conclude_part, describe_part
-from jaxbundle.reconstruction.result import Part, Reconstruction
+from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
 from jaxbundle.types import Progress
 
@@ -79,7 +79,7 @@ def write_reconstruction(
 
 def _write_part(
     found: Reconstruction,
-    part: Part,
+    part: ReconstructedPart,
     folder: Path,
     plots: bool,
     note: str,
@@ -109,7 +109,7 @@ def _write_part(
         print(f"no COLMAP model: {error}")
 
 
-def _write_tables(part: Part, folder: Path) -> None:
+def _write_tables(part: ReconstructedPart, folder: Path) -> None:
     """Control and check points, and camera positions, as tables."""
     if part.control is not None:
         axes = [f"{kind}{a}" for kind in ("", "s", "d") for a in "XYZ"]

@@ -1,38 +1,35 @@
 """Metadata of a photograph: camera, time, position (EXIF) and attitude (XMP).
 
-Every value may be missing, and some cameras write wrong ones: they are start values and priors.
+Every value may be missing or of another type than the standard says (`Any` below), and some
+cameras write wrong ones: they are start values and priors. Tags are those of Exif 2.32 (CIPA
+DC-008), by Pillow's names.
 """
 
 import dataclasses
 import datetime
 import math
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxbundle.photographs.reading import open_image
 from jaxbundle.photographs.sensors import sensor_width
-from jaxbundle.photographs.xmp import Attitude, Xmp, parse_xmp
+from jaxbundle.photographs.xmp import CameraAttitude, Xmp, parse_xmp
 
-MAKE, MODEL, ORIENTATION, DATE = 0x010F, 0x0110, 0x0112, 0x0132
-DETAILS, GPS, PACKET = 0x8769, 0x8825, 0x02BC
 PNG_PACKET = "XML:com.adobe.xmp"
-FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
-PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
-TAKEN_X, TAKEN_Y = 0xA002, 0xA003
-SHAPE = 0.02
-"""Difference of the ratio of the sides, from rounding and borders, without a crop."""
+"""Name of the XMP packet among the text chunks of PNG (XMP specification, part 3)."""
 FILM_DIAGONAL = math.hypot(36, 24)
 """mm: reference of focal lengths equivalent to 35 mm film."""
-MM = {2: 25.4, 3: 10.0, 4: 1.0}
-"""Units of the resolution in the focal plane."""
+RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
+"""mm by the code of the unit of the resolution in the focal plane: inch, centimetre (Exif 2.32),
+millimetre (of some makers)."""
 UPRIGHT = 1
-NOMINAL = 0.05
+"""Orientation of a photograph stored as on the sensor (Exif 2.32, tag 0x0112)."""
+NOMINAL_SIGMA = 0.05
 """Relative σ of a principal distance from a stated focal length: focal lengths are rounded, the
 sensor is a few per cent wider than the photograph, and focused at 20 focal lengths the principal
 distance is 5 % longer."""
-ROUNDING = 1 / math.sqrt(12)
-"""mm: σ of a focal length equivalent to 35 mm film, which is a whole number."""
 
 
 class StatedDistance(NamedTuple):
@@ -44,7 +41,7 @@ class StatedDistance(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class GeographicPosition:
     """Latitude and longitude in degrees (WGS 84), height in metres with uncertain reference
     (EXIF: above sea level); `sigma` of the position, and of the height, metres, if
     stated."""
@@ -70,8 +67,8 @@ class Exif:
     resolution: float | None = None
     orientation: int = UPRIGHT
     time: datetime.datetime | None = None
-    place: Place | None = None
-    attitude: Attitude | None = None
+    place: GeographicPosition | None = None
+    attitude: CameraAttitude | None = None
     cropped: bool = False
 
     @property
@@ -84,19 +81,21 @@ class Exif:
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
         was taken; None if unknown."""
+        # without knowing which part of the sensor is left
         if self.cropped:
             return None
         long = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
-            value, relative = self.focal_length / width * long, NOMINAL
+            value, relative = self.focal_length / width * long, NOMINAL_SIGMA
             source = "focal length and sensor"
         elif self.focal_length_35:
             value = self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size)
-            relative = math.hypot(NOMINAL, ROUNDING / self.focal_length_35)
+            # a whole number of mm, whose rounding has σ = 1/√12
+            relative = math.hypot(NOMINAL_SIGMA, 1 / math.sqrt(12) / self.focal_length_35)
             source = "focal length equivalent to 35 mm film"
         elif self.focal_length and self.resolution:
-            value, relative = self.focal_length * self.resolution, NOMINAL
+            value, relative = self.focal_length * self.resolution, NOMINAL_SIGMA
             source = "focal length and resolution"
         else:
             return None
@@ -109,41 +108,48 @@ def read_exif(path: str | Path) -> Exif:
     **Raises:** `InputError` if it is not an image.
     """
     with open_image(path) as image, warnings.catch_warnings():
+        from PIL.ExifTags import IFD
+        from PIL.ExifTags import Base as Tag
+
         warnings.simplefilter("ignore")  # about damaged headers
-        size = image.size
+        size, info = image.size, image.info
         try:
             head = image.getexif()
-            details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
-            packet = image.info.get("xmp") or image.info.get(PNG_PACKET) or head.get(PACKET) or b""
+            details, gps = head.get_ifd(IFD.Exif), head.get_ifd(IFD.GPSInfo)
+            packet = info.get("xmp") or info.get(PNG_PACKET) or head.get(Tag.XMLPacket) or b""
         except Exception:  # any error of the reader on a damaged header
             return Exif(size)
-    resolution = _positive(details.get(PLANE_X))
-    unit = MM.get(details.get(PLANE_UNIT, 2))
-    taken = sorted(_positive(details.get(side)) or 0 for side in (TAKEN_X, TAKEN_Y))
+    resolution = _positive(details.get(Tag.FocalPlaneXResolution))
+    unit = RESOLUTION_UNIT.get(details.get(Tag.FocalPlaneResolutionUnit, 2))
+    sides = (Tag.ExifImageWidth, Tag.ExifImageHeight)
+    taken = sorted(_positive(details.get(side)) or 0 for side in sides)
     if resolution and taken[1]:
         # of the original photograph: programs that reduce it usually keep this
         resolution *= max(size) / taken[1]
+    # the ratio of the sides differs by up to 2 % without a crop, from rounding and borders
+    cropped = taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > 0.02
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
+    date = details.get(Tag.DateTimeOriginal) or head.get(Tag.DateTime)
     return Exif(
         size=size,
-        make=_text(head.get(MAKE)),
-        model=_text(head.get(MODEL)),
-        focal_length=_positive(details.get(FOCAL_LENGTH)),
-        focal_length_35=_positive(details.get(FOCAL_LENGTH_35)),
+        make=_text(head.get(Tag.Make)),
+        model=_text(head.get(Tag.Model)),
+        focal_length=_positive(details.get(Tag.FocalLength)),
+        focal_length_35=_positive(details.get(Tag.FocalLengthIn35mmFilm)),
         resolution=resolution / unit if resolution and unit else None,
-        orientation=_whole(head.get(ORIENTATION), UPRIGHT),
-        time=_time(details.get(DATE_TAKEN) or head.get(DATE), details.get(FRACTION)),
+        orientation=_orientation(head.get(Tag.Orientation)),
+        time=_time(date, details.get(Tag.SubsecTimeOriginal)),
         place=_place(gps, xmp),
         attitude=xmp.attitude,
-        cropped=taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > SHAPE,
+        cropped=cropped,
     )
 
 
-def _text(value) -> str:
+def _text(value: Any) -> str:
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""
 
 
-def _number(value) -> float | None:
+def _number(value: Any) -> float | None:
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -151,17 +157,17 @@ def _number(value) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _positive(value) -> float | None:
+def _positive(value: Any) -> float | None:
     number = _number(value)
     return number if number and number > 0 else None
 
 
-def _whole(value, otherwise: int) -> int:
+def _orientation(value: Any) -> int:
     number = _number(value)
-    return otherwise if number is None or not 1 <= number <= 8 else int(number)
+    return UPRIGHT if number is None or not 1 <= number <= 8 else int(number)
 
 
-def _time(value, fraction) -> datetime.datetime | None:
+def _time(value: Any, fraction: Any) -> datetime.datetime | None:
     try:
         time = datetime.datetime.strptime(_text(value)[:19], "%Y:%m:%d %H:%M:%S")
         part = _text(fraction)
@@ -170,22 +176,26 @@ def _time(value, fraction) -> datetime.datetime | None:
         return None
 
 
-def _place(gps, xmp: Xmp) -> Place | None:
-    latitude, longitude = _angle(gps.get(2), gps.get(1)), _angle(gps.get(4), gps.get(3))
+def _place(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
+    from PIL.ExifTags import GPS
+
+    latitude = _angle(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef))
+    longitude = _angle(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef))
+    # 0° N 0° E is what receivers write before their first position
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
-    height = _number(gps.get(6))
-    below = gps.get(5) in (1, b"\x01")
-    return Place(
+    height = _number(gps.get(GPS.GPSAltitude))
+    below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    return GeographicPosition(
         latitude,
         longitude,
         None if height is None else -height if below else height,
-        xmp.sigma or _positive(gps.get(31)),
+        xmp.sigma or _positive(gps.get(GPS.GPSHPositioningError)),
         xmp.sigma_height,
     )
 
 
-def _angle(parts, reference) -> float | None:
+def _angle(parts: Any, reference: Any) -> float | None:
     """Degrees, minutes, seconds as degrees; negative to the south and west."""
     try:
         degrees, minutes, seconds = (float(part) for part in parts)

@@ -12,19 +12,19 @@ from jaxbundle.photographs.formats import RAW, SUFFIXES, is_photograph
 
 HIDDEN = ("thumbs.db", "desktop.ini")
 """Files that operating systems put into folders, beside those whose name begins with a dot."""
-MOST_SUFFIXES = 6
 
 
 def list_photographs(folder: Path) -> list[Path]:
     """The photographs in a folder, by name: also those whose format cannot be read."""
     files = [p for p in _visible(folder) if p.is_file() and is_photograph(p)]
+    # raw and JPEG of one exposure have one name; the raw file alone is listed, and refused by name
     read = {p.stem.lower() for p in files if p.suffix.lower() in SUFFIXES}
     return [p for p in files if p.suffix.lower() not in RAW or p.stem.lower() not in read]
 
 
 def describe_other_files(folder: Path) -> str:
     """The files and folders that are no photographs of their own, in words; empty if none."""
-    used = set(list_photographs(folder))
+    used, most = set(list_photographs(folder)), 6  # names in a message of one or two lines
     others = [p for p in _visible(folder) if p not in used]
     inside = [p for p in others if p.is_dir() and any(map(is_photograph, _visible(p)))]
     raw = [p for p in others if p.is_file() and p.suffix.lower() in RAW]
@@ -33,12 +33,12 @@ def describe_other_files(folder: Path) -> str:
     if raw:
         said.append(f"{count(len(raw), 'raw file')} beside photographs of the same name")
     if inside:
-        names = ", ".join(f"{p.name}/" for p in inside[:MOST_SUFFIXES])
+        names = ", ".join(f"{p.name}/" for p in inside[:most])
         said.append(f"{count(len(inside), 'folder')} with photographs ({names}); give them, too")
     if rest:
         kinds = Counter(p.suffix.lower() or "no suffix" for p in rest)
-        some = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(MOST_SUFFIXES))
-        more = ", …" if len(kinds) > MOST_SUFFIXES else ""
+        some = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(most))
+        more = ", …" if len(kinds) > most else ""
         said.append(f"{count(len(rest), 'other file')} ({some}{more})")
     return f"{folder}: not read: {'; '.join(said)}" if said else ""
 

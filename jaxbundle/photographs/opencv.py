@@ -1,9 +1,12 @@
-"""OpenCV and Pillow (extra `images`), imported on demand."""
+"""OpenCV and Pillow (extra `images`), imported on demand: modules that a type checker may not
+have."""
+
+from typing import Any
 
 from jaxbundle.errors import InputError
 
 
-def need_opencv():
+def need_opencv() -> Any:
     """The module cv2, or an error that says what to install."""
     try:
         import cv2
@@ -14,7 +17,7 @@ def need_opencv():
     return cv2
 
 
-def need_pillow():
+def need_pillow() -> Any:
     """The module PIL.Image, or an error that says what to install."""
     try:
         from PIL import Image

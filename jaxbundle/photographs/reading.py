@@ -10,9 +10,11 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.formats import OF_RAW, RAW, register_heic, remedy
@@ -21,10 +23,9 @@ from jaxbundle.system.file_content import check_plain, read_content
 from jaxbundle.system.memory import free_memory, is_memory_shortage
 
 MOST_PIXELS = 2**30
-"""Limit of OpenCV."""
-BRIGHT = 99.8
-"""Percentile of grey values with more than 8 bits that becomes white."""
+"""Limit of OpenCV (CV_IO_MAX_IMAGE_PIXELS)."""
 LIMIT = threading.Lock()
+"""Held while Pillow's limit, which is global, is changed."""
 START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 """Marks of JPEG: start of the file, of a scan, end of the image."""
 
@@ -53,7 +54,8 @@ def image_errors(path: str | Path | None = None) -> Iterator[None]:
             raise PhotographMemoryError(_describe_shortage(path)) from None
         if isinstance(error, need_opencv().error):
             where = "" if path is None else f"{path}: "
-            raise InputError(f"{where}OpenCV cannot process this image: {error.err}") from None
+            words = getattr(error, "err", error)
+            raise InputError(f"{where}OpenCV cannot process this image: {words}") from None
         raise
 
 
@@ -69,7 +71,9 @@ def read_photograph(
         return _read(need_opencv(), path, colour)
 
 
-def _read(cv2, path, colour):
+def _read(
+    cv2: ModuleType, path: str | Path, colour: bool
+) -> UInt8[np.ndarray, "rows columns *channels"]:
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file")
     if os.path.isdir(path):
@@ -82,12 +86,12 @@ def _read(cv2, path, colour):
         _refuse_cut(path)
     way = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
     flags = way | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if found is None:
-        found = _by_pillow(path, colour)
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if pixels is None:
+        pixels = _read_by_pillow(path, colour)
     elif colour:
-        found = found[..., ::-1]
-    return np.ascontiguousarray(_eight_bits(found))
+        pixels = pixels[..., ::-1]  # OpenCV's order is blue, green, red
+    return np.ascontiguousarray(_stretch(pixels))
 
 
 def photograph_size(path: str | Path) -> tuple[int, int]:
@@ -99,7 +103,7 @@ def photograph_size(path: str | Path) -> tuple[int, int]:
         return image.size
 
 
-def open_image(path: str | Path):
+def open_image(path: str | Path) -> Any:
     """The file opened by Pillow with its header read, without decoding pixels. Close it, by `with`.
 
     **Raises:** `InputError` if it cannot be read, is not an image, or has more than 2³⁰ pixels.
@@ -128,7 +132,7 @@ def open_image(path: str | Path):
     return image
 
 
-def _describe_shortage(path) -> str:
+def _describe_shortage(path: str | Path) -> str:
     try:
         columns, rows = photograph_size(path)
         size = f" for its {columns} × {rows} pixels"
@@ -140,35 +144,38 @@ def _describe_shortage(path) -> str:
     )
 
 
-def _refuse_raw(path):
+def _refuse_raw(path: str | Path) -> None:
     """Raw files of many cameras are TIFF: a small preview would be read for the photograph."""
     if os.path.exists(path) and os.path.splitext(path)[1].lower() in RAW:
         raise InputError(f"{path}: {OF_RAW}")
 
 
-def _open_any_size(path):
+def _open_any_size(path: str | Path) -> Any:
     """The file opened without Pillow's limit against decompression bombs: 179 million pixels, which
     a photograph may have."""
     Image = need_pillow()
     register_heic()
     with LIMIT:
-        given, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about damaged headers: missing fields are unknown
                 return Image.open(path)
         finally:
-            Image.MAX_IMAGE_PIXELS = given
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def _looks_cut(content: bytes) -> bool:
     """Whether a JPEG file has no end mark after its last scan, or a PNG file no end."""
     if content.startswith(START):
         return content.rfind(END) < content.rfind(SCAN)
+    # a JPEG preview inside has an end mark of its own, but before the last scan; PNG ends with a
+    # chunk IEND of 12 bytes, which padding may follow
     return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]
 
 
-def _refuse_cut(path):
+def _refuse_cut(path: str | Path) -> None:
+    """Refuse a file that Pillow cannot decode to its end: the marks alone are no proof."""
     try:
         with open_image(path) as image:
             image.load()
@@ -176,7 +183,7 @@ def _refuse_cut(path):
         raise InputError(f"{path}: the file is truncated; copy it again") from None
 
 
-def _by_pillow(path, colour):
+def _read_by_pillow(path: str | Path, colour: bool) -> UInt8[np.ndarray, "rows columns *channels"]:
     try:
         with open_image(path) as image:
             return np.asarray(image.convert("RGB" if colour else "L"))
@@ -186,10 +193,13 @@ def _by_pillow(path, colour):
         raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, …)") from None
 
 
-def _eight_bits(found):
-    if found.dtype == np.uint8:
-        return found
-    some = found[::8, ::8] if found.size > 2**20 else found
-    low, high = 0.0, float(np.nanpercentile(some, BRIGHT))
-    scale = 255 / (high - low) if high > low else 1.0
-    return np.clip(np.nan_to_num(found * scale), 0, 255).astype(np.uint8)
+def _stretch(pixels: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Grey values of 8 bits as they are, others in proportion, the brightest 0.2 % as white:
+    reflections and hot pixels would otherwise leave a few grey values to the object."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    # every 64th pixel of a large photograph suffices for a percentile
+    some = pixels[::8, ::8] if pixels.size > 2**20 else pixels
+    high = float(np.nanpercentile(some, 99.8))
+    scale = 255 / high if high > 0 else 1.0
+    return np.clip(np.nan_to_num(pixels * scale), 0, 255).astype(np.uint8)

@@ -92,11 +92,8 @@ def sensor_width(make: str, model: str) -> float | None:
     make, model = make.lower().strip(), " ".join(model.lower().split())
     first = make.split(" ")[0]
     name = model if first and model.startswith(first) else f"{first} {model}"
-    best = max((known for known in WIDTHS if _begins(name, known)), key=len, default=None)
+    # a known name that continues with a digit is another camera: a D80 is not a D800
+    goes_on = lambda known: known[-1].isdigit() and name[len(known) :][:1].isdigit()
+    alike = (known for known in WIDTHS if name.startswith(known) and not goes_on(known))
+    best = max(alike, key=len, default=None)
     return None if best is None else WIDTHS[best]
-
-
-def _begins(name: str, known: str) -> bool:
-    """Whether a name begins with a known one, not followed by a digit: a D80 is not a D800."""
-    rest = name[len(known) :]
-    return name.startswith(known) and not (rest[:1].isdigit() and known[-1].isdigit())

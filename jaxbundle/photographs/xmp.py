@@ -14,20 +14,19 @@ import dataclasses
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 SIGMA_ATTITUDE = 5.0
 """Default σ, degrees: a gimbal is better about the horizontal axes, a compass worse."""
-MOST_BYTES = 1 << 20
 DJI = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 PIX4D = ("Yaw", "Pitch", "Roll")
 
 
 @dataclasses.dataclass(frozen=True)
-class Attitude:
+class CameraAttitude:
     """Yaw, pitch (−90: straight down, 0: at the horizon), roll and their largest σ, degrees."""
 
     yaw: float
@@ -41,7 +40,7 @@ class Xmp:
     """The content of a packet: attitude; σ of the position east and north, and of its height,
     metres."""
 
-    attitude: Attitude | None = None
+    attitude: CameraAttitude | None = None
     sigma: float | None = None
     sigma_height: float | None = None
 
@@ -57,10 +56,12 @@ def parse_xmp(packet: bytes | str) -> Xmp:
     return Xmp(attitude, positive(plane), positive(height))
 
 
-def rotation_of(attitude: Attitude, convergence: float = 0.0) -> Float[np.ndarray, "3 3"]:
+def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.ndarray, "3 3"]:
     """M of an attitude, from east, north, up of a map to the camera: x to the right of the picture,
     y to its top, looking along −z; `convergence`: of the meridian, degrees, grid north less it."""
     yaw, pitch, roll = np.radians([attitude.yaw - convergence, attitude.pitch, attitude.roll])
+    # the axes of the picture in east, north, up: yaw about the vertical, then pitch about the right
+    # axis, then roll about the viewing direction
     right = np.array([math.cos(yaw), -math.sin(yaw), 0.0])
     level = np.array([math.sin(yaw), math.cos(yaw), 0.0])
     ahead = math.cos(pitch) * level + math.sin(pitch) * np.array([0.0, 0.0, 1.0])
@@ -72,27 +73,29 @@ def rotation_of(attitude: Attitude, convergence: float = 0.0) -> Float[np.ndarra
     return np.stack([right, top, -ahead])
 
 
-def _attitude(number) -> Attitude | None:
-    dji, pix4d = ([number(name) for name in names] for names in (DJI, PIX4D))
-    # A missing or failed gimbal gives all zeros.
-    if None not in dji and any(dji):
-        yaw, pitch, roll = dji
-    elif None not in pix4d and any(pix4d):
-        yaw, pitch, roll = pix4d
-        pitch -= 90
-    else:
-        return None
+def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
     stated = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
-    return Attitude(yaw, pitch, roll, stated if stated and stated > 0 else SIGMA_ATTITUDE)
+    sigma = stated if stated and stated > 0 else SIGMA_ATTITUDE
+    # the pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's
+    for names, horizon in ((DJI, 0.0), (PIX4D, 90.0)):
+        angles = [angle for angle in map(number, names) if angle is not None]
+        # a missing or failed gimbal gives all zeros
+        if len(angles) == 3 and any(angles):
+            yaw, pitch, roll = angles
+            return CameraAttitude(yaw, pitch - horizon, roll, sigma)
+    return None
 
 
 def _fields(packet: bytes | str) -> Mapping[str, str]:
     """Attributes and elements by their names without namespace, the first of each."""
     content = packet if isinstance(packet, bytes) else packet.encode()
-    whole = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[:MOST_BYTES], re.DOTALL)
+    # packets have 64 KB at most within JPEG; a megabyte is far beyond what drones write
+    whole = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
+    # entities may grow without limit ("billion laughs"); no camera uses them
     head = content[: whole.start()] if whole else b""
     if whole is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
         return {}
+    # some drones declare namespaces outside the part that is read
     spaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
     text = whole[0].decode(errors="replace")
     opening = re.match(r"<[\w:]+", text)
@@ -101,12 +104,12 @@ def _fields(packet: bytes | str) -> Mapping[str, str]:
         root = ET.fromstring(opening[0] + missing + text[opening.end() :] if opening else text)
     except ET.ParseError:
         return {}
-    found: dict[str, str] = {}
+    fields: dict[str, str] = {}
     for element in root.iter():
         for name, value in (*element.attrib.items(), (element.tag, element.text or "")):
             if value.strip():
-                found.setdefault(name.rpartition("}")[2], value.strip())
-    return found
+                fields.setdefault(name.rpartition("}")[2], value.strip())
+    return fields
 
 
 def _number(text: str | None) -> float | None:
@@ -118,6 +121,6 @@ def _number(text: str | None) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _largest(values) -> float | None:
+def _largest(values: Sequence[float | None]) -> float | None:
     known = [v for v in values if v is not None]
     return max(known) if known else None

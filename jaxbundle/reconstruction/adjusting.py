@@ -2,17 +2,19 @@
 
 1. All measurements with the σ of their matching.
 2. The σ of measurements of a kind (least squares matching by level of the pyramid, positions of
-   features) are multiplied by the root of the variance component of this kind,
+   features) are multiplied by the root of the variance component of this kind (Förstner 1979),
 
        f² = Σ(v/σ)²/Σr,        r = 1 − 3/(2n) for a point with n rays,
 
-   over residuals below `GROSS`·f.
+   over normalised residuals v/(σ·√r) below `gross_residual`·f. (2n coordinates determine 3 of the
+   point; what they add to images and cameras is neglected.)
 3. Data snooping, and 2. again for the remaining measurements, with their redundancy numbers, until
    the factors converge.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,43 +27,61 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 
-GROSS, DOUBTFUL = 4.0, 5.0
-LAST_CHANGE = 0.004
-"""Change of a factor that ends the rounds."""
-ROUNDS = 4
-FEWEST = 60
-"""Minimum measurements of a kind with a separate factor."""
-SMALLEST, LARGEST = 0.3, 8.0
-MANY = 0.25
-"""Share of gross errors above which points of two rays are not used: most of their gross errors
-cannot be detected."""
-SOME, MISFIT = 0.05, 2.0
-"""Share of gross errors, and factor of σ of the others, that together make a result doubtful:
-undetected ones may distort it."""
-LARGEST_MISFIT, WRONG_MISFIT = 4.0, 8.0
+DOUBTFUL_MISFIT, WRONG_MISFIT = 4.0, 8.0
 """Factor of σ above which a result is called doubtful, and most likely wrong; right results of
 rendered facades have up to 2.5, of a photographed facade with known centres 3.7, wrong ones of real
 photographs 11.8 and 19.7."""
-AGREEING_RAY = 0.001
-"""Maximum misclosure of an agreeing ray, relative to the image extent."""
-LOSSES = 6
-"""Maximum rounds of excluding points left undetermined, in one adjustment."""
-FEWEST_ITERATIONS, MOST_ITERATIONS, MOST_WORK = 200, 2000, 4_000_000
-"""Iterations of one adjustment, and iterations times image points. Two photographs, or many with
-the same viewing direction, determine an unknown camera only weakly, and the search then needs
-several hundred; with more photographs a search that has not ended soon has wrong start values,
-and others are tried."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Weighted:
+class WeightingSettings:
+    """Settings of the weighting of measurements and the removal of gross errors."""
+
+    gross_residual: float = 4.0
+    """Normalised residuals above it, in factors of their kind, take no part in its factor. Normally
+    distributed ones are cut off with 6e-5, which reduces the factor by 0.05 %; at 3 it would be
+    1.3 %, and larger limits let small gross errors in."""
+    suspect_residual: float = 5.0
+    """Normalised residual, in factors of its kind, above which an image point is excluded when data
+    snooping begins, with a probability of 6e-7; snooping restores it if it agrees. Smaller: more to
+    restore; larger: more rounds until all gross errors are found."""
+    last_change: float = 0.004
+    """Relative change of a factor that ends the rounds: less than its own σ, 1/√(2·Σr), unless a
+    kind has more than 30 000 measurements."""
+    max_rounds: int = 4
+    """Maximum rounds of data snooping and new factors. What has not converged then changes by
+    single measurements."""
+    min_measurements: int = 60
+    """Minimum measurements of a kind with a separate factor: with Σr of about 60 its σ is
+    1/√(2·60) = 9 %. Fewer would only copy their own errors into the weights."""
+    min_factor: float = 0.3
+    """Smallest factor of one round. σ of matching are right to 15 % or too small; a much smaller
+    factor comes from measurements that agree because they are hardly checked."""
+    max_factor: float = 8.0
+    """Largest factor of one round: `WRONG_MISFIT`. Beyond it the model is wrong, not σ."""
+    many_errors: float = 0.25
+    """Share of gross errors above which points of two rays are not used: most of their gross errors
+    cannot be detected, since one along the epipolar line moves the point and leaves no residual."""
+    some_errors: float = 0.05
+    """Share of gross errors that, together with `some_misfit`, makes a result doubtful: undetected
+    ones may distort it."""
+    some_misfit: float = 2.0
+    """Factor of σ of the other measurements for the same: around the fountain of the set `loop` it
+    is 1.3, on facades, which repeat themselves, 1.5 to 3."""
+    agreeing_ray: float = 0.001
+    """Maximum misclosure of a ray that agrees with a result, relative to the image extent: 3 pixels
+    of 3000, like the tolerance of verified pairs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightedAdjustment:
     """The adjustment, and the factor of σ of each kind of measurement, which is also in it; the
-    number of measurements that agree with it, and of `unused` points of two rays."""
+    number of measurements that agree with it, and `unused_points` of two rays."""
 
     adjustment: Adjustment
     factors: dict[str, float]
-    agreeing: int
-    unused: int = 0
+    agreeing_rays: int
+    unused_points: int = 0
 
     def __post_init__(self):
         if self.adjustment.converged:
@@ -82,7 +102,8 @@ def adjust_weighted(
     names: dict[int, str],
     significance: float,
     tell: Callable[[str], None],
-) -> Weighted:
+    settings: WeightingSettings = WeightingSettings(),
+) -> WeightedAdjustment:
     """Adjust with variance components of the kinds and data snooping. Without a solution, or with
     a doubtful one, adjust again without points of two rays, whose gross errors can hardly be
     detected: where an object repeats itself, some agree with its photographs by chance.
@@ -92,62 +113,64 @@ def adjust_weighted(
     **Raises:** as `jaxbundle.adjust`; `NotSolvedError` if, with very many gross errors, points of
     three rays do not confirm the result.
     """
-    found, failed = None, None
+    every, failed, many = None, None, settings.many_errors
+    weight = lambda network, kinds: _weight(network, kinds, names, significance, tell, settings)
     try:
-        found = _weight(network, kinds, names, significance, tell)
-        if found.adjustment.converged and (len(network.images) < 3 or not _is_doubtful(found)):
-            return found
+        every = weight(network, kinds)
+        # two photographs have no points of three rays to compare with
+        few = len(network.images) < 3
+        if every.adjustment.converged and (few or not _is_doubtful(every, settings)):
+            return every
     except NotSolvedError as error:
         failed = error
-    solved = found is not None and found.adjustment.converged
+    solved = every is not None and every.adjustment.converged
     rays = network.observations
+    # points of another role than tie are checked by their coordinates
     number = np.bincount(rays.point, minlength=len(network.points))
     several = (number > 2) | ~network.points.has_role("tie")
     clear, kinds = keep_points(network, several), kinds[several[rays.point]]
     try:
-        clearer = _weight(clear, kinds, names, significance, tell)
+        clearer = weight(clear, kinds)
     except (InputError, NotSolvedError):
         # a photograph has hardly any of these points, or they do not determine it
         if failed is not None:
             raise failed from None
     else:
         if not clearer.adjustment.converged and not solved:
-            return found or clearer
-        if clearer.adjustment.converged and _is_better(clearer, found if solved else None):
+            return every or clearer
+        if clearer.adjustment.converged and (
+            every is None or not solved or _removed_more(every, many) or clearer.worst < every.worst
+        ):
             return dataclasses.replace(
                 clearer,
-                agreeing=_count_agreeing(network, clearer),
-                unused=len(network.points) - len(clear.points),
+                agreeing_rays=_count_agreeing(network, clearer, settings.agreeing_ray),
+                unused_points=len(network.points) - len(clear.points),
             )
-    assert found is not None, "an attempt ends with a result or an error"
-    if solved and _removed_many(found.adjustment):
+    assert every is not None, "an attempt ends with a result or an error"
+    if solved and _removed_more(every, many):
         raise NotSolvedError(
-            f"not solved: {len(found.adjustment.removed)} of {len(rays)} measurements are gross "
+            f"not solved: {len(every.adjustment.removed)} of {len(rays)} measurements are gross "
             "errors, and the points of three rays alone do not confirm the others: the object "
             "repeats itself; take photographs with shorter bases",
             list(network.images.id),
         )
-    return found
+    return every
 
 
-def _is_doubtful(found: Weighted) -> bool:
+def _is_doubtful(weighted: WeightedAdjustment, settings: WeightingSettings) -> bool:
     """Whether undetected gross errors, most of them in points of two rays, may distort a result."""
-    return _removed_many(found.adjustment) or (
-        _removed_many(found.adjustment, SOME) and found.worst > MISFIT
+    return _removed_more(weighted, settings.many_errors) or (
+        _removed_more(weighted, settings.some_errors) and weighted.worst > settings.some_misfit
     )
 
 
-def _removed_many(result: Adjustment, share: float = MANY) -> bool:
+def _removed_more(weighted: WeightedAdjustment, share: float) -> bool:
     """Whether more than a share of the measurements were gross errors."""
+    result = weighted.adjustment
     return len(result.removed) > share * len(result.network.observations)
 
 
-def _is_better(clearer: Weighted, found: Weighted | None) -> bool:
-    """Whether the result of points of three rays replaces that of all points."""
-    return found is None or _removed_many(found.adjustment) or clearer.worst < found.worst
-
-
-def _count_agreeing(network: Network, clearer: Weighted) -> int:
+def _count_agreeing(network: Network, clearer: WeightedAdjustment, tolerance: float) -> int:
     """The number of measurements of all points that agree with the result of some of them."""
     result = clearer.adjustment
     cameras = tuple(
@@ -155,23 +178,27 @@ def _count_agreeing(network: Network, clearer: Weighted) -> int:
     )
     values, points = result.image_values, network.points
     tie = points.has_role("tie")[:, None]
+    # images are placed, tie points intersected anew: start values count the rays that agree
     images = dataclasses.replace(network.images, position=values[:, :3], angles=values[:, 3:])
     points = dataclasses.replace(points, position=np.where(tie, np.nan, points.position))
     placed = network.replace(cameras=cameras, images=images, points=points)
     try:
-        return len(find_start_values(placed, tolerance=AGREEING_RAY).network.observations)
+        return len(find_start_values(placed, tolerance=tolerance).network.observations)
     except NotSolvedError:  # control does not agree so closely
-        return clearer.agreeing
+        return clearer.agreeing_rays
 
 
-def adjust_determined(network: Network, **options) -> tuple[Adjustment, Network, np.ndarray]:
+def adjust_determined(
+    network: Network, **options: Any
+) -> tuple[Adjustment, Network, Int[np.ndarray, " rays"]]:
     """The adjustment without undetermined tie points; the network without them; its rows among
     those given."""
     rows = np.arange(len(network.observations))
-    again = lambda: adjust(network, max_iterations=limit_iterations(network), **options)
-    for _ in range(LOSSES):
+    adjust_again = lambda: adjust(network, max_iterations=limit_iterations(network), **options)
+    # each round may leave further points with one ray; what six do not end is reported as it is
+    for _ in range(6):
         try:
-            result = again()
+            result = adjust_again()
         except NotSolvedError as error:
             kept = _are_determined(network, error.undetermined)
             if kept.all():
@@ -182,109 +209,138 @@ def adjust_determined(network: Network, **options) -> tuple[Adjustment, Network,
                 return result, network, rows
         rows = rows[kept[network.observations.point]]
         network = keep_points(network, kept)
-    return again(), network, rows
+    return adjust_again(), network, rows
 
 
 def limit_iterations(network: Network) -> int:
-    """The maximum number of iterations of an adjustment, by its size."""
-    work = MOST_WORK // max(len(network.observations), 1)
-    return min(max(work, FEWEST_ITERATIONS), MOST_ITERATIONS)
+    """The maximum number of iterations of an adjustment, by its size: 2000 up to 2000 image points,
+    200 from 20 000 on. Two photographs, or many with the same viewing direction, determine an
+    unknown camera only weakly, and the search then needs several hundred; with more photographs a
+    search that has not ended soon has wrong start values, and others are tried."""
+    return min(max(4_000_000 // max(len(network.observations), 1), 200), 2000)
 
 
-def _are_determined(network: Network, undetermined) -> Bool[np.ndarray, " points"]:
+def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.ndarray, " points"]:
     """False for tie points named among the undetermined."""
     lost = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
     return ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
 
 
-def _weight(network: Network, kinds, names, significance, tell) -> Weighted:
+def _weight(
+    network: Network,
+    kinds: Int[np.ndarray, " rays"],
+    names: dict[int, str],
+    significance: float,
+    tell: Callable[[str], None],
+    settings: WeightingSettings,
+) -> WeightedAdjustment:
+    """The steps of the module, for the points of a network."""
     tell("adjustment")
     result, network, kept = adjust_determined(network)
-    kinds, given = kinds[kept], network.observations.sigma
-    total, doubtful = np.ones(len(kept)), []
+    kinds, sigma = kinds[kept], network.observations.sigma
+    total, suspects = np.ones(len(kept)), []
     if result.converged:
-        (w, r), rows = _of_residuals(result), _rows(result, network)
-        total[rows] = _factors(w, r, kinds[rows])
-        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[rows, None]
-        doubtful = _name(result, beyond.any(1))
-        network = network.replace(datum_points=choose_datum_points(result))
-    for _ in range(ROUNDS):
-        tell("data snooping")
-        network = _with_sigma(network, given * total[:, None])
-        result, network, kept = adjust_determined(
-            network, snooping="pope", significance=significance, doubtful=doubtful
+        (w, r), rows = _approximate_redundancy(result), _rows(result, network)
+        total[rows] = _factors(w, r, kinds[rows], settings, settings.gross_residual)
+        # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
+        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > (
+            settings.suspect_residual * total[rows, None]
         )
-        kinds, given, total = kinds[kept], given[kept], total[kept]
+        suspects = _name(result, np.any(beyond, axis=1))
+        # once: a datum that changes with each round would change all σ, too
+        network = network.replace(datum_points=choose_datum_points(result))
+    for _ in range(settings.max_rounds):
+        tell("data snooping")
+        weighted = dataclasses.replace(network.observations, sigma=sigma * total[:, None])
+        result, network, kept = adjust_determined(
+            network.replace(observations=weighted),
+            snooping="pope",
+            significance=significance,
+            doubtful=suspects,
+        )
+        kinds, sigma, total = kinds[kept], sigma[kept], total[kept]
         if not result.converged:
             break
         rows = _rows(result, network)
-        factor = _factors(*_of_reliability(result), kinds[rows], np.inf)
-        if np.all(np.abs(factor - 1) < LAST_CHANGE):
+        # gross errors are removed by now: no limit
+        factor = _factors(*_redundancy(result), kinds[rows], settings, np.inf)
+        if np.all(np.abs(factor - 1) < settings.last_change):
             break
         total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0
-        doubtful = _name(result, ~used.any(1))
-    kept = {
+        suspects = _name(result, ~np.any(used, axis=1))
+    factors = {
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }
     used = np.asarray(result.problem.data.image_weight) > 0
-    return Weighted(result, kept, int(used.any(1).sum()))
+    return WeightedAdjustment(result, factors, int(used.any(1).sum()))
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
     """For every image point of a result its row in the network, without excluded ones."""
-    index = {one: k for k, one in enumerate(_all_ids(network))}
-    return np.array([index[one] for one in _name(result, slice(None))], int)
+    rays = network.observations
+    index = {ids: k for k, ids in enumerate(_ids(network, rays.image, rays.point))}
+    return np.array([index[ids] for ids in _name(result, slice(None))], int)
 
 
-def _ids(network: Network, image, point):
+def _ids(
+    network: Network, image: Int[np.ndarray, " rays"], point: Int[np.ndarray, " rays"]
+) -> list[tuple[str, str]]:
+    """The ids of images and points."""
     images, points = network.images.id, network.points.id
     return [(images[i], points[p]) for i, p in zip(image.tolist(), point.tolist())]
 
 
-def _all_ids(network: Network):
-    return _ids(network, network.observations.image, network.observations.point)
-
-
-def _name(result: Adjustment, rows) -> list[tuple[str, str]]:
+def _name(result: Adjustment, rows: slice | Bool[np.ndarray, " rays"]) -> list[tuple[str, str]]:
     """Image and point, by id, of image points."""
     problem = result.problem
     return _ids(result.network, problem.image[rows], problem.point[rows])
 
 
-def _with_sigma(network: Network, sigma) -> Network:
-    return network.replace(observations=dataclasses.replace(network.observations, sigma=sigma))
-
-
-def _of_residuals(result: Adjustment):
-    """v/σ of the rays, and redundancy numbers from the number of rays of their points."""
+def _approximate_redundancy(
+    result: Adjustment,
+) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
+    """v/σ of the rays, and redundancy numbers from the number of rays of their points: exact ones
+    need the cofactors of the whole network, which gross errors would spoil."""
     w = np.asarray(result.inspection.residuals.image)
     rays = np.bincount(result.problem.point)[result.problem.point]
     return w, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
 
 
-def _of_reliability(result: Adjustment):
-    found = result.reliability
+def _redundancy(
+    result: Adjustment,
+) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
+    """v/σ of the rays, NaN of excluded ones, and their redundancy numbers."""
+    reliability = result.reliability
     used = np.asarray(result.problem.data.image_weight) > 0
-    return np.where(used, found.residual.image, np.nan), np.asarray(found.redundancy.image)
+    w = np.where(used, reliability.residual.image, np.nan)
+    return w, np.asarray(reliability.redundancy.image)
 
 
 def _factors(
-    w: Float[np.ndarray, "rays 2"], r: Float[np.ndarray, "rays 2"], kinds, gross: float = GROSS
+    w: Float[np.ndarray, "rays 2"],
+    r: Float[np.ndarray, "rays 2"],
+    kinds: Int[np.ndarray, " rays"],
+    settings: WeightingSettings,
+    gross: float,
 ) -> Float[np.ndarray, " rays"]:
-    """Factors of the σ of every ray."""
+    """Factors of the σ of every ray, from normalised residuals below `gross` factors."""
     r = np.maximum(r, 1e-3)
     factor = np.ones(len(w))
     for kind in np.unique(kinds):
         rows = kinds == kind
-        length, spare = np.abs(w[rows]) / np.sqrt(r[rows]), r[rows]
-        there = np.isfinite(length) & (spare > 0.05)
-        if there.sum() < 2 * FEWEST:
+        normalised_residual, redundancy = np.abs(w[rows]) / np.sqrt(r[rows]), r[rows]
+        # with r below 0.05 the residual is less than a fifth of an error, and that of rounding
+        # and neglected terms counts
+        checked = np.isfinite(normalised_residual) & (redundancy > 0.05)
+        if checked.sum() < 2 * settings.min_measurements:
             continue
-        scale = 1.4826 * np.median(length[there])
+        # 1.4826 = 1/Φ⁻¹(3/4): the median of |v| of a normal distribution as its σ
+        scale = 1.4826 * np.median(normalised_residual[checked])
+        # the choice of good ones and the factor depend on each other; five rounds settle both
         for _ in range(5):
-            good = there & (length < gross * max(scale, 1e-9))
-            scale = np.sqrt(np.sum(w[rows][good] ** 2) / np.sum(spare[good]))
-        factor[rows] = np.clip(scale, SMALLEST, LARGEST)
+            good = checked & (normalised_residual < gross * max(scale, 1e-9))
+            scale = np.sqrt(np.sum(w[rows][good] ** 2) / np.sum(redundancy[good]))
+        factor[rows] = np.clip(scale, settings.min_factor, settings.max_factor)
     return factor

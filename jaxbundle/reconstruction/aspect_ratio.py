@@ -9,6 +9,8 @@ chance explains, to the same side, and by more than they differ from each other.
 """
 
 import dataclasses
+from collections.abc import Collection
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +23,9 @@ from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network, Points
 from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
 
-CRITICAL = 3.29
-"""Normalised deviation beyond which chance (one in a thousand) does not explain it."""
-MIN_HALF = 4
-"""Minimum photographs in a half. Fewer hardly determine a camera."""
+CRITICAL_DEVIATION = NormalDist().inv_cdf(1 - 0.001 / 2)
+"""Normalised deviation, 3.29, beyond which chance (one in a thousand, either sign) does not explain
+it."""
 
 
 class Ratio(NamedTuple):
@@ -41,7 +42,7 @@ def contradicted_ratios(result: Adjustment) -> dict[str, Ratio]:
     number is r = 1 − q/σ², the normalised residual d/(σ·√r), and without the observation the ratio
     would be d/r with cofactor q/r.
     """
-    observed, found = observed_parameters(result.problem.network), {}
+    observed, contradicted = observed_parameters(result.problem.network), {}
     if observed is None:
         return {}
     columns = observed.camera, observed.parameter, observed.value.tolist(), observed.sigma.tolist()
@@ -49,43 +50,53 @@ def contradicted_ratios(result: Adjustment) -> dict[str, Ratio]:
         if name == ASPECT:
             d, q = _deviation(result, id, value)
             r = 1 - q / sigma**2
-            if r > 0 and abs(d) > CRITICAL * sigma * np.sqrt(r):
-                found[id] = Ratio(d / r, result.sigma0 * np.sqrt(q / r))
-    return found
+            if r > 0 and abs(d) > CRITICAL_DEVIATION * sigma * np.sqrt(r):
+                contradicted[id] = Ratio(d / r, result.sigma0 * np.sqrt(q / r))
+    return contradicted
 
 
 def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
     """By camera, the ratios of two halves of the photographs, each adjusted alone; none if a half
     does not determine them."""
-    network = _without_ratios(_at_solution(result))
+    network = _adjusted_network(result)
+    network = release(network, [camera.id for camera in network.cameras])
     number = np.arange(len(network.images))
     of_halves = []
-    for half in (0, 1):
-        one = keep_images(network, number % 2 == half)
-        rays = np.bincount(one.observations.point, minlength=len(one.points))
-        one = keep_points(one, (rays > 1) | ~one.points.has_role("tie")).replace(datum_points=())
-        if len(one.images) < MIN_HALF:
+    # every second photograph, so that both halves see the whole object
+    for parity in (0, 1):
+        half = keep_images(network, number % 2 == parity)
+        rays = np.bincount(half.observations.point, minlength=len(half.points))
+        half = keep_points(half, (rays > 1) | ~half.points.has_role("tie"))
+        half = half.replace(datum_points=())
+        # three photographs leave the principal point of an unknown camera to its prior
+        if len(half.images) < 4:
             return {}
+        # a half that does not determine its cameras confirms nothing
         try:
-            alone = adjust(one)
+            alone = adjust(half)
         except (InputError, NotSolvedError):
             return {}
         if not alone.converged:
             return {}
-        used = {one.cameras[c].id for c in np.unique(one.images.camera)}
-        of_halves.append({id: _ratio(alone, id) for id in used})
+        used = {half.cameras[c].id for c in np.unique(half.images.camera)}
+        ratios = {}
+        for id in used:
+            d, q = _deviation(alone, id, 1.0)
+            ratios[id] = Ratio(d, alone.sigma0 * np.sqrt(q))
+        of_halves.append(ratios)
     both = of_halves[0].keys() & of_halves[1].keys()
     return {id: (of_halves[0][id], of_halves[1][id]) for id in both}
 
 
 def is_replicated(one: Ratio, other: Ratio) -> bool:
     """Whether two halves confirm each other that a ratio is not 1."""
+    # the difference of the halves shows the correlated errors that their σ does not contain
     apart = abs(one.deviation - other.deviation)
-    clear = all(abs(r.deviation) > max(CRITICAL * r.sigma, apart) for r in (one, other))
+    clear = all(abs(r.deviation) > max(CRITICAL_DEVIATION * r.sigma, apart) for r in (one, other))
     return clear and one.deviation * other.deviation > 0
 
 
-def release(network: Network, cameras) -> Network:
+def release(network: Network, cameras: Collection[str]) -> Network:
     """The network without the observed ratios of some cameras. Their fx is no longer that of
     photographs of the same lens in the other format."""
     observed = observed_parameters(network)
@@ -94,6 +105,7 @@ def release(network: Network, cameras) -> Network:
     keep = [
         name != ASPECT or id not in cameras for id, name in zip(observed.camera, observed.parameter)
     ]
+    # of a lens in portrait format fy lies along the other axis: fx of both are then two unknowns
     network = with_observed(network, observed.take(np.array(keep)))
     return network.replace(
         further=tuple(
@@ -103,17 +115,13 @@ def release(network: Network, cameras) -> Network:
     )
 
 
-def _without_focal_lengths(ties: Ties, cameras) -> Ties:
+def _without_focal_lengths(ties: Ties, cameras: Collection[str]) -> Ties:
     columns = zip(ties.camera, ties.other, ties.parameter)
     keep = [name != "fx" or not {one, other} & {*cameras} for one, other, name in columns]
     return ties.take(np.array(keep))
 
 
-def _without_ratios(network: Network) -> Network:
-    return release(network, [camera.id for camera in network.cameras])
-
-
-def _at_solution(result: Adjustment) -> Network:
+def _adjusted_network(result: Adjustment) -> Network:
     """The network with adjusted values as start values, without removed observations."""
     network, values = result.problem.network, result.image_values
     images, points, rays = network.images, network.points, network.observations
@@ -130,8 +138,8 @@ def _at_solution(result: Adjustment) -> Network:
     )
     points = Points(points.id, points.role, position, points.sigma, points.source)
     rays = rays.take(used)
-    found = network.replace(cameras=cameras, images=images, points=points, observations=rays)
-    return keep_points(found, np.all(np.isfinite(position), axis=1))
+    network = network.replace(cameras=cameras, images=images, points=points, observations=rays)
+    return keep_points(network, np.all(np.isfinite(position), axis=1))
 
 
 def _deviation(result: Adjustment, camera: str, value: float) -> tuple[float, float]:
@@ -139,11 +147,7 @@ def _deviation(result: Adjustment, camera: str, value: float) -> tuple[float, fl
     names, Q = result.camera_cofactor(camera)
     p = result.camera_parameters(camera)
     ratio = p["fy"] / p["fx"]
+    # ∂(fy/fx)/∂(fx, fy) = (−fy/fx², 1/fx)
     slope = np.zeros(len(names))
     slope[names.index("fx")], slope[names.index("fy")] = -ratio / p["fx"], 1 / p["fx"]
     return ratio - value, float(slope @ Q @ slope)
-
-
-def _ratio(result: Adjustment, camera: str) -> Ratio:
-    d, q = _deviation(result, camera, 1.0)
-    return Ratio(d, result.sigma0 * np.sqrt(q))

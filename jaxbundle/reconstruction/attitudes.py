@@ -2,7 +2,7 @@
 
 Attitudes rotated by a mounting, a firmware or another convention would spoil a network that does
 not need them. So they are first compared with the orientations from the photographs and their
-positions, and all are left out if they differ by more than `LARGEST_MEDIAN` of their σ.
+positions, and all are left out if the median of the differences is above 3 σ.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ from jaxtyping import Float
 from jaxbundle.network.build import make_further
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.photographs.xmp import Attitude, rotation_of
+from jaxbundle.photographs.xmp import CameraAttitude, rotation_of
 
-LARGEST_MEDIAN = 3.0
-"""Largest median of the differences, in units of their σ."""
-FEWEST = 3
+MIN_ATTITUDES = 3
+"""Minimum known attitudes: of two, the median of the differences is the mean of both, and one wrong
+attitude refuses a right one."""
 
 
-class Attitudes(NamedTuple):
+class MapAttitudes(NamedTuple):
     """M from the map system to the camera, and its σ about every axis, radians; NaN: unknown."""
 
     M: Float[np.ndarray, "n 3 3"]
@@ -29,18 +29,18 @@ class Attitudes(NamedTuple):
 
 
 def map_attitudes(
-    measured: Sequence[Attitude | None], convergence: Float[np.ndarray, " n"]
-) -> Attitudes | None:
+    measured: Sequence[CameraAttitude | None], convergence: Float[np.ndarray, " n"]
+) -> MapAttitudes | None:
     """The attitudes in the map system; None if fewer than three are known."""
     M, sigma = np.full((len(measured), 3, 3), np.nan), np.full(len(measured), np.nan)
     for k, attitude in enumerate(measured):
         if attitude is not None and np.isfinite(convergence[k]):
             M[k], sigma[k] = rotation_of(attitude, convergence[k]), np.radians(attitude.sigma)
-    return Attitudes(M, sigma) if np.isfinite(sigma).sum() >= FEWEST else None
+    return MapAttitudes(M, sigma) if np.isfinite(sigma).sum() >= MIN_ATTITUDES else None
 
 
 def with_attitudes(
-    network: Network, names: Sequence[str], attitudes: Attitudes | None
+    network: Network, names: Sequence[str], attitudes: MapAttitudes | None
 ) -> tuple[Network, str]:
     """The oriented network with its attitudes as observations, or without; and a note.
 
@@ -50,17 +50,21 @@ def with_attitudes(
         return network, ""
     rows = np.array([names.index(id) for id in network.images.id])
     known = np.isfinite(attitudes.sigma[rows]) & np.isfinite(network.images.angles).all(1)
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_ATTITUDES:
         return network, ""
     M, sigma = attitudes.M[rows[known]], attitudes.sigma[rows[known]]
-    found = np.asarray(many.matrices(network.images.angles[known]))
-    cosine = (np.einsum("nij,nij->n", M, found) - 1) / 2
+    oriented = np.asarray(many.matrices(network.images.angles[known]))
+    # the angle of M·M'ᵀ: 2·cos α + 1 = tr(M·M'ᵀ)
+    cosine = (np.einsum("nij,nij->n", M, oriented) - 1) / 2
     off = np.arccos(np.clip(cosine, -1, 1))
-    if np.median(off / sigma) > LARGEST_MEDIAN:
+    # angles of right attitudes with σ about three axes have the median 1.54 σ; one constant
+    # rotation, as of a mounting, makes all of them large
+    if np.median(off / sigma) > 3:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
             "from those of the photographs and their positions: not used"
         )
+    # one σ about all axes: the largest that the file states
     angles = np.asarray(many.angles(M))
     columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}
     columns |= {axis: angles[:, k] for k, axis in enumerate(("omega", "phi", "kappa"))}

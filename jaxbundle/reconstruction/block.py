@@ -2,7 +2,7 @@
 
 import dataclasses
 import datetime
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -16,15 +16,6 @@ from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.photographs.exif import Exif
 from jaxbundle.report.layout import significant
 from jaxbundle.system.clock import in_words, now
-
-DOWNWARD = 0.7
-"""Least cosine between the viewing directions and the vertical of a block with a flying height and
-an area: 45 degrees."""
-CONTRADICTORY = 3.0
-"""Offset and RMS of satellite positions, in σ, above which they contradict control or photographs.
-"""
-RANGE = 0.01
-"""Share of the points beyond each side of the area: they may be far away by a gross error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,19 +34,19 @@ class CameraPositions:
         """RMS of the differences."""
         return np.sqrt(np.mean(np.square([*self.difference.values()]), 0))
 
-    def contradictions(self, prior: Float[np.ndarray, "3"], unit: str) -> list[str]:
+    def contradictions(self, prior: Sequence[float], unit: str) -> list[str]:
         """How the positions contradict control and their own σ, in words; `prior`: σ of the
         offset before the adjustment."""
-        said = []
+        said, limit = [], 3.0  # σ: by chance one in 370, for each of six figures
         for axis, value, s in zip("XYZ", self.offset, prior):
-            if np.isfinite(value) and abs(value) > CONTRADICTORY * s:
+            if np.isfinite(value) and abs(value) > limit * s:
                 said.append(
                     f"satellite positions and control contradict each other: their offset "
                     f"in {axis} is {value:+.1f} {unit}, its prior σ {s:g} {unit}; compare "
                     "their coordinate systems"
                 )
         for axis, value, s in zip("XYZ", self.rms, self.sigma):
-            if value > CONTRADICTORY * s:
+            if value > limit * s:
                 numbers = f"{significant(value)} {unit}, their σ {significant(s)} {unit}"
                 said.append(
                     f"satellite positions contradict the photographs: RMS in {axis} {numbers}"
@@ -64,7 +55,7 @@ class CameraPositions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Block:
+class BlockFacts:
     """Facts about an adjusted block. Lengths in the object unit; None: not defined, without a
     vertical or in an oblique block."""
 
@@ -115,23 +106,21 @@ class Block:
     def _position_facts(self) -> list[tuple[str, str]]:
         if self.positions is None:
             return [("Camera positions", "none in the files were used")]
-        axes = lambda values, sign="": " ".join(
-            f"{a} {significant(v) if not sign else f'{v:+.3g}'}"
-            for a, v in zip("XYZ", values)
-            if np.isfinite(v)
+        axes = lambda values: " ".join(
+            f"{a} {significant(v)}" for a, v in zip("XYZ", values) if np.isfinite(v)
         )
-        found = self.positions
+        p = self.positions
         rows = [
             (
                 "Camera positions",
-                f"{len(found.difference)} in the files, RMS of adjusted − given {axes(found.rms)} "
-                f"{self.unit} (σ {axes(found.sigma)})",
+                f"{len(p.difference)} in the files, RMS of adjusted − given {axes(p.rms)} "
+                f"{self.unit} (σ {axes(p.sigma)})",
             )
         ]
-        if np.isfinite(found.offset).any():
+        if np.isfinite(p.offset).any():
             offset = " ".join(
                 f"{a} {v:+.3g} ± {significant(s, 2)}"
-                for a, v, s in zip("XYZ", found.offset, found.offset_sigma)
+                for a, v, s in zip("XYZ", p.offset, p.offset_sigma)
                 if np.isfinite(v)
             )
             rows.append(("Their offset", f"{offset} {self.unit}, positions minus control"))
@@ -141,7 +130,7 @@ class Block:
         """The facts for JSON."""
         number = lambda x: None if x is None or not np.isfinite(x) else float(x)
         axes = lambda values: dict(zip("XYZ", map(number, values)))
-        found = {
+        facts = {
             "photographs": self.photographs,
             "taken": None if self.taken is None else [t.isoformat() for t in self.taken],
             "computed": self.computed.isoformat(timespec="seconds"),
@@ -156,22 +145,22 @@ class Block:
             "points_per_photograph",
             "photographs_per_place",
         )
-        found |= {name: number(getattr(self, name)) for name in names}
+        facts |= {name: number(getattr(self, name)) for name in names}
         if self.positions is None:
-            return found | {"camera_positions": None}
-        of = self.positions
-        return found | {
+            return facts | {"camera_positions": None}
+        p = self.positions
+        return facts | {
             "camera_positions": {
-                "rms": axes(of.rms),
-                "sigma": axes(of.sigma),
-                "offset": axes(of.offset),
-                "offset_sigma": axes(of.offset_sigma),
-                "difference": {id: axes(d) for id, d in of.difference.items()},
+                "rms": axes(p.rms),
+                "sigma": axes(p.sigma),
+                "offset": axes(p.offset),
+                "offset_sigma": axes(p.offset_sigma),
+                "difference": {id: axes(d) for id, d in p.difference.items()},
             }
         }
 
 
-def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) -> Block:
+def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) -> BlockFacts:
     """The facts of an adjusted block.
 
     **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
@@ -183,11 +172,14 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     known = np.isfinite(X[point]).all(1)
     image, point = image[known], point[known]
     depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
+    # by photograph first: one with many points does not decide for all
     of_image = np.array(
         [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
     )
     pixel = np.array([_pixel_angle(camera) for camera in network.cameras])[network.images.camera]
-    down = bool(system) and float(np.median(M[:, 2, 2])) > DOWNWARD
+    # within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
+    # the camera, and footprints reach to the horizon
+    down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
     height = area = places = None
     tie = network.points.has_role("tie")
     ground = X[np.unique(point[tie[point]])]
@@ -198,12 +190,13 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
             if (image == k).any()
         ]
         height, area = float(np.median(above)), _hull_area(_inner(ground[:, :2]))
+        # as much ground as the photographs cover, by how much there is
         footprints = [_hull_area(_inner(X[point[image == k], :2])) for k in range(len(X0))]
         places = sum(footprints) / area if area else None
     times = [exif[id].time for id in network.images.id if id in exif]
     taken = sorted(t for t in times if t is not None)
     on_ties = tie[point]
-    return Block(
+    return BlockFacts(
         len(X0),
         (taken[0], taken[-1]) if taken else None,
         now(),
@@ -234,10 +227,10 @@ def _pixel_angle(camera: Camera) -> float:
 
 
 def _inner(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """The points within the quantiles of both coordinates."""
+    """The points without 1 % beyond each side, which may be far away by a gross error."""
     if len(xy) < 4:
         return xy
-    low, high = np.quantile(xy, [RANGE, 1 - RANGE], axis=0)
+    low, high = np.quantile(xy, [0.01, 1 - 0.01], axis=0)
     return xy[((xy >= low) & (xy <= high)).all(1)]
 
 
@@ -247,8 +240,8 @@ def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
         return 0.0
     ordered = sorted(map(tuple, xy.tolist()))
 
-    def half(points):
-        chain: list = []
+    def half(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        chain: list[tuple[float, float]] = []
         for p in points:
             while len(chain) > 1 and (
                 (chain[-1][0] - chain[-2][0]) * (p[1] - chain[-2][1])
@@ -259,7 +252,7 @@ def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
         return chain[:-1]
 
     x, y = np.array([*half(ordered), *half(ordered[::-1])]).T
-    x, y = x - x[0], y - y[0]
+    x, y = x - x[0], y - y[0]  # map coordinates have 7 digits, whose products would cancel
     return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
 
 
@@ -270,6 +263,7 @@ def camera_positions(result: Adjustment) -> CameraPositions | None:
     nothing = np.full(3, np.nan)
     antennas = next((one for one in network.further if isinstance(one, Antennas)), None)
     if antennas is not None:
+        # the shift of the one strip is the offset of the system; not estimated axes have none
         row = {id: k for k, id in enumerate(network.images.id)}
         (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
         found = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]

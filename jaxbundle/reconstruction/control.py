@@ -13,6 +13,7 @@ their UTM zone.
 import csv
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,10 @@ from jaxbundle.network.rules import check_choice
 from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
 
-MANUAL = 1.0
-"""Default σ of a manual measurement, pixels."""
+MANUAL_SIGMA = 1.0
+"""Default σ of a manual measurement, pixels: a person hits a mark to about that. If the rays of the
+points meet worse, σ are multiplied by the robust scale (`OrientedBlock.resolve`), so a
+smaller value corrects itself, a larger one stays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Control:
     name."""
 
     points: Points
-    seen: tuple[tuple[str, str], ...]
+    sightings: tuple[tuple[str, str], ...]
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, " n"]
     system: str = ""
@@ -56,8 +59,8 @@ def with_sigma(control: Control, text: str) -> Control:
         )
     sigma = np.array([values[0], values[0], values[-1]])
     points, free = control.points, np.array(control.points.role, object) != "fixed"
-    given = np.where(np.isnan(control.points.sigma) & free[:, None], sigma, points.sigma)
-    return dataclasses.replace(control, points=dataclasses.replace(points, sigma=given))
+    completed = np.where(np.isnan(points.sigma) & free[:, None], sigma, points.sigma)
+    return dataclasses.replace(control, points=dataclasses.replace(points, sigma=completed))
 
 
 def read_control_measurements(path: str | Path) -> Control:
@@ -74,22 +77,22 @@ def read_control_measurements(path: str | Path) -> Control:
     ]
     if not rows:
         raise InputError(f"{path}: the file is empty")
+    # three formats, told apart by the first line: column names, a coordinate system, anything else
     head = [cell.strip().lower() for cell in rows[0][1].split(",")]
     if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
-        return _table(path, head, rows[1:])
+        return _read_table(path, head, rows[1:])
     first = rows[0][1].strip()
-    if _is_system(first):
-        return _gcp_list(path, first, rows[1:])
+    if first.upper().startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS")):
+        return _read_gcp_list(path, first, rows[1:])
     points = read_control(path)
     return Control(points, (), np.zeros((0, 2)), np.zeros(0))
 
 
-def _is_system(line: str) -> bool:
-    word = line.upper()
-    return word.startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS"))
+Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float, int]
+"""Point, its coordinates, photograph, pixels, their σ, and the line of the file."""
 
 
-def _gcp_list(path, system, rows) -> Control:
+def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> Control:
     records = []
     for number, line in rows:
         cells = line.split()
@@ -100,12 +103,13 @@ def _gcp_list(path, system, rows) -> Control:
             raise InputError(
                 f"{path}, line {number}: X Y Z u v photograph [name] are expected, not {line!r}"
             ) from None
+        # without a name rows of one point are known by their equal coordinates, as text
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
-        records.append((name, (X, Y, Z), image, (u, v), MANUAL, number))
+        records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
 
 
-def _table(path, head, rows) -> Control:
+def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]) -> Control:
     records, sigmas = [], {}
     for number, line in rows:
         row = next(csv.reader([line], skipinitialspace=True))
@@ -116,7 +120,12 @@ def _table(path, head, rows) -> Control:
             )
         cells = dict(zip(head, row))
 
-        def value(name, otherwise=math.nan, cells=cells, number=number):
+        def value(
+            name: str,
+            otherwise: float = math.nan,
+            cells: dict[str, str] = cells,
+            number: int = number,
+        ) -> float:
             text = (cells.get(name) or "").strip()
             try:
                 return float(text) if text else otherwise
@@ -128,32 +137,32 @@ def _table(path, head, rows) -> Control:
         id, role = cells["id"].strip(), (cells.get("role") or "control").strip()
         check_choice("role", role, ROLES, f"{path}, line {number}: ")
         sigmas[id] = ([value(f"s{axis}") for axis in "xyz"], role)
-        place = (value("u"), value("v"))
-        records.append(
-            (
-                id,
-                tuple(value(axis) for axis in "xyz"),
-                cells["image"].strip(),
-                place,
-                value("suv", MANUAL),
-                number,
-            )
-        )
+        X, uv = tuple(value(axis) for axis in "xyz"), (value("u"), value("v"))
+        image, sigma = cells["image"].strip(), value("suv", MANUAL_SIGMA)
+        records.append((id, X, image, uv, sigma, number))
     return _collect(path, records, "", sigmas)
 
 
-def _collect(path, records, system, sigmas) -> Control:
+def _collect(
+    path: Path,
+    records: Sequence[Record],
+    system: str,
+    sigmas: Mapping[str, tuple[Sequence[float], str]],
+) -> Control:
+    """The control of a file; `sigmas`: σ and role by point, where the file states them."""
     if not records:
         raise InputError(f"{path}: contains no control points")
     position, numbers = {}, {}
     for name, X, _, place, sigma, number in records:
         if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
+        # the table repeats the coordinates in each row of a point
         if name in position and position[name] != X:
             raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
         position[name] = X
         numbers.setdefault(name, number)
     X, said = to_map(np.array(list(position.values())), system, str(path))
+    # control without a σ, NaN, gets one from --control-sigma or from its residuals
     sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
     roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
     source = Source(str(path), np.array(list(numbers.values())), "line")

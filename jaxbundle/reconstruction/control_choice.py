@@ -15,16 +15,10 @@ from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Points
 from jaxbundle.orientation.control_consistency import Assessment, assess
 from jaxbundle.reconstruction.oriented_block import (
-    ENOUGH_CONTROL,
-    WRONG,
-    Measured,
+    MIN_CONTROL,
+    MeasuredPoint,
     OrientedBlock,
 )
-
-CONTRADICTORY_HEIGHTS = 3.0
-"""Heights that are all 0 are unknown if the heights of the block differ by more, in σ."""
-COMPARED_TOGETHER = 100
-"""Largest number of control points with a joint covariance."""
 
 
 @dataclasses.dataclass
@@ -33,29 +27,31 @@ class ControlChoice:
     ones estimated; the reason for points that are not used, and remarks about wrong measurements,
     by id; the `assessment` of those that could be compared."""
 
-    measured: dict[str, Measured]
+    points: dict[str, MeasuredPoint]
     used: Bool[np.ndarray, " n"]
     sigma: Float[np.ndarray, "n 3"]
-    why: dict[str, str]
-    wrong: dict[str, list[str]]
+    reasons: dict[str, str]
+    errors: dict[str, list[str]]
     assessment: Assessment
 
-    def assessed(self, rows) -> Assessment:
+    def assessed(self, rows: Bool[np.ndarray, " n"]) -> Assessment:
         """The assessment with the σ of some of the points."""
         return dataclasses.replace(self.assessment, sigma=self.sigma[rows])
 
     def remarks(self) -> list[str]:
         """What is wrong, by point."""
-        found = [f"{id} in {said}" for id, lines in self.wrong.items() for said in lines]
-        return [*found, *(f"{id} is not used: {why}" for id, why in self.why.items())]
+        wrong = [f"{id} in {said}" for id, lines in self.errors.items() for said in lines]
+        return [*wrong, *(f"{id} is not used: {why}" for id, why in self.reasons.items())]
 
 
 def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     """Control whose heights are all 0 without heights, if satellite positions contradict them; and
     what was decided."""
-    points = block.given.points
+    points = block.frame.points
+    # spreadsheets and forms write 0 for what is not known: suspected if there are several points,
+    # all of them 0, without a σ that somebody stated for a height
     heights = points.position[:, 2]
-    if len(points) < ENOUGH_CONTROL or heights.any() or np.isfinite(points.sigma[:, 2]).any():
+    if len(points) < MIN_CONTROL or heights.any() or np.isfinite(points.sigma[:, 2]).any():
         return points, ""
     if not block.has_positions:
         return points, (
@@ -66,13 +62,13 @@ def without_unknown_heights(block: OrientedBlock) -> tuple[Points, str]:
     spread = block.network.images.sigma[:, 2]
     sigma = float(np.nanmedian(spread[np.isfinite(spread)]))
     middle = float(np.median(block.X[rows, 2])) if rows else 0.0
-    if abs(middle) <= CONTRADICTORY_HEIGHTS * sigma:
+    if abs(middle) <= block.settings.contradictory_heights * sigma:
         return points, (
             f"the heights of all control points are 0, {abs(middle):.1f} m from those "
             "by the satellite positions: used as the file states them"
         )
     free = points.sigma.copy()
-    free[:, 2] = np.inf
+    free[:, 2] = np.inf  # infinite: not controlled, in all that follows
     return dataclasses.replace(points, sigma=free), (
         f"the heights of all control points are 0, but {middle:.1f} ± {sigma:.1f} m by the "
         "satellite positions: taken as unknown, control is used in the plane only (state sZ for "
@@ -85,26 +81,26 @@ def assess_control(
 ) -> tuple[list[int], Assessment]:
     """The usable points in the order of their assessment: very many in groups that spread over all
     of them, since time grows with the cube of their number."""
-    number = max(1, -(-len(usable) // COMPARED_TOGETHER))
+    number = max(1, -(-len(usable) // block.settings.compared_together))
     groups = [list(usable[first::number]) for first in range(number)]
-    found = [assess(block.compare(group, control), assumed) for group in groups]
-    join = lambda name: np.concatenate([getattr(one, name) for one in found])
+    of_groups = [assess(block.compare(group, control), assumed) for group in groups]
+    join = lambda name: np.concatenate([getattr(of_group, name) for of_group in of_groups])
     return [k for group in groups for k in group], Assessment(
         join("used"),
         join("sigma"),
-        found[0].redundancy,
+        of_groups[0].redundancy,
         join("error"),
         join("error_sigma"),
         join("probability"),
-        found[0].assumed,
-        max(one.factor for one in found),
+        of_groups[0].assumed,
+        max(of_group.factor for of_group in of_groups),
     )
 
 
 def choose_control(
     block: OrientedBlock,
     control: Points,
-    measured: dict[str, Measured],
+    measured: dict[str, MeasuredPoint],
     usable: Sequence[int],
     assessed: Assessment,
     assumed: float,
@@ -113,33 +109,35 @@ def choose_control(
     sigma = control.sigma.copy()
     for k in range(3):
         unknown = np.isnan(sigma[:, k])
-        among = np.isnan(control.sigma[list(usable), k])
-        sigma[unknown, k] = assessed.sigma[among, k][0] if among.any() else assumed
+        estimated = np.isnan(control.sigma[list(usable), k])
+        sigma[unknown, k] = assessed.sigma[estimated, k][0] if estimated.any() else assumed
+    # stated σ that most points contradict are multiplied by one factor, estimated ones fit already
     sigma[np.isfinite(control.sigma)] *= assessed.factor
-    found = ControlChoice(dict(measured), np.zeros(len(control), bool), sigma, {}, {}, assessed)
-    at = {k: n for n, k in enumerate(usable)}
+    choice = ControlChoice(dict(measured), np.zeros(len(control), bool), sigma, {}, {}, assessed)
+    row = {k: n for n, k in enumerate(usable)}
+    # the offset of satellite positions against control, by the points that agree
     shift = np.zeros(3)
-    agreed = [k for k, n in at.items() if assessed.used[n]]
+    agreed = [k for k, n in row.items() if assessed.used[n]]
     if agreed:
         X = block.X[[block.determined[control.id[k]] for k in agreed]]
         shift = np.median(X - control.position[agreed], axis=0)
     for k, id in enumerate(control.id):
-        one = measured[id]
-        if not len(one.rows):
-            found.why[id] = "in no oriented photograph"
-        elif k in at:
-            n = at[k]
-            found.used[k] = assessed.used[n]
+        point = measured[id]
+        if not len(point.rows):
+            choice.reasons[id] = "in no oriented photograph"
+        elif k in row:
+            n = row[k]
+            choice.used[k] = assessed.used[n]
             if not assessed.used[n]:
-                found.why[id] = _describe_error(assessed, n)
-        elif one.good.any():
-            found.used[k] = control.role[k] != "check"
+                choice.reasons[id] = _describe_error(assessed, n)
+        elif point.good.any():
+            choice.used[k] = control.role[k] != "check"
         else:
-            _settle_by_coordinates(block, found, k, control, shift)
-        if found.measured[id].good.any() or id not in found.why:
-            _name_wrong(block, found, id)
-    _name_exchanged(block, control, found, [k for k, n in at.items() if not assessed.used[n]])
-    return found
+            _settle_by_coordinates(block, choice, k, control, shift)
+        if choice.points[id].good.any() or id not in choice.reasons:
+            _name_wrong(block, choice, id)
+    _name_exchanged(block, control, choice, [k for k, n in row.items() if not assessed.used[n]])
+    return choice
 
 
 def _describe_error(assessed: Assessment, n: int) -> str:
@@ -155,68 +153,73 @@ def _describe_error(assessed: Assessment, n: int) -> str:
 
 def _settle_by_coordinates(
     block: OrientedBlock,
-    found: ControlChoice,
+    choice: ControlChoice,
     k: int,
     control: Points,
     shift: Float[np.ndarray, "3"],
 ) -> None:
     """A point whose rays do not meet, or that has only one: its rays are compared with its
     coordinates."""
-    id, one = control.id[k], found.measured[control.id[k]]
+    id, point = control.id[k], choice.points[control.id[k]]
     X = control.position[k] + shift
+    # without a height, that of the points around
     if np.isinf(control.sigma[k, 2]):
         depth = [block.X[row, 2] for row in block.determined.values()]
         X[2] = np.median(depth) if depth else X[2]
-    distance = np.linalg.norm(X - block.X0[one.image], axis=1)
-    spread = np.sqrt((np.where(np.isfinite(found.sigma[k]), found.sigma[k], 0.0) ** 2).sum())
-    off = block.misses(one, X)
-    agree = off < WRONG * np.hypot(one.sigma, spread / (distance * one.pixel))
-    if control.role[k] == "check" or (len(one.rows) > 1 and agree.sum() != 1):
-        number = count(len(one.rows), "ray")
-        found.why[id] = (
+    distance = np.linalg.norm(X - block.X0[point.image], axis=1)
+    spread = np.sqrt((np.where(np.isfinite(choice.sigma[k]), choice.sigma[k], 0.0) ** 2).sum())
+    off = block.misses(point, X)
+    # σ of the measurement and, in pixels, of the coordinates
+    sigma = np.hypot(point.sigma, spread / (distance * point.pixel))
+    agree = off < block.settings.wrong_ray * sigma
+    # of several rays that do not meet exactly one may pass the coordinates: then that one is right
+    if control.role[k] == "check" or (len(point.rows) > 1 and agree.sum() != 1):
+        number = count(len(point.rows), "ray")
+        choice.reasons[id] = (
             f"its {number} do not meet"
-            if len(one.rows) > 1
+            if len(point.rows) > 1
             else "a check point needs two rays, it has 1"
         )
     elif agree.any():
-        found.measured[id] = dataclasses.replace(one, good=agree)
-        found.used[k] = True
+        choice.points[id] = dataclasses.replace(point, good=agree)
+        choice.used[k] = True
     else:
-        ground = off[0] * one.pixel[0] * distance[0]
-        found.why[id] = (
-            f"its only ray, in {block.name_of(one, 0)}, misses its coordinates by "
+        ground = off[0] * point.pixel[0] * distance[0]
+        choice.reasons[id] = (
+            f"its only ray, in {block.name_of(point, 0)}, misses its coordinates by "
             f"{off[0]:.0f} px, {ground:.1f} m"
         )
 
 
-def _name_wrong(block: OrientedBlock, found: ControlChoice, id: str) -> None:
+def _name_wrong(block: OrientedBlock, choice: ControlChoice, id: str) -> None:
     """Remarks about the measurements of a point that do not agree with the others."""
-    one = found.measured[id]
-    X = one.position
+    point = choice.points[id]
+    X = point.position
     if not np.isfinite(X).all():
         return
-    off = block.misses(one, X)
-    for n in np.flatnonzero(~one.good).tolist():
-        passes = np.linalg.norm(np.cross(X - block.X0[one.image[n]], one.rays[n]))
+    off = block.misses(point, X)
+    for n in np.flatnonzero(~point.good).tolist():
+        passes = np.linalg.norm(np.cross(X - block.X0[point.image[n]], point.rays[n]))
         said = (
-            f"{block.name_of(one, n)} is a wrong measurement and not used: {off[n]:.0f} px "
+            f"{block.name_of(point, n)} is a wrong measurement and not used: {off[n]:.0f} px "
             "from where the other photographs see it, its ray passes at "
             f"{passes:.2f} m"
         )
-        other = block.seen_there(one, n, id, found.measured)
-        found.wrong.setdefault(id, []).append(
+        other = block.seen_there(point, n, id, choice.points)
+        choice.errors.setdefault(id, []).append(
             said + (f"; it is at the place of {other}: a wrong name" if other else "")
         )
 
 
 def _name_exchanged(
-    block: OrientedBlock, control: Points, found: ControlChoice, bad: Sequence[int]
+    block: OrientedBlock, control: Points, choice: ControlChoice, bad: Sequence[int]
 ) -> None:
     """Pairs of contradictory points whose coordinates fit if they are exchanged."""
     for i in bad:
         for j in bad:
             X = block.X[block.determined[control.id[i]]]
             off = X - control.position[j]
-            sigma = np.where(np.isfinite(found.sigma[j]), found.sigma[j], np.inf)
-            if i != j and np.all(np.abs(off) < WRONG * np.hypot(sigma, block.offset_sigma)):
-                found.why[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"
+            sigma = np.where(np.isfinite(choice.sigma[j]), choice.sigma[j], np.inf)
+            limit = block.settings.wrong_ray * np.hypot(sigma, block.offset_sigma)
+            if i != j and np.all(np.abs(off) < limit):
+                choice.reasons[control.id[i]] += f"; it fits the coordinates of {control.id[j]}"

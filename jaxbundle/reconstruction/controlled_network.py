@@ -13,15 +13,10 @@ from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Distances, Network, Points, Source
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.reconstruction.control_choice import ControlChoice
-from jaxbundle.reconstruction.oriented_block import (
-    OFFSET,
-    OFFSET_HEIGHT,
-    Measured,
-    OrientedBlock,
-)
+from jaxbundle.reconstruction.oriented_block import MeasuredPoint, OrientedBlock
 
 
-class _Added(NamedTuple):
+class _NamedPoints(NamedTuple):
     """Named points of the final network, and their measurements, σ in pixels."""
 
     id: tuple[str, ...]
@@ -41,13 +36,15 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     ends = [(ids[a], ids[b]) for a, b in distances.points]
     network = keep_points(network, np.array([id not in named for id in network.points.id]))
     row = {id: k for k, id in enumerate(network.points.id)}
-    at = np.array([row.get(id, -1) for id in whole.points.id])
-    rays = whole.observations.take(at[whole.observations.point] >= 0)
-    added = _measured_points(block, control, choice, len(row))
+    # the rows of the points in the new network, −1: named ones, which are added anew
+    new_row = np.array([row.get(id, -1) for id in whole.points.id])
+    rays = whole.observations.take(new_row[whole.observations.point] >= 0)
+    added = _gather_points(block, control, choice, len(row))
     xy, sigma = from_image_unit(
         block.cameras, whole.images.camera[added.image], added.xy, added.spread, "px"
     )
     images, moved = network.images, [block.of_id[id] for id in network.points.id]
+    # check points are no points of the network, and distances to them are left out
     row |= {id: len(row) + k for k, id in enumerate(added.id) if added.role[k] != "check"}
     here = np.array([a in row and b in row for a, b in ends], bool)
     return network.replace(
@@ -61,14 +58,15 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         observations=dataclasses.replace(
             rays,
             image=np.concatenate([rays.image, added.image]),
-            point=np.concatenate([at[rays.point], added.point]),
+            point=np.concatenate([new_row[rays.point], added.point]),
             xy=np.concatenate([rays.xy, xy]),
             sigma=np.concatenate([rays.sigma, sigma]),
             source=Source("observations"),
         ),
         further=(
-            *(one for one in network.further if not isinstance(one, ExteriorPriors)),
-            *_positions(block, choice),
+            # the positions come back as observations of antennas, with an offset
+            *(kind for kind in network.further if not isinstance(kind, ExteriorPriors)),
+            *_observe_positions(block, choice),
         ),
         distances=Distances(
             np.array([[row[a], row[b]] for (a, b), keep in zip(ends, here) if keep], int).reshape(
@@ -86,64 +84,66 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
     )
 
 
-def _measured_points(
+def _gather_points(
     block: OrientedBlock, control: Points, choice: ControlChoice, first: int
-) -> _Added:
+) -> _NamedPoints:
     """Control and check points that can be determined, with their good measurements."""
     ids, roles, position, sigma, rows, point = [], [], [], [], [], []
     image, spread = [], []
     for k, id in enumerate(control.id):
-        one = choice.measured[id]
-        # a point with wrong coordinates is a good tie point
+        measured = choice.points[id]
+        # a point with wrong coordinates is a good tie point: its rays agree
         role = "check" if control.role[k] == "check" else "tie"
         role = control.role[k] if choice.used[k] else role
-        if one.good.sum() < (1 if choice.used[k] else 2):
+        # known coordinates and one ray leave a residual, a tie point with one ray leaves none
+        if measured.good.sum() < (1 if choice.used[k] else 2):
             continue
-        there = np.isfinite(one.position).all()
-        start = one.position if there else _on_ray(block, one)
+        there = np.isfinite(measured.position).all()
+        start = measured.position if there else _place_on_ray(block, measured)
         free = np.isinf(choice.sigma[k]) | (role == "tie")
         position.append(np.where(free, start, control.position[k]))
         exact = role in ("fixed", "tie")
         sigma.append(np.full(3, np.nan) if exact else choice.sigma[k])
-        rows += one.rows[one.good].tolist()
-        image += one.image[one.good].tolist()
-        spread += one.sigma[one.good].tolist()
-        point += [first + len(ids)] * int(one.good.sum())
+        rows += measured.rows[measured.good].tolist()
+        image += measured.image[measured.good].tolist()
+        spread += measured.sigma[measured.good].tolist()
+        point += [first + len(ids)] * int(measured.good.sum())
         ids.append(id)
         roles.append(role)
-    return _Added(
+    return _NamedPoints(
         tuple(ids),
         tuple(roles),
         np.reshape(position, (-1, 3)),
         np.reshape(sigma, (-1, 3)),
         np.array(image, int),
         np.array(point, int),
-        block.given.named.xy[np.array(rows, int)],
+        block.frame.named.xy[np.array(rows, int)],
         np.repeat(np.reshape(spread, (-1, 1)), 2, 1),
     )
 
 
-def _on_ray(block: OrientedBlock, one: Measured) -> Float[np.ndarray, "3"]:
+def _place_on_ray(block: OrientedBlock, measured: MeasuredPoint) -> Float[np.ndarray, "3"]:
     """A place on the first good ray, at the distance of the points around."""
-    first = int(np.flatnonzero(one.good)[0])
-    X0, rays = block.X0[one.image[first]], block.network.observations
-    seen = block.X[rays.point[rays.image == one.image[first]]]
+    first = int(np.flatnonzero(measured.good)[0])
+    X0, rays = block.X0[measured.image[first]], block.network.observations
+    seen = block.X[rays.point[rays.image == measured.image[first]]]
     depth = np.nanmedian(np.linalg.norm(seen - X0, axis=1))
-    return X0 + depth * one.rays[first]
+    return X0 + depth * measured.rays[first]
 
 
-def _positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
+def _observe_positions(block: OrientedBlock, choice: ControlChoice) -> list[Antennas]:
     """Satellite positions as observations, with an offset on the axes that control has."""
-    if block.given.positions is None:
+    if block.frame.positions is None:
         return []
-    names = {name: k for k, name in enumerate(block.given.names)}
+    names = {name: k for k, name in enumerate(block.frame.names)}
     rows = np.array([names[id] for id in block.network.images.id])
-    X, sigma = (one[rows] for one in block.given.positions)
+    X, sigma = (values[rows] for values in block.frame.positions)
     there = np.flatnonzero(np.isfinite(X).all(1) & np.isfinite(sigma).all(1))
     if not len(there):
         return []
+    # on an axis without control the offset and the block itself could not be separated
     axes = [a for k, a in enumerate("XYZ") if np.isfinite(choice.sigma[choice.used, k]).any()]
-    prior = dict(zip("XYZ", (OFFSET, OFFSET, OFFSET_HEIGHT)))
+    prior = dict(zip("XYZ", block.settings.offset_sigma))
     settings = {
         "free": [f"shift_{a}" for a in axes],
         "sigma": {f"shift_{a}": prior[a] for a in axes},

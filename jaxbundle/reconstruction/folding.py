@@ -17,79 +17,110 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.columns import count
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
-from jaxbundle.reconstruction.adjusting import Weighted
-from jaxbundle.tiepoints.refinement import Measurements
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.tiepoints.search import ideal_features, present_size
-
-AGREEING_SHARE = 1 / 3
-"""Minimum share of measurements that agree with a result."""
-ONE_DIRECTION, ONE_SCALE = np.radians(15.0), 1.5
-"""Maximum angle between the rays to a point, and ratio of their lengths, with which it is expected
-in both photographs."""
-FEWEST, OF_EACH = 50, 10
-"""Minimum expected points of a pair, and of those of each photograph in the other one."""
-SHARED = 0.1
-"""Share of the expected points below which a pair is contradictory."""
-PAIRS, OF_ALL = 3, 0.15
-"""Contradictory pairs, and their share of all, above which a result is refused: 17 of 24 in a
-facade that is folded (`chain` of the benchmarks)."""
-MOST_NAMED = 5
+from jaxbundle.tiepoints.track_measurement import Measurements
 
 
-def refuse_folded(weighted: Weighted, measured: Measurements, names: Sequence[str]) -> None:
+@dataclasses.dataclass(frozen=True)
+class SuperpositionSettings:
+    """Settings of the search for superimposed parts of an object."""
+
+    min_agreeing: float = 1 / 3
+    """Minimum share of measurements that agree with a result. Smaller: folded results,
+    with which the measurements of one layer agree, pass; larger: right ones of objects that move or
+    repeat themselves in part are refused."""
+    max_angle: float = np.radians(15.0)
+    """Maximum angle between the rays to a point with which it is expected in both photographs,
+    radians: SIFT still finds most features. Larger: points that cannot be found count as missing;
+    smaller: fewer pairs can be compared."""
+    max_scale: float = 1.5
+    """Maximum ratio of the lengths of these rays: half an octave of SIFT."""
+    min_points: int = 50
+    """Minimum expected points of a pair: a tenth of them are five; if every second of right ones is
+    found again, fewer than five are with a probability of 2e-10."""
+    min_of_each: int = 10
+    """Minimum expected points of each photograph in the other one."""
+    min_shared: float = 0.1
+    """Share of the expected points below which a pair is contradictory. Superimposed parts that
+    repeat themselves share some points; right pairs share most, blurred ones less."""
+    max_pairs: int = 3
+    """Number of contradictory pairs from which a result is refused: one photograph with something
+    close in front of it may cause one or two."""
+    max_pair_share: float = 0.15
+    """The same as a share of all pairs that can be compared, whichever is more: in a facade that is
+    folded (`chain` of the benchmarks) 17 of 24 are."""
+
+
+def refuse_folded(
+    weighted: WeightedAdjustment,
+    measured: Measurements,
+    names: Sequence[str],
+    settings: SuperpositionSettings = SuperpositionSettings(),
+) -> None:
     """Refuse a result that disagrees with most measurements in its photographs."""
     placed = set(weighted.adjustment.network.images.id)
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
-    found = int(rays[rays > 1].sum())
-    if weighted.agreeing < AGREEING_SHARE * found:
+    number = int(rays[rays > 1].sum())
+    if weighted.agreeing_rays < settings.min_agreeing * number:
         raise _folded(
-            f"of {found} measurements in {count(len(placed), 'photograph')} {weighted.agreeing} "
-            "agree with one object",
+            f"of {number} measurements in {count(len(placed), 'photograph')} "
+            f"{weighted.agreeing_rays} agree with one object",
             names,
         )
 
 
 def refuse_superimposed(
-    result: Adjustment, measured: Network, tried: set[tuple[int, int]], names: Sequence[str]
+    result: Adjustment,
+    measured: Network,
+    matched_pairs: set[tuple[int, int]],
+    names: Sequence[str],
+    settings: SuperpositionSettings = SuperpositionSettings(),
 ) -> list[str]:
     """Pairs of photographs that contradict a result, as notes.
 
-    **Arguments:** `measured`: the network with all measurements; `tried`: matched pairs, by the
+    **Arguments:** `measured`: the network with all measurements; `matched_pairs`: by the
     positions of their photographs in `names`.
 
     **Raises:** `NotSolvedError` if there are many of them.
     """
-    expected, shared = count_shared_points(result, measured)
+    expected, shared = count_shared_points(result, measured, settings)
     row = {name: k for k, name in enumerate(names)}
     place = [row[id] for id in result.network.images.id]
-    compared, bad = 0, []
+    compared, contradictory = 0, []
     number, common = expected + expected.T, shared + shared.T
-    clear = (number >= FEWEST) & (np.minimum(expected, expected.T) >= OF_EACH)
-    few = shared < SHARED * expected
+    clear = (number >= settings.min_points) & (
+        np.minimum(expected, expected.T) >= settings.min_of_each
+    )
+    few = shared < settings.min_shared * expected
     for i, j in np.argwhere(np.triu(clear, 1)).tolist():
-        if (min(place[i], place[j]), max(place[i], place[j])) in tried:
+        if (min(place[i], place[j]), max(place[i], place[j])) in matched_pairs:
             compared += 1
+            # in one direction only: a blurred photograph, which lacks the points of the other
             if few[i, j] and few[j, i]:
-                bad.append((i, j))
-    bad.sort(key=lambda pair: -number[pair])
+                contradictory.append((i, j))
+    contradictory.sort(key=lambda pair: -number[pair])
     said = [
         f"{common[i, j]} of {number[i, j]} points expected in both {names[place[i]]} and "
         f"{names[place[j]]} were found"
-        for i, j in bad
+        for i, j in contradictory
     ]
-    if len(bad) >= max(PAIRS, OF_ALL * compared):
-        raise _folded(f"{said[0]}, and too few in {len(bad)} of {compared} such pairs", names)
+    bad = len(contradictory)
+    if bad >= max(settings.max_pairs, settings.max_pair_share * compared):
+        raise _folded(f"{said[0]}, and too few in {bad} of {compared} such pairs", names)
     return [
-        f"{one}: something hides them, or parts of the object are superimposed"
-        for one in said[:MOST_NAMED]
+        f"{words}: something hides them, or parts of the object are superimposed"
+        for words in said[:5]
     ]
 
 
 def count_shared_points(
-    result: Adjustment, measured: Network
+    result: Adjustment,
+    measured: Network,
+    settings: SuperpositionSettings = SuperpositionSettings(),
 ) -> tuple[Int[np.ndarray, "images images"], Int[np.ndarray, "images images"]]:
     """The points of every photograph (rows) that should also be in every other one (columns), and
     those of them that are measured there."""
@@ -104,35 +135,40 @@ def count_shared_points(
     seen = _points_of_images(n, *_measured_rays(network, measured))
     to_points = [X[points] - X0[i] for i, points in enumerate(agreeing)]
     far = [np.linalg.norm(d, axis=1) for d in to_points]
-    reach = np.array([lengths.max(initial=0.0) for lengths in far])
+    farthest = np.array([lengths.max(initial=0.0) for lengths in far])
     fields = [
-        _field(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
+        _field_of_view(dataclasses.replace(c, parameters=result.camera_parameters(c.id)))
         for c in network.cameras
     ]
     expected, shared = np.zeros((2, n, n), int)
     for j in range(n):
+        # measured counts, even if it was removed as a gross error: what is missing was not found
         there = np.zeros(len(X), bool)
         there[agreeing[j]] = there[seen[j]] = True
-        near = np.linalg.norm(X0 - X0[j], axis=1) < reach
+        # within both limits the base is shorter than the rays: others have no expected points
+        near = np.linalg.norm(X0 - X0[j], axis=1) < farthest
         for i in np.flatnonzero(near & (np.arange(n) != j)):
             d = X[agreeing[i]] - X0[j]
             length = np.linalg.norm(d, axis=1)
             cosine = (d * to_points[i]).sum(1) / (length * far[i])
-            one = (cosine > np.cos(ONE_DIRECTION)) & (length < ONE_SCALE * far[i])
-            one &= (far[i] < ONE_SCALE * length) & _is_in_field(
-                d @ M[j].T, fields[network.images.camera[j]]
-            )
-            expected[i, j], shared[i, j] = one.sum(), there[agreeing[i][one]].sum()
+            alike = cosine > np.cos(settings.max_angle)
+            alike &= (length < settings.max_scale * far[i]) & (far[i] < settings.max_scale * length)
+            alike &= _is_in_field(d @ M[j].T, fields[network.images.camera[j]])
+            expected[i, j], shared[i, j] = alike.sum(), there[agreeing[i][alike]].sum()
     return expected, shared
 
 
-def _points_of_images(number: int, image, point) -> list[Int[np.ndarray, " points"]]:
+def _points_of_images(
+    number: int, image: Int[np.ndarray, " rays"], point: Int[np.ndarray, " rays"]
+) -> list[Int[np.ndarray, " _"]]:
     """The points of every image."""
     order = np.argsort(image, kind="stable")
     return np.split(point[order], np.searchsorted(image[order], np.arange(1, number)))
 
 
-def _measured_rays(network: Network, measured: Network):
+def _measured_rays(
+    network: Network, measured: Network
+) -> tuple[Int[np.ndarray, " rays"], Int[np.ndarray, " rays"]]:
     """Image and point, in the network, of the measurements that belong to both."""
     image = {id: k for k, id in enumerate(network.images.id)}
     point = {id: k for k, id in enumerate(network.points.id)}
@@ -143,15 +179,18 @@ def _measured_rays(network: Network, measured: Network):
     return i[both], p[both]
 
 
-def _field(camera) -> Float[np.ndarray, "2 2"]:
-    """Limits of x and y, c = 1, of the middle of each side."""
+def _field_of_view(camera: Camera) -> Float[np.ndarray, "2 2"]:
+    """Limits of x and y, c = 1, of the middle of each side: the corners of a lens with distortion
+    reach farther, which costs a few points."""
     columns, rows = present_size(camera)
     u, v = (columns - 1) / 2, (rows - 1) / 2
     ideal = ideal_features(camera, np.array([[0, v], [2 * u, v], [u, 0], [u, 2 * v]]))
     return np.stack([ideal.min(0), ideal.max(0)])
 
 
-def _is_in_field(d: Float[np.ndarray, "n 3"], field) -> Bool[np.ndarray, " n"]:
+def _is_in_field(
+    d: Float[np.ndarray, "n 3"], field: Float[np.ndarray, "2 2"]
+) -> Bool[np.ndarray, " n"]:
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = -d[:, :2] / d[:, 2:]
         return (d[:, 2] < 0) & ((xy > field[0]) & (xy < field[1])).all(1)

@@ -12,7 +12,7 @@
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Points
-from jaxbundle.reconstruction.adjusting import Weighted, adjust_determined
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment, adjust_determined
 from jaxbundle.reconstruction.block import camera_positions
 from jaxbundle.reconstruction.control_choice import (
     ControlChoice,
@@ -31,29 +31,27 @@ from jaxbundle.reconstruction.control_choice import (
 from jaxbundle.reconstruction.control_table import ControlPoint, ControlTable, describe_sigma
 from jaxbundle.reconstruction.controlled_network import network_with_control
 from jaxbundle.reconstruction.oriented_block import (
-    ENOUGH_CONTROL,
-    OFFSET,
-    OFFSET_HEIGHT,
-    Given,
+    MIN_CONTROL,
+    ControlSettings,
+    FrameData,
     OrientedBlock,
 )
 from jaxbundle.types import present
 
-ASSUMED = 2.0
-"""σ of control that its residuals do not determine, and the smallest estimated one, in pixels on
-the ground: what is marked and identified in photographs is hardly more exact, unless it is stated.
-"""
-
 
 def georeference(
-    found: Weighted, given: Given, significance: float, tell: Callable[[str], None]
-) -> tuple[Weighted, ControlTable]:
+    weighted: WeightedAdjustment,
+    frame: FrameData,
+    significance: float,
+    tell: Callable[[str], None],
+    settings: ControlSettings | None = None,
+) -> tuple[WeightedAdjustment, ControlTable]:
     """The adjustment with control and positions, and the table of control and check points.
 
     **Raises:** `InputError` or `NotSolvedError` if control does not determine the frame.
     """
     tell("control points")
-    block = OrientedBlock(found.adjustment, given)
+    block = OrientedBlock(weighted.adjustment, frame, settings or ControlSettings())
     measured = block.resolve()
     control, heights = without_unknown_heights(block)
     usable = [
@@ -61,18 +59,21 @@ def georeference(
         for k, id in enumerate(control.id)
         if control.role[k] != "check" and block.is_determined(id, measured[id])
     ]
+    # rays and intersections again, in the frame of control
     if not block.has_positions:
         block.move(usable, control)
         measured = block.resolve()
-    pixel = block.ground_sample_distance
-    usable, assessed = assess_control(block, control, usable, ASSUMED * pixel)
-    choice = choose_control(block, control, measured, usable, assessed, ASSUMED * pixel)
-    if not block.has_positions and choice.used.sum() < ENOUGH_CONTROL:
+    assumed = block.settings.assumed_pixels * block.ground_sample_distance
+    # in object units: a pixel is larger on the ground the higher the camera
+    usable, assessed = assess_control(block, control, usable, assumed)
+    choice = choose_control(block, control, measured, usable, assessed, assumed)
+    if not block.has_positions and choice.used.sum() < MIN_CONTROL:
         raise InputError(
-            f"expected {ENOUGH_CONTROL} control points without contradictions, got "
+            f"expected {MIN_CONTROL} control points without contradictions, got "
             f"{choice.used.sum()}: "
-            + list_some((f"{id}: {why}" for id, why in choice.why.items()), 5, str)
+            + list_some((f"{id}: {why}" for id, why in choice.reasons.items()), 5, str)
         )
+    # snooping begins without what was removed before; control is judged anew
     doubtful = [pair for pair in block.removed() if pair[1] not in control.id]
     result, _, _ = adjust_determined(
         network_with_control(block, control, choice),
@@ -87,21 +88,22 @@ def georeference(
     free = np.array([role == "control" for role in control.role])
     words = describe_sigma(control.sigma[free], choice.assessed(free), fixed, "m")
     positions = camera_positions(result)
-    prior = np.array([OFFSET, OFFSET, OFFSET_HEIGHT])
     notes = [heights] * bool(heights) + choice.remarks()
-    notes += [] if positions is None else positions.contradictions(prior, "m")
+    notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")
     table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
-    return dataclasses.replace(found, adjustment=result, agreeing=int(used.sum())), table
+    return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(used.sum())), table
 
 
-def _tabulate(result: Adjustment, block: OrientedBlock, control: Points, choice: ControlChoice):
+def _tabulate(
+    result: Adjustment, block: OrientedBlock, control: Points, choice: ControlChoice
+) -> Iterator[ControlPoint]:
     """The rows of the table."""
-    final = OrientedBlock(result, block.given)
+    final = OrientedBlock(result, block.frame, block.settings)
     checks, points = result.check_points, result.problem.network.points.id
     compared = {} if checks is None else {id: k for k, id in enumerate(checks.id)}
-    snooped = [one.name for one in result.removed]
+    snooped = [removed.name for removed in result.removed]
     for k, id in enumerate(control.id):
-        one = dataclasses.replace(final.measure(id), good=choice.measured[id].good)
+        measured = dataclasses.replace(final.measure(id), good=choice.points[id].good)
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
         if id in compared:
             X = present(checks).position[compared[id]]
@@ -109,11 +111,14 @@ def _tabulate(result: Adjustment, block: OrientedBlock, control: Points, choice:
             X = final.X[final.of_id[id]]
         if np.isfinite(X).all():
             residual = np.where(np.isinf(choice.sigma[k]), np.nan, X - control.position[k])
-        off = final.misses(one, X)[one.good]
+        off = final.misses(measured, X)[measured.good]
         used = "held exactly" if control.role[k] == "fixed" else "used"
         verdict = used if choice.used[k] else "left out"
         verdict = "check" if control.role[k] == "check" else verdict
-        reasons = [*([choice.why[id]] if id in choice.why else []), *choice.wrong.get(id, [])]
+        reasons = [
+            *([choice.reasons[id]] if id in choice.reasons else []),
+            *choice.errors.get(id, []),
+        ]
         reasons += [
             f"data snooping removed {name}" for name in snooped if f"point {id} " in f"{name} "
         ]
@@ -121,7 +126,7 @@ def _tabulate(result: Adjustment, block: OrientedBlock, control: Points, choice:
             id,
             control.role[k],
             bool(choice.used[k]) and id in points,
-            int(one.good.sum()),
+            int(measured.good.sum()),
             control.position[k],
             np.full(3, np.nan) if control.role[k] == "fixed" else choice.sigma[k],
             residual,

@@ -4,6 +4,7 @@ Around a photograph that repeated parts of an object place wrongly, enough point
 epipolar lines. But its pairs were oriented, and closed in triplets, without this model.
 """
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping
 
@@ -13,53 +14,68 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
-TURN, ASIDE = np.radians(10.0), np.radians(30.0)
-"""Maximum difference of rotations, and of base directions, that agree: start values are coarse."""
-SURE_BASE = 0.03
-"""Angle of intersection, radians, above which the direction of a base is known."""
-FEWEST = 3
-"""Minimum number of pairs for a photograph to be judged by them."""
+
+@dataclasses.dataclass(frozen=True)
+class MisplacedSettings:
+    """Settings of the comparison of start values with pairs. Both are coarse, and what remains
+    undetected is seen in the residuals: only gross contradictions count."""
+
+    max_rotation: float = np.radians(10.0)
+    """Maximum difference of rotations that agree, radians: twice that of a closed loop
+    (`LoopSettings.max_rotation`)."""
+    max_base_angle: float = np.radians(30.0)
+    """Maximum difference of base directions that agree, radians, as in loops without common
+    features (`LoopSettings.max_aside`)."""
+    sure_base: float = 0.03
+    """Angle of intersection, radians, above which the direction of a base is known
+    (`LoopSettings.narrow_angle`)."""
+    min_pairs: int = 3
+    """Minimum number of pairs for a photograph to be judged by them: with fewer, the
+    photograph at the other end may be the wrong one."""
+
 
 NamedPairs = Mapping[tuple[str, str], Pair]
 """Pairs by the ids of their images."""
 
 
-def find_misplaced(network: Network, pairs: NamedPairs) -> dict[str, str]:
+def find_misplaced(
+    network: Network, pairs: NamedPairs, settings: MisplacedSettings = MisplacedSettings()
+) -> dict[str, str]:
     """Images that contradict more than half of their pairs, with the reason; the worst first,
     whose pairs no longer count for the others. None if these are most images: then it is not known
     which of them are right."""
-    contradicted = _compare(network, pairs)
-    found: dict[str, str] = {}
+    contradicted = _compare(network, pairs, settings)
+    misplaced: dict[str, str] = {}
+    # one at a time: the pairs of a misplaced photograph make its neighbours look wrong, too
     while True:
         number = Counter(id for pair in contradicted for id in pair)
         bad = Counter(id for pair, wrong in contradicted.items() if wrong for id in pair)
-        judged = [id for id in bad if number[id] >= FEWEST and 2 * bad[id] > number[id]]
+        judged = [id for id in bad if number[id] >= settings.min_pairs and 2 * bad[id] > number[id]]
         if not judged:
-            return found if 2 * len(found) < len(network.images) else {}
+            return misplaced if 2 * len(misplaced) < len(network.images) else {}
         worst = max(judged, key=lambda id: bad[id] / number[id])
-        found[worst] = (
+        misplaced[worst] = (
             f"its position or attitude contradicts {bad[worst]} of its {number[worst]} pairs"
         )
         contradicted = {pair: wrong for pair, wrong in contradicted.items() if worst not in pair}
 
 
-def _compare(network: Network, pairs: NamedPairs) -> dict[tuple[str, str], bool]:
+def _compare(
+    network: Network, pairs: NamedPairs, settings: MisplacedSettings
+) -> dict[tuple[str, str], bool]:
     """Whether each pair contradicts the images."""
     row = {id: k for k, id in enumerate(network.images.id)}
     if not row:
         return {}
     X0, M = network.images.position, np.asarray(many.matrices(network.images.angles))
-    found = {}
+    contradicted = {}
     for ids, pair in pairs.items():
         if ids[0] in row and ids[1] in row:
             i, j = (row[id] for id in ids)
-            turned = rotation_angle(pair.M @ (M[j] @ M[i].T).T) > TURN
+            turned = rotation_angle(pair.M @ (M[j] @ M[i].T).T) > settings.max_rotation
+            # in the system of the first camera, as the base of the pair
             base = M[i] @ (X0[j] - X0[i])
-            aside = _angle(base, pair.b) > ASIDE
-            clear = pair.kind != "rotation" and pair.angle > SURE_BASE
-            found[ids] = bool(turned or (clear and aside))
-    return found
-
-
-def _angle(a, b) -> float:
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+            angle = np.arctan2(np.linalg.norm(np.cross(base, pair.b)), base @ pair.b)
+            clear = pair.kind != "rotation" and pair.angle > settings.sure_base
+            contradicted[ids] = bool(turned or (clear and angle > settings.max_base_angle))
+    return contradicted

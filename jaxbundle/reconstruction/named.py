@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
@@ -21,7 +21,7 @@ from jaxbundle.system.threads import map_in_threads
 
 
 @dataclasses.dataclass(frozen=True)
-class Named:
+class NamedMeasurements:
     """Measurements of named points: photograph, name, pixels, σ in pixels."""
 
     image: Int[np.ndarray, " n"]
@@ -32,17 +32,17 @@ class Named:
     def __len__(self) -> int:
         return len(self.name)
 
-    def take(self, rows) -> "Named":
-        """The chosen measurements (a mask)."""
-        rows = np.flatnonzero(rows)
-        return Named(
+    def take(self, chosen: Bool[np.ndarray, " n"]) -> "NamedMeasurements":
+        """The chosen measurements."""
+        rows = np.flatnonzero(chosen)
+        return NamedMeasurements(
             self.image[rows], tuple(self.name[k] for k in rows), self.xy[rows], self.sigma[rows]
         )
 
 
-def no_named_points() -> Named:
+def no_named_points() -> NamedMeasurements:
     """No measurements."""
-    return Named(np.zeros(0, int), (), np.zeros((0, 2)), np.zeros((0, 2)))
+    return NamedMeasurements(np.zeros(0, int), (), np.zeros((0, 2)), np.zeros((0, 2)))
 
 
 def find_named(
@@ -50,7 +50,7 @@ def find_named(
     targets: str | None,
     control: Control | None,
     workers: int | None = None,
-) -> tuple[Named, list[str]]:
+) -> tuple[NamedMeasurements, list[str]]:
     """The coded targets of all photographs and the measurements of control points; notes.
     `workers`: photographs in work at once, at most; default: one for each core.
 
@@ -61,30 +61,34 @@ def find_named(
         columns, rows = max((p.size for p in photographs), key=math.prod)
         need = memory_of_targets(rows, columns, targets)
         at_once = photographs_at_once(rows * columns, need, workers)
-        found = map_in_threads(lambda p: _targets_of(p, targets), photographs, at_once)
-        for k, one in enumerate(found):
-            if one is None:
+        find = lambda photograph: _find_targets(photograph, targets)
+        of_photographs = map_in_threads(find, photographs, at_once)
+        for k, points in enumerate(of_photographs):
+            if points is None:
                 continue
-            image += [k] * len(one)
-            name += one.names
-            xy += list(one.xy)
-            sigma += list(one.sigma)
-        left_out = Counter(why for one in found if one is not None for _, why in one.left_out)
+            image += [k] * len(points)
+            name += points.names
+            xy += list(points.xy)
+            sigma += list(points.sigma)
+        left_out = Counter(
+            why for points in of_photographs if points is not None for _, why in points.left_out
+        )
         notes += [
             f"{n} measurements of coded targets are left out: {why}" for why, n in left_out.items()
         ]
         notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
-    if control is not None and control.seen:
+    if control is not None and control.sightings:
         index = {p.name: k for k, p in enumerate(photographs)}
-        unknown = sorted({file for file, _ in control.seen if file not in index})
-        if len(unknown) == len({file for file, _ in control.seen}):
+        unknown = sorted({file for file, _ in control.sightings if file not in index})
+        # all: another folder was given; some: photographs that were left out of it
+        if len(unknown) == len({file for file, _ in control.sightings}):
             raise InputError(
                 f"{control.points.source.name}: measured in none of the photographs, but in "
                 f"{list_some(unknown, 3, str)}"
             )
         if unknown:
             notes.append(f"control measured in missing photographs: {list_some(unknown)}")
-        for (file, id), place, s in zip(control.seen, control.xy, control.sigma):
+        for (file, id), place, s in zip(control.sightings, control.xy, control.sigma):
             if file in index:
                 image.append(index[file])
                 name.append(id)
@@ -92,20 +96,25 @@ def find_named(
                 sigma.append((s, s))
     if not name:
         return no_named_points(), notes
-    return Named(np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)), notes
+    columns = np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)
+    return NamedMeasurements(*columns), notes
 
 
 def name_unused(
-    named: Named, control: Control | None, distances: Sequence[dict], fewest: int
+    named: NamedMeasurements,
+    control: Control | None,
+    distances: Sequence[dict],
+    min_control: int,
 ) -> list[str]:
     """Notes about scale bars and control points in no photographs.
 
-    **Raises:** `InputError` if no scale bar, or fewer than `fewest` control points, are left.
+    **Raises:** `InputError` if no scale bar, or fewer than `min_control` control points, are left.
     """
     photographs = {
         name: len(set(named.image[np.array(named.name) == name].tolist()))
         for name in set(named.name)
     }
+    # an end in one photograph has no position, and a distance to it says nothing
     ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):
@@ -117,19 +126,20 @@ def name_unused(
     if control is not None:
         points = control.points
         lost = [id for id in points.id if id not in photographs]
-        found = sum(
+        number = sum(
             id in photographs and role != "check" for id, role in zip(points.id, points.role)
         )
-        if found < fewest:
+        if number < min_control:
             raise InputError(
-                f"{points.source.name}: {found} control points are measured in the photographs, "
-                f"{fewest} are needed" + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
+                f"{points.source.name}: {number} control points are measured in the photographs, "
+                f"{min_control} are needed"
+                + (f"; not found: {list_some(lost, 5, str)}" if lost else "")
             )
         notes += [f"control points in no photograph: {list_some(lost, 5, str)}"] * bool(lost)
     return notes
 
 
-def _targets_of(photograph: Photograph, kind: str) -> NamedPoints | None:
+def _find_targets(photograph: Photograph, kind: str) -> NamedPoints | None:
     """The coded targets of a photograph; None if it cannot be read: it is left out later, with
     the reason."""
     try:

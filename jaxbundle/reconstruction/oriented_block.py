@@ -21,37 +21,58 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.control_consistency import Discrepancies
 from jaxbundle.orientation.sights import ideal_points
-from jaxbundle.reconstruction.named import Named
+from jaxbundle.reconstruction.named import NamedMeasurements
 
-OFFSET, OFFSET_HEIGHT = 10.0, 100.0
-"""Prior σ of the offset between satellite positions and control, metres: in the plane the error
-common to the code solutions of one flight; in height geoid undulations reach 107 m (EGM2008)."""
-WRONG = 5.0
-"""A ray that misses its point by more, in σ of the measurement, is a wrong measurement."""
-PAIRED_RAYS = 8
-"""Most rays of one point of which every pair is tried: 28 pairs."""
-ENOUGH_CONTROL = 3
-"""Minimum control points of a block without satellite positions."""
+MIN_CONTROL = 3
+"""Minimum control points of a block without satellite positions: a similarity has 7 parameters, two
+points have 6 coordinates."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Given:
+class ControlSettings:
+    """Settings of the use of control points and satellite positions."""
+
+    offset_sigma: tuple[float, float, float] = (10.0, 10.0, 100.0)
+    """Prior σ of the offset between satellite positions and control, metres: in the plane the error
+    common to the code solutions of one flight; in height geoid undulations reach 107 m
+    (EGM2008)."""
+    wrong_ray: float = 5.0
+    """A ray that misses its point by more, in σ of the measurement, is a wrong measurement: by
+    chance 4e-6 (Rayleigh). Wrong names and marks miss by tens of pixels; between, σ is
+    enlarged by the robust scale of all."""
+    paired_rays: int = 8
+    """Most rays of one point of which every pair is tried: 28 pairs, of which with half of the rays
+    wrong six are right."""
+    assumed_pixels: float = 2.0
+    """σ of control that its residuals do not determine, and the smallest estimated one, in pixels
+    on the ground: what is marked and identified in photographs is hardly more exact, unless it is
+    stated."""
+    contradictory_heights: float = 3.0
+    """Heights that are all 0 are unknown if the heights of the block differ by more, in σ of
+    satellite positions."""
+    compared_together: int = 100
+    """Largest number of control points with a joint covariance, of 300 coordinates: the time of
+    their comparison grows with the cube."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameData:
     """What is given about the frame: control and check `points` with `named` measurements
     (photographs by their row in `names`), the `system` of their coordinates; satellite `positions`
     [photographs, 3] and their σ in this system, NaN: unknown."""
 
     points: Points
-    named: Named
+    named: NamedMeasurements
     names: tuple[str, ...]
     system: str = ""
     positions: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
-    """The measurements of one point in oriented photographs: rows of `Named`, of the network's
-    images; directions as unit vectors in object space; the angle of a pixel along each; σ, pixels;
-    whether each agrees with the point, and the point intersected from those."""
+class MeasuredPoint:
+    """The measurements of one point in oriented photographs: rows of the named ones, of the
+    network's images; directions as unit vectors in object space; the angle of a pixel along each;
+    σ, pixels; whether each agrees with the point, and the point intersected from those."""
 
     rows: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
@@ -65,8 +86,10 @@ class Measured:
 class OrientedBlock:
     """An adjusted block: its orientations, and intersections of named points in it."""
 
-    def __init__(self, result: Adjustment, given: Given):
-        self.result, self.given = result, given
+    def __init__(
+        self, result: Adjustment, frame: FrameData, settings: ControlSettings = ControlSettings()
+    ):
+        self.result, self.frame, self.settings = result, frame, settings
         self.network: Network = result.problem.network
         values = result.image_values
         self.X0, self.angles = values[:, :3], values[:, 3:]
@@ -79,15 +102,15 @@ class OrientedBlock:
         self.row = {id: k for k, id in enumerate(self.network.images.id)}
         points = self.network.points.id
         known = np.all(np.isfinite(self.X), axis=1)
-        named = set(given.points.id)
+        named = set(frame.points.id)
         self.determined = {id: k for k, id in enumerate(points) if id in named and known[k]}
         observed = np.all(np.isfinite(self.network.images.sigma[:, :3]), axis=1)
-        self.has_positions = int(observed.sum()) > 2
+        self.has_positions = int(observed.sum()) > 2  # two leave a rotation open
         self.of_id = {id: k for k, id in enumerate(points)}
 
-    def measure(self, id: str) -> Measured:
+    def measure(self, id: str) -> MeasuredPoint:
         """The measurements of a point; all of them agree for now."""
-        named, names = self.given.named, self.given.names
+        named, names = self.frame.named, self.frame.names
         rows = [
             k
             for k, name in enumerate(named.name)
@@ -96,17 +119,10 @@ class OrientedBlock:
         rows = np.array(rows, int)
         image = np.array([self.row[names[named.image[k]]] for k in rows], int)
         if not len(rows):
-            nothing = np.zeros(0)
-            return Measured(
-                rows,
-                image,
-                np.zeros((0, 3)),
-                nothing,
-                nothing,
-                np.zeros(0, bool),
-                np.full(3, np.nan),
-            )
+            none, no_ray = np.zeros(0), np.zeros((0, 3))
+            return MeasuredPoint(rows, image, no_ray, none, none, none > 0, np.full(3, np.nan))
         camera = self.network.images.camera[image]
+        # half a pixel in both directions, as a difference quotient
         ends = [self._ideal(camera, named.xy[rows] + shift) for shift in ([0, 0], [0.5, 0.5])]
         pixel = np.linalg.norm(ends[1] - ends[0], axis=1) / np.hypot(0.5, 0.5)
         rays = np.einsum(
@@ -115,73 +131,81 @@ class OrientedBlock:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         good = np.isfinite(rays).all(1)
         sigma = named.sigma[rows].mean(1)
-        return Measured(rows, image, rays, pixel, sigma, good, np.full(3, np.nan))
+        return MeasuredPoint(rows, image, rays, pixel, sigma, good, np.full(3, np.nan))
 
-    def _ideal(self, camera, xy) -> Float[np.ndarray, "n 2"]:
+    def _ideal(
+        self, camera: Int[np.ndarray, " n"], xy: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "n 2"]:
         xy, _ = from_image_unit(self.cameras, camera, xy, np.ones_like(xy), "px")
-        found = np.full_like(xy, np.nan)
+        ideal = np.full_like(xy, np.nan)
         for c in np.unique(camera):
-            found[camera == c] = ideal_points(self.cameras[c], xy[camera == c])
-        return found
+            ideal[camera == c] = ideal_points(self.cameras[c], xy[camera == c])
+        return ideal
 
-    def misses(self, one: Measured, X) -> Float[np.ndarray, " n"]:
+    def misses(self, point: MeasuredPoint, X: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
         """Distances of the projections of X from its measurements, pixels."""
-        away = X - self.X0[one.image]
-        along = np.einsum("ni,ni->n", away, one.rays)
-        across = np.linalg.norm(np.cross(away, one.rays), axis=1)
+        away = X - self.X0[point.image]
+        along = np.einsum("ni,ni->n", away, point.rays)
+        across = np.linalg.norm(np.cross(away, point.rays), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(along > 0, across / along / one.pixel, np.inf)
+            return np.where(along > 0, across / along / point.pixel, np.inf)
 
-    def resolve(self) -> dict[str, Measured]:
+    def resolve(self) -> dict[str, MeasuredPoint]:
         """By point, the measurements that agree on one position of it, and that position.
 
         σ of the measurements are multiplied by the robust scale of all their misclosures, if this
         is larger than 1: a point is identified worse than it is measured."""
-        measured = {id: self.measure(id) for id in self.given.points.id}
-        first = {id: self._consistent(one) for id, one in measured.items()}
+        measured = {id: self.measure(id) for id in self.frame.points.id}
+        first = {id: self._find_consistent(point) for id, point in measured.items()}
+        # normalised by the redundancy number 1 − 3/(2n) of a point with n rays
         off = [
-            self.misses(one, one.position)[one.good]
-            / one.sigma[one.good]
-            / np.sqrt(1 - 1.5 / one.good.sum())
-            for one in first.values()
-            if one.good.sum() > 1
+            self.misses(point, point.position)[point.good]
+            / point.sigma[point.good]
+            / np.sqrt(1 - 1.5 / point.good.sum())
+            for point in first.values()
+            if point.good.sum() > 1
         ]
-        # the median of a Rayleigh distribution is 1.1774 σ
+        # the median of a Rayleigh distribution (the length of two errors) is √(2·ln 2)·σ = 1.1774 σ
         scale = max(1.0, float(np.median(np.concatenate(off))) / 1.1774) if off else 1.0
         if scale == 1.0:
             return first
         return {
-            id: self._consistent(dataclasses.replace(one, sigma=scale * one.sigma))
-            for id, one in measured.items()
+            id: self._find_consistent(dataclasses.replace(point, sigma=scale * point.sigma))
+            for id, point in measured.items()
         }
 
-    def _consistent(self, one: Measured) -> Measured:
+    def _find_consistent(self, point: MeasuredPoint) -> MeasuredPoint:
         """The largest set of rays that meet, more than half of them, from the best pair."""
-        usable = np.flatnonzero(np.isfinite(one.rays).all(1))
-        best = np.zeros(len(one.rows), bool)
+        usable = np.flatnonzero(np.isfinite(point.rays).all(1))
+        best = np.zeros(len(point.rows), bool)
         closest = np.inf
-        tried = usable[many.spread(len(usable), PAIRED_RAYS)]
+        tried = usable[many.spread(len(usable), self.settings.paired_rays)]
         for i in tried:
             for j in tried[tried > i]:
-                pair = np.isin(np.arange(len(one.rows)), [i, j])
-                off = self.misses(one, self._meet(one, pair)) / one.sigma
-                good = off < WRONG
+                pair = np.isin(np.arange(len(point.rows)), [i, j])
+                off = self.misses(point, self._intersect(point, pair)) / point.sigma
+                good = off < self.settings.wrong_ray
                 if good[[i, j]].all() and (good.sum(), -np.median(off[good])) > (
                     best.sum(),
                     -closest,
                 ):
                     best, closest = good, np.median(off[good])
         if best.sum() < 2 or 2 * best.sum() <= len(usable):
-            return dataclasses.replace(one, good=np.zeros(len(one.rows), bool))
-        return dataclasses.replace(one, good=best, position=self._meet(one, best))
+            return dataclasses.replace(point, good=np.zeros(len(point.rows), bool))
+        return dataclasses.replace(point, good=best, position=self._intersect(point, best))
 
-    def _meet(self, one: Measured, use) -> Float[np.ndarray, "3"]:
+    def _intersect(
+        self, point: MeasuredPoint, use: Bool[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "3"]:
         """The point nearest to some rays, by the angle at which they miss it."""
-        weight, X0 = np.ones(use.sum()), self.X0[one.image[use]]
-        P = np.eye(3) - one.rays[use][:, :, None] * one.rays[use][:, None, :]
+        weight, X0 = np.ones(use.sum()), self.X0[point.image[use]]
+        # Σ p·(I − r·rᵀ)·(X − X0) = 0; with p = 1/distance² from the step before, distances from the
+        # rays become angles
+        P = np.eye(3) - point.rays[use][:, :, None] * point.rays[use][:, None, :]
         X = X0[0]
         for _ in range(3):
             N = (P * weight[:, None, None]).sum(0)
+            # parallel rays: σ along them would be a million times that across
             if np.linalg.cond(N) > 1e12:
                 return np.full(3, np.nan)
             X = np.linalg.solve(N, np.einsum("n,nij,nj->i", weight, P, X0))
@@ -192,16 +216,16 @@ class OrientedBlock:
         """Move the block by the similarity that fits most of the control points."""
         ids = [points.id[k] for k in places]
         target = points.position[list(places)]
-        if len(ids) < ENOUGH_CONTROL or np.isinf(points.sigma[list(places)]).any():
+        if len(ids) < MIN_CONTROL or np.isinf(points.sigma[list(places)]).any():
             raise InputError(
                 f"control points with heights in at least two photographs: expected "
-                f"{ENOUGH_CONTROL}, got {len(ids)} in this part; without satellite positions they "
+                f"{MIN_CONTROL}, got {len(ids)} in this part; without satellite positions they "
                 "alone give the frame"
             )
-        found = similarity_of_most(self.X[[self.determined[id] for id in ids]], target)
-        if found is None:
+        similarity = similarity_of_most(self.X[[self.determined[id] for id in ids]], target)
+        if similarity is None:
             raise InputError("the control points are on a line: they leave a rotation open")
-        A, t = found
+        A, t = similarity
         R = A / np.cbrt(np.linalg.det(A))
         self.X0, self.X, self.M = self.X0 @ A.T + t, self.X @ A.T + t, self.M @ R.T
         self.angles, self.A = np.asarray(many.angles(self.M)), A
@@ -209,18 +233,18 @@ class OrientedBlock:
     @property
     def ground_sample_distance(self) -> float:
         """The length of a pixel at the named points, the median."""
-        found = [
-            one.pixel * np.linalg.norm(X - self.X0[one.image], axis=1)
-            for one, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())
+        lengths = [
+            point.pixel * np.linalg.norm(X - self.X0[point.image], axis=1)
+            for point, X in ((self.measure(id), self.X[k]) for id, k in self.determined.items())
         ]
-        return float(np.median(np.concatenate(found))) if found else 1.0
+        return float(np.median(np.concatenate(lengths))) if lengths else 1.0
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint cofactors."""
         rows = [self.determined[points.id[k]] for k in places]
         if not rows:
-            nothing = np.zeros((0, 3))
-            return Discrepancies(nothing, np.zeros((0, 3, 0, 3)), nothing, np.zeros((0, 3, 0)))
+            none = np.zeros((0, 3))
+            return Discrepancies(none, np.zeros((0, 3, 0, 3)), none, np.zeros((0, 3, 0)))
         X, given = self.X[rows], points.position[list(places)]
         C = self._joint_cofactors(rows)
         n, sigma = len(rows), points.sigma[list(places)].copy()
@@ -232,21 +256,24 @@ class OrientedBlock:
             x = (X - X.mean(0)) / max(np.ptp(X, axis=0).max(), 1e-12)
             turn = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
             G = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turn, x[:, :, None]], 2)
+        # exact coordinates: σ 0, while NaN is to be estimated and infinity no observation
         fixed = np.array([points.role[k] == "fixed" for k in places])
         sigma[fixed] = 0.0
         return Discrepancies(X - given, C, sigma, G)
 
-    def _joint_cofactors(self, rows) -> Float[np.ndarray, "n 3 n 3"]:
+    def _joint_cofactors(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
         tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.system.tables}
         lengths = problem.layout.lengths
         for k, row in enumerate(rows):
             D = np.eye(3)
+            # far points are unknowns by direction and inverse distance: D of X by them
             if lengths is not None:
-                at = np.append(np.asarray(self.result.values.point)[row], lengths[row])
-                D = np.asarray(derivative(jnp.asarray(at)))
+                unknowns = np.append(np.asarray(self.result.values.point)[row], lengths[row])
+                D = np.asarray(derivative(jnp.asarray(unknowns)))
             tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
+        # A·D·Q·Dᵀ·Aᵀ of these points, row by row, without the covariance matrix of the network
         Q = self.result.cofactors.solution.propagate_rows(tables)
         return self.result.sigma0**2 * np.asarray(Q).reshape(n, 3, n, 3)
 
@@ -260,32 +287,31 @@ class OrientedBlock:
             for i, p in zip(problem.image[gone].tolist(), problem.point[gone].tolist())
         ]
 
-    def is_determined(self, id: str, one: Measured) -> bool:
+    def is_determined(self, id: str, point: MeasuredPoint) -> bool:
         """Whether a point was adjusted with the block, from the measurements that agree."""
-        if id not in self.determined or one.good.sum() < 2:
+        if id not in self.determined or point.good.sum() < 2:
             return False
-        off = self.misses(one, self.X[self.determined[id]])[one.good]
-        return bool((off < WRONG * one.sigma[one.good]).all())
+        off = self.misses(point, self.X[self.determined[id]])[point.good]
+        return bool((off < self.settings.wrong_ray * point.sigma[point.good]).all())
 
-    def name_of(self, one: Measured, n: int) -> str:
+    def name_of(self, point: MeasuredPoint, n: int) -> str:
         """The photograph of a measurement."""
-        return self.network.images.id[one.image[n]]
+        return self.network.images.id[point.image[n]]
 
-    def seen_there(self, one: Measured, n: int, id: str, measured: dict[str, Measured]) -> str:
+    def seen_there(
+        self, point: MeasuredPoint, n: int, id: str, measured: dict[str, MeasuredPoint]
+    ) -> str:
         """Another point at the place of a measurement: measured in the same photograph, or
         intersected from others; empty without."""
+        limit, xy = self.settings.wrong_ray * point.sigma[n], self.frame.named.xy
         for other, its in measured.items():
-            there = its.rows[its.image == one.image[n]]
-            xy = self.given.named.xy
-            near = np.linalg.norm(xy[there] - xy[one.rows[n]], axis=1) < WRONG * one.sigma[n]
-            if other != id and (
-                near.any() or self.misses(one, its.position)[n] < WRONG * one.sigma[n]
-            ):
+            there = its.rows[its.image == point.image[n]]
+            near = np.linalg.norm(xy[there] - xy[point.rows[n]], axis=1) < limit
+            if other != id and (near.any() or self.misses(point, its.position)[n] < limit):
                 return other
         return ""
 
     @property
     def offset_sigma(self) -> Float[np.ndarray, "3"]:
         """σ of the system of the block against that of control."""
-        offset = np.array([OFFSET, OFFSET, OFFSET_HEIGHT])
-        return offset if self.has_positions else np.zeros(3)
+        return np.array(self.settings.offset_sigma) if self.has_positions else np.zeros(3)

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbundle.network.columns import count
-from jaxbundle.reconstruction.adjusting import LARGEST_MISFIT, WRONG_MISFIT
+from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WRONG_MISFIT
 from jaxbundle.reconstruction.control_table import HEADER
+from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.head import count_points
 from jaxbundle.report.layout import clean, heading, significant, table
 from jaxbundle.report.layout import facts as text_facts
@@ -24,35 +25,39 @@ from jaxbundle.report.page.columns import Column
 from jaxbundle.report.page.markup import facts, grid, items
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Verdict, conclude
 
-WITHOUT = ("χ² test",)
+INAPPLICABLE = ("χ² test",)
 """Findings of an adjustment that do not apply: σ are estimated from the residuals."""
 CONTROL = ("Control",)
 """The finding of an adjustment in place of which that of the control table stands."""
 
 
-def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
+def compose_part(
+    whole: Reconstruction, part: ReconstructedPart, origin: Origin = UNKNOWN
+) -> Iterator[str]:
     """The page of a part of a `Reconstruction`: HTML, in pieces."""
-    return compose(part.adjustment, origin, also=_describe(found, part))
+    return compose(part.adjustment, origin, also=_describe(whole, part))
 
 
-def conclude_part(found, part) -> Verdict:
+def conclude_part(whole: Reconstruction, part: ReconstructedPart) -> Verdict:
     """The verdict on a part, with the use of the photographs."""
-    return conclude(part.adjustment, *_findings(found, part), len(found.warnings))
+    return conclude(part.adjustment, *_findings(whole, part), len(whole.warnings))
 
 
-def _findings(found, part) -> tuple[list[Finding], tuple[str, ...]]:
+def _findings(
+    whole: Reconstruction, part: ReconstructedPart
+) -> tuple[list[Finding], tuple[str, ...]]:
     """The findings of a part, and those of its adjustment that they replace."""
-    fit = [_fit(part)] if part.factors else []
+    fit = [_judge_fit(part)] if part.factors else []
     controlled = part.control is not None or part.no_control
     return (
-        [*fit, _photographs(found, part), *_judge_control(part)],
-        (*WITHOUT, *CONTROL) if controlled else WITHOUT,
+        [*fit, _judge_photographs(whole, part), *_judge_control(part)],
+        (*INAPPLICABLE, *CONTROL) if controlled else INAPPLICABLE,
     )
 
 
-def describe_part(found, part) -> str:
+def describe_part(whole: Reconstruction, part: ReconstructedPart) -> str:
     """What a surveyor asks of a part, as text: the block, control and check points."""
-    lines = heading(_name(found, part))[1:]
+    lines = heading(_name(whole, part))[1:]  # without the empty line before it
     lines += text_facts(part.block.facts())
     if part.no_control:
         lines += ["", *text_paragraph(f"Control is not used: {part.no_control}")]
@@ -67,43 +72,43 @@ def describe_part(found, part) -> str:
     return "\n".join([*lines, "", ""])
 
 
-def _describe(found, part) -> Addition:
-    sections = [*_control(part), *_positions(part)]
-    sections += [_factors(part)] if part.factors else []
-    if found.left_out:
-        rows = grid(("photograph", "reason"), found.left_out.items(), "words")
+def _describe(whole: Reconstruction, part: ReconstructedPart) -> Addition:
+    sections = [*_list_control(part), *_list_positions(part)]
+    sections += [_list_factors(part)] if part.factors else []
+    if whole.left_out:
+        rows = grid(("photograph", "reason"), whole.left_out.items(), "words")
         sections.append(Section("left-out", "Photographs left out", rows, "Left out"))
-    overview = f"<h3>Block {clean(found.name)}</h3>\n{facts(part.block.facts())}"
-    overview += f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
-    if found.notes:
-        overview += items(found.notes)
-    findings, without = _findings(found, part)
+    overview = f"<h3>Block {clean(whole.name)}</h3>\n{facts(part.block.facts())}"
+    overview += f"<h3>Reconstruction</h3>\n{facts(_count_parts(whole, part))}"
+    if whole.notes:
+        overview += items(whole.notes)
+    findings, without = _findings(whole, part)
     return Addition(
         "reconstruction",
         tuple(findings),
         overview=overview,
-        warnings=found.warnings,
+        warnings=whole.warnings,
         sections=tuple(sections),
-        tables={"pairs": _pairs(found)},
-        name=_name(found, part),
+        tables={"pairs": _list_pairs(whole)},
+        name=_name(whole, part),
         without=without,
     )
 
 
-def _name(found, part) -> str:
+def _name(whole: Reconstruction, part: ReconstructedPart) -> str:
     """The name of the reconstruction, with that of the part if there are several."""
     return (
-        found.name
-        if found.name and len(found.parts) == 1
-        else ", ".join(filter(None, (found.name, part.name)))
+        whole.name
+        if whole.name and len(whole.parts) == 1
+        else ", ".join(filter(None, (whole.name, part.name)))
     )
 
 
-def _fit(part) -> Finding:
+def _judge_fit(part: ReconstructedPart) -> Finding:
     """The fit of the measurements, relative to their σ from matching."""
     words = ", ".join(f"{significant(f, 3)} ({kind})" for kind, f in part.factors.items())
     worst = part.misfit
-    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= LARGEST_MISFIT else GOOD
+    state = BAD if worst >= WRONG_MISFIT else DOUBTFUL if worst >= DOUBTFUL_MISFIT else GOOD
     return Finding(
         "Fit",
         state,
@@ -113,30 +118,29 @@ def _fit(part) -> Finding:
     )
 
 
-def _photographs(found, part) -> Finding:
-    used, total = len(part.adjustment.network.images), len(found.photographs)
+def _judge_photographs(whole: Reconstruction, part: ReconstructedPart) -> Finding:
+    used, total = len(part.adjustment.network.images), len(whole.photographs)
     words = f"{used} of {count(total, 'photograph')} in this part"
-    if len(found.parts) > 1:
-        words += f", {len(found.parts)} unconnected parts"
-    if found.left_out:
-        words += f", {len(found.left_out)} left out"
-    whole = len(found.parts) == 1 and not found.left_out
+    if len(whole.parts) > 1:
+        words += f", {len(whole.parts)} unconnected parts"
+    if whole.left_out:
+        words += f", {len(whole.left_out)} left out"
+    # a verdict is about the photographs that somebody took, not about those that were used
+    complete = len(whole.parts) == 1 and not whole.left_out
     brief = f"{total - used} of {count(total, 'photograph')} not in this result"
-    return Finding("Photographs", GOOD if whole else DOUBTFUL, words, brief)
+    return Finding("Photographs", GOOD if complete else DOUBTFUL, words, brief)
 
 
-def _judge_control(part) -> list[Finding]:
+def _judge_control(part: ReconstructedPart) -> list[Finding]:
     """Control and check points in one line each."""
     if part.no_control:
         return [Finding("Control", BAD, f"not used: {part.no_control}")]
-    if part.control is None:
+    if (control := part.control) is None:
         return []
-    given = [p for p in part.control.points if p.role != "check"]
-    checks = [p for p in part.control.points if p.role == "check"]
+    given = [p for p in control.points if p.role != "check"]
+    checks = [p for p in control.points if p.role == "check"]
     rms = lambda role: " ".join(
-        f"{axis} {significant(x)}"
-        for axis, x in zip("XYZ", part.control.rms(role))
-        if np.isfinite(x)
+        f"{axis} {significant(x)}" for axis, x in zip("XYZ", control.rms(role)) if np.isfinite(x)
     )
     used, left = [p for p in given if p.used], part.control.left_out
     words = (
@@ -145,6 +149,7 @@ def _judge_control(part) -> list[Finding]:
     )
     if left:
         words += f"; left out: {', '.join(left)}"
+    # the verdicts of the table, which name photograph and point, are its only source
     wrong = sum("wrong measurement" in p.verdict for p in part.control.points)
     if wrong:
         words += f"; {count(wrong, 'point')} with a wrong measurement"
@@ -153,16 +158,16 @@ def _judge_control(part) -> list[Finding]:
     said += [f"{count(wrong, 'control point')} with a wrong measurement"] if wrong else []
     said += ["control held exactly"] if held else []
     state = DOUBTFUL if said else GOOD
-    found = [Finding("Control", state, words, ", ".join(said))]
+    findings = [Finding("Control", state, words, ", ".join(said))]
     if checks:
         known = [p for p in checks if np.isfinite(p.residual).any()]
         if len(known) < len(checks):
             words = f"{len(known)} of {count(len(checks), 'check point')} compared"
-            found.append(Finding("Check points compared", DOUBTFUL, words, words))
-    return found
+            findings.append(Finding("Check points compared", DOUBTFUL, words, words))
+    return findings
 
 
-def _control(part) -> list[Section]:
+def _list_control(part: ReconstructedPart) -> list[Section]:
     """Control and check points."""
     if part.control is None:
         return []
@@ -172,42 +177,42 @@ def _control(part) -> list[Section]:
     return [Section("control", title, points + said, "Control")]
 
 
-def _positions(part) -> list[Section]:
+def _list_positions(part: ReconstructedPart) -> list[Section]:
     """Camera positions against the given ones."""
-    found = part.block.positions
-    if found is None:
+    positions = part.block.positions
+    if positions is None:
         return []
-    rows = [(id, *(significant(x) for x in d)) for id, d in found.difference.items()]
-    rows.append(("RMS", *(significant(x) for x in found.rms)))
+    rows = [(id, *(significant(x) for x in d)) for id, d in positions.difference.items()]
+    rows.append(("RMS", *(significant(x) for x in positions.rms)))
     title = f"Camera positions: adjusted − given, in {clean(part.block.unit)}"
     return [Section("positions", title, grid(("photograph", "dX", "dY", "dZ"), rows), "Positions")]
 
 
-def _counts(found, part) -> list[tuple[str, str]]:
+def _count_parts(whole: Reconstruction, part: ReconstructedPart) -> list[tuple[str, str]]:
     """The parts, this one marked, and the pairs."""
     rows = []
-    for one in found.parts:
+    for one in whole.parts:
         network = one.adjustment.network
         rows.append(
             (
-                clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
+                clean(one.name) + (" (this page)" if one is part and len(whole.parts) > 1 else ""),
                 f"{count(len(network.images), 'photograph')}, "
                 f"{count(count_points(one.adjustment), 'point')}, "
                 f"σ0 {significant(one.adjustment.sigma0, 4)}",
             )
         )
-    return [*rows, ("Verified pairs", str(len(found.pairs)))]
+    return [*rows, ("Verified pairs", str(len(whole.pairs)))]
 
 
-def _factors(part) -> Section:
+def _list_factors(part: ReconstructedPart) -> Section:
     """Factors of σ of the kinds of measurements."""
     rows = [(kind, significant(factor, 4)) for kind, factor in part.factors.items()]
     note = ("kind of measurement", "factor of its a priori σ")
     return Section("factors", "Variance factors", grid(note, rows), "Variance factors")
 
 
-def _pairs(found) -> Listing:
-    one, other, matches, verified, kind = zip(*found.pairs) if found.pairs else ((),) * 5
+def _list_pairs(whole: Reconstruction) -> Listing:
+    one, other, matches, verified, kind = zip(*whole.pairs) if whole.pairs else ((),) * 5
     words = lambda values: np.array(values, dtype=object)
     return Listing(
         "Pairs of photographs",

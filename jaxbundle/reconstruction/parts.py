@@ -2,39 +2,41 @@
 
 from collections.abc import Sequence
 
+from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.verification import Pair
 
 SMALLEST_PART = 3
-"""Minimum photographs of a part; two if there are only two in all."""
+"""Minimum photographs of a part; two if there are only two in all. Between two alone no
+loop and no point of three rays could contradict wrong matches."""
 
 
 def group_connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
     """Groups of photographs connected by verified pairs, the largest first."""
     root = list(range(number))
 
-    def of(k):
+    def find_root(k: int) -> int:
         while root[k] != k:
             root[k] = root[root[k]]
             k = root[k]
         return k
 
     for pair in pairs:
-        a, b = (of(k) for k in pair.images)
-        root[max(a, b)] = min(a, b)
+        a, b = (find_root(k) for k in pair.images)
+        root[max(a, b)] = min(a, b)  # by the smallest: groups do not depend on the order of pairs
     groups: dict[int, list[int]] = {}
     for k in range(number):
-        groups.setdefault(of(k), []).append(k)
+        groups.setdefault(find_root(k), []).append(k)
     return sorted(groups.values(), key=lambda g: (-len(g), g[0]))
 
 
-def why_alone(k: int, names: Sequence[str], matches, pairs: Sequence[Pair]) -> str:
+def why_alone(
+    k: int, names: Sequence[str], matches: Sequence[FeatureMatches], pairs: Sequence[Pair]
+) -> str:
     """The reason why a photograph is in no part."""
-    mine = [pair for pair in pairs if k in pair.images]
-    if mine:
-        with_it = sorted({names[j] for pair in mine for j in pair.images if j != k})
-        return f"it overlaps only with {', '.join(with_it[:3])}"
-    found = [(len(m.rows), m.images) for m in matches if k in m.images]
-    most, best = max(found, default=(0, None))
+    overlapping = sorted({names[j] for p in pairs if k in p.images for j in p.images if j != k})
+    if overlapping:
+        return f"it overlaps only with {', '.join(overlapping[:3])}"
+    most, best = max(((len(m.rows), m.images) for m in matches if k in m.images), default=(0, None))
     if best is None or not most:
         return "it has no matches with any other photograph"
     other = names[best[0] if best[1] == k else best[1]]

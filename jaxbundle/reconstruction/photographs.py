@@ -14,11 +14,6 @@ from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.photographs.reading import photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
-DEFAULT_RATIO = 1.2
-"""Default principal distance relative to the longer side."""
-SHORTEST_SIDE = 64
-"""Minimum pixels of the shorter side."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Photograph:
@@ -42,14 +37,15 @@ def find_photographs(
 
     **Raises:** `InputError` if fewer than two can be used, or a name is given twice.
     """
-    paths, left_out = _files(given), {}
-    names = _names(paths)
-    found, first = [], {}
+    paths, left_out = _list_files(given), {}
+    names = _name_files(paths)
+    photographs, first = [], {}
     for path, name in zip(paths, names):
         try:
             check_plain(path)
             columns, rows = photograph_size(path)
-            if min(columns, rows) < SHORTEST_SIDE:
+            # icons and previews: a window of least squares matching is a quarter of the side
+            if min(columns, rows) < 64:
                 raise InputError(f"{path}: {columns} × {rows} pixels are too few")
             content = read_content(path, text=False)
         except InputError as error:
@@ -60,43 +56,44 @@ def find_photographs(
             left_out[name] = f"the same file as {first[fingerprint]}"
             continue
         first[fingerprint] = name
-        found.append(Photograph(path, name, fingerprint, read_exif(path)))
-    if len(found) < 2:
+        photographs.append(Photograph(path, name, fingerprint, read_exif(path)))
+    if len(photographs) < 2:
         said = list_some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
         raise InputError(
-            f"{len(found)} of {len(paths)} photographs can be used; two or more are needed"
+            f"{len(photographs)} of {len(paths)} photographs can be used; two or more are needed"
             + (f": {said}" if left_out else "")
         )
-    return found, left_out
+    return photographs, left_out
 
 
 def name_other_files(given: Sequence[str | Path]) -> list[str]:
     """Notes about files in the given folders that are no photographs."""
-    said = [describe_other_files(one) for one in map(Path, given) if one.is_dir()]
+    said = [describe_other_files(folder) for folder in map(Path, given) if folder.is_dir()]
     return [words for words in said if words]
 
 
-def _files(given) -> list[Path]:
+def _list_files(given: Sequence[str | Path]) -> list[Path]:
+    """The files, and those of the folders, each once."""
     paths: list[Path] = []
-    for one in map(Path, given):
-        if one.is_dir():
-            inside = list_photographs(one)
+    for path in map(Path, given):
+        if path.is_dir():
+            inside = list_photographs(path)
             if not inside:
-                other = describe_other_files(one).removeprefix(f"{one}: ")
+                other = describe_other_files(path).removeprefix(f"{path}: ")
                 raise InputError(
-                    f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})"
+                    f"{path}: no photographs in this folder ({', '.join(SUFFIXES)})"
                     + (f"; {other}" if other else "")
                 )
             paths += inside
-        elif not one.exists():
-            raise InputError(f"{one}: no such file")
+        elif not path.exists():
+            raise InputError(f"{path}: no such file")
         else:
-            paths.append(one)
-    unique = {path.resolve(): path for path in paths}
+            paths.append(path)
+    unique = {path.resolve(): path for path in paths}  # a file, its folder and a link to it
     return list(unique.values())
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
+def _name_files(paths: Sequence[Path]) -> list[str]:
     """File names; with their folder if two are the same."""
     plain = [path.name for path in paths]
     double = {name for name in plain if plain.count(name) > 1}
@@ -111,9 +108,9 @@ class Cameras:
     distance and radial distortion."""
 
     cameras: tuple[Camera, ...]
-    of: tuple[int, ...]
-    stated: tuple[StatedDistance | None, ...]
-    given: bool
+    camera_of: tuple[int, ...]
+    stated_distances: tuple[StatedDistance | None, ...]
+    calibrated: bool
     notes: tuple[str, ...]
     lens: tuple[int, ...] = (0,)
 
@@ -127,21 +124,29 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     """
     notes = _rotation_messages(photographs)
     if given is not None:
-        return Cameras((_fits(given, photographs),), (0,) * len(photographs), (None,), True, notes)
+        fitted = _fit_size(given, photographs)
+        return Cameras((fitted,), (0,) * len(photographs), (None,), True, notes)
+    # a zoom lens at another focal length is another camera, to the tenth of a millimetre
     groups: dict[tuple, list[int]] = {}
     for k, photograph in enumerate(photographs):
         exif = photograph.exif
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
         groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
     cameras, stated, of = [], [], [0] * len(photographs)
+    # the key of a lens is that of a camera with the sides in order
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
-        f = told.value if told else DEFAULT_RATIO * max(exif.size)
+        # without a statement a start value: 45° of view, between telephones and normal lenses
+        columns, rows_of_image = exif.size
+        f = told.value if told else 1.2 * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
-        cameras.append(_new_camera(id, f, exif.size))
+        centre = {"cx": (columns - 1) / 2, "cy": (rows_of_image - 1) / 2}
+        cameras.append(
+            Camera(id, "opencv", {"fx": f, "fy": f, **centre}, image_size=(columns, rows_of_image))
+        )
         stated.append(told)
         for k in rows:
             of[k] = number
@@ -161,13 +166,8 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
     return Cameras(tuple(cameras), tuple(of), tuple(stated), False, notes, tuple(lens))
 
 
-def _new_camera(id, f, size):
-    columns, rows = size
-    parameters = {"fx": f, "fy": f, "cx": (columns - 1) / 2, "cy": (rows - 1) / 2}
-    return Camera(id, "opencv", parameters, image_size=(columns, rows))
-
-
-def _fits(given: Camera, photographs) -> Camera:
+def _fit_size(given: Camera, photographs: Sequence[Photograph]) -> Camera:
+    """The given camera with the size of the photographs."""
     size = given.image_size
     for photograph in photographs:
         if size is None:
@@ -181,7 +181,7 @@ def _fits(given: Camera, photographs) -> Camera:
     return given
 
 
-def _rotation_messages(photographs) -> tuple[str, ...]:
+def _rotation_messages(photographs: Sequence[Photograph]) -> tuple[str, ...]:
     turned = [p.name for p in photographs if p.exif.orientation != UPRIGHT]
     if not turned:
         return ()

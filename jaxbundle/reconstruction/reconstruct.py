@@ -6,11 +6,12 @@ part ─tracks─▶ measured by least squares matching ─start values─▶ ad
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int, UInt8
 
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
@@ -22,19 +23,16 @@ from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.at_once import photographs_at_once
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction import aspect_ratio
-from jaxbundle.reconstruction.adjusting import (
-    LARGEST_MISFIT,
-    Weighted,
-    adjust_weighted,
-)
+from jaxbundle.reconstruction.adjusting import DOUBTFUL_MISFIT, WeightedAdjustment, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.block import describe_block
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.folding import refuse_folded, refuse_superimposed
 from jaxbundle.reconstruction.georeferencing import georeference
+from jaxbundle.reconstruction.misplaced import NamedPairs
 from jaxbundle.reconstruction.named import find_named, name_unused
-from jaxbundle.reconstruction.network import Extra, tie_network, track_name
-from jaxbundle.reconstruction.oriented_block import ENOUGH_CONTROL, Given
+from jaxbundle.reconstruction.network import FurtherData, tie_network, track_name
+from jaxbundle.reconstruction.oriented_block import MIN_CONTROL, FrameData
 from jaxbundle.reconstruction.parts import SMALLEST_PART, group_connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
@@ -44,20 +42,20 @@ from jaxbundle.reconstruction.photographs import (
     name_other_files,
 )
 from jaxbundle.reconstruction.result import (
-    Part,
+    ReconstructedPart,
     Reconstruction,
     misfit_in_words,
     principal_distances,
 )
 from jaxbundle.reconstruction.satellite_positions import find_positions
-from jaxbundle.reconstruction.settings import Settings
+from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.reconstruction.starting import is_plausible, start_again, start_values
 from jaxbundle.system.configuration import available_cores, can_run_two_programs
-from jaxbundle.tiepoints import refinement
-from jaxbundle.tiepoints.calibration import start_cameras
+from jaxbundle.tiepoints import track_measurement
+from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features, memory_of_features
-from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
+from jaxbundle.tiepoints.matching import FeatureMatches
 from jaxbundle.tiepoints.search import (
     detect,
     match,
@@ -67,28 +65,20 @@ from jaxbundle.tiepoints.search import (
 )
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
+from jaxbundle.tiepoints.track_measurement import Measurements, measure_tracks
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
 from jaxbundle.types import Progress
 
-DEFAULT = Settings()
-NAMED = 99
-"""Kind of the measurements of named points."""
-REPEATS = 0.3
-"""Share of contradictory pairs above which the result is doubtful."""
-CONTRADICTS_FILE = 3.29
-"""Difference from the principal distance of the files, in σ, that chance explains in one of a
-thousand."""
-TEXTURE = 16
-"""Minimum features of a photograph."""
+DEFAULT = ReconstructionSettings()
 
 
 def reconstruct(
     given: Sequence[str | Path],
     camera: Camera | None = None,
-    settings: Settings = DEFAULT,
+    settings: ReconstructionSettings = DEFAULT,
     store: Path | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: Progress = lambda *_: None,
     control: Control | None = None,
     distances: Sequence[dict] = (),
     name: str = "",
@@ -112,7 +102,8 @@ def reconstruct(
     positions, said = find_positions(photographs, control)
     notes += said
     framed = positions is not None and positions.define_frame
-    notes += name_unused(named, control, distances, 1 if framed else ENOUGH_CONTROL)
+    notes += name_unused(named, control, distances, 1 if framed else MIN_CONTROL)
+    # attitudes are those of the map: without positions in it the frame has another orientation
     attitudes = None
     if positions is not None and framed:
         attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
@@ -120,10 +111,12 @@ def reconstruct(
     frame = None
     if control is not None:
         points = control.points.take(~control.points.has_role("tie"))
-        frame = Given(points, named, names, control.system, positions and positions[:2])
+        frame = FrameData(points, named, names, control.system, positions and positions[:2])
+        # measurements of check points take no part, in the first adjustment either: a wrong one
+        # would be judged by what it has changed
         checks = {id for id, role in zip(points.id, points.role) if role == "check"}
-        named = named.take(np.array([one not in checks for one in named.name], bool))
-    extra = Extra(
+        named = named.take(np.array([id not in checks for id in named.name], bool))
+    further = FurtherData(
         named, tuple(distances), positions[:2] if positions and framed else None, attitudes
     )
     system = "" if control is None else control.system
@@ -131,8 +124,8 @@ def reconstruct(
         system = positions.words if control is None else system or positions.system
     first = Path(given[0])
     name = name or (first if first.is_dir() else first.parent).resolve().name
-    kept = Store(store, settings.detection)
-    run = _ReconstructionRun(photographs, left_out, cameras, settings, kept, progress, extra)
+    stored = Store(store, settings.detection, settings.matching)
+    run = _ReconstructionRun(photographs, left_out, cameras, settings, stored, progress, further)
     run.notes += notes
     run.frame, run.system, run.title = frame, system, name
     return run.run()
@@ -141,62 +134,82 @@ def reconstruct(
 class _ReconstructionRun:
     """The state of a running reconstruction."""
 
-    def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell, extra):
-        self.photographs: list[Photograph] = photographs
-        self.left_out: dict[str, str] = dict(left_out)
+    def __init__(
+        self,
+        photographs: Sequence[Photograph],
+        left_out: Mapping[str, str],
+        cameras: Cameras,
+        settings: ReconstructionSettings,
+        store: Store,
+        tell: Progress,
+        further: FurtherData,
+    ):
+        self.photographs, self.left_out = photographs, dict(left_out)
         self.cameras, self.settings, self.store, self.tell = cameras, settings, store, tell
-        self.extra: Extra = extra
+        self.further = further
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
         self.warnings: list[tuple[float, str]] = []
-        self.tried: set[tuple[int, int]] = set()
-        self.frame: Given | None = None
+        self.matched_pairs: set[tuple[int, int]] = set()
+        self.frame: FrameData | None = None
         self.system = self.title = ""
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
             # compiled during the search and matching of features, and the verification of pairs
-            programs = (prepare, refinement.prepare, many.prepare) if can_run_two_programs() else ()
-            prepared = [ahead.submit(one) for one in programs]
-            features, matches = self._matches()
+            windows = lambda: track_measurement.prepare(self.settings.track_matching)
+            programs = (prepare, windows, many.prepare) if can_run_two_programs() else ()
+            prepared = [ahead.submit(program) for program in programs]
+            features, matches = self._match()
             for first in prepared[:1]:
-                first.result()
-            self._calibrate(features, matches)
+                first.result()  # an error of the compilation is raised here, not lost
+            self._find_cameras(features, matches)
             pairs = self._verify(features, matches)
-            for one in prepared:
-                one.result()
-        parts = self._parts(features, matches, pairs)
+            for program in prepared:
+                program.result()
+        parts = self._make_parts(features, matches, pairs)
         said = tuple(
-            (self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
+            (self.names[p.images[0]], self.names[p.images[1]], p.match_count, len(p), p.kind)
             for p in pairs
         )
         files = {p.name: p.path for p in self.photographs}
-        warnings = [said for _, said in sorted(self.warnings, key=lambda one: -one[0])]
+        warnings = [said for _, said in sorted(self.warnings, key=lambda warning: -warning[0])]
         return Reconstruction(
             tuple(parts), self.left_out, tuple(self.notes), said, files, tuple(warnings), self.title
         )
 
-    def _matches(self):
-        features = self._features()
+    def _match(self) -> tuple[list[Features], list[FeatureMatches]]:
+        """Features and matches, without those of duplicates and marks."""
+        features = self._detect()
+        settings = self.settings
         prints = [p.fingerprint for p in self.photographs]
-        place = self.extra.positions and self.extra.positions[0]
+        place = self.further.positions and self.further.positions[0]
         matches = match(
-            features, prints, self.settings.pairs, place, self.store, self.workers, self.tell
+            features,
+            prints,
+            settings.pairs,
+            place,
+            self.store,
+            self.workers,
+            self.tell,
+            settings.matching,
+            settings.candidates,
         )
         self.store.drop_unused()
+        # before marks: all matches of a duplicate are at the same pixels, too
         sizes = [p.size for p in self.photographs]
-        again = find_duplicates(matches, features, sizes)
-        for k, (other, still, number) in again.items():
+        duplicates = find_duplicates(matches, features, sizes, settings.duplicates)
+        for k, (other, still, number) in duplicates.items():
             self.left_out.setdefault(
                 self.names[k],
                 f"it shows the same as {self.names[other]} ({still} of {number} "
                 "matches are at the same place): saved again, or taken from the same place",
             )
         self._require_two()
-        matches = [m for m in matches if not {*m.images} & again.keys()]
-        self.tried = {m.images for m in matches}
-        matches, marked = without_marks(matches, features, sizes)
+        matches = [m for m in matches if not {*m.images} & duplicates.keys()]
+        self.matched_pairs = {m.images for m in matches}
+        matches, marked = without_marks(matches, features, sizes, settings.marks)
         if marked:
             self.notes.append(
                 f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
@@ -204,8 +217,9 @@ class _ReconstructionRun:
             )
         return features, matches
 
-    def _features(self) -> list[Features]:
-        read = [self._reader(p) for p in self.photographs]
+    def _detect(self) -> list[Features]:
+        """The features of the photographs; those without are left out."""
+        read = [self._make_reader(p) for p in self.photographs]
         prints = [p.fingerprint for p in self.photographs]
         detection = self.settings.detection
         columns, rows = max((p.size for p in self.photographs), key=math.prod)
@@ -220,11 +234,10 @@ class _ReconstructionRun:
             at_once,
             self.tell,
         )
-        bad = {k for k, f in enumerate(features) if len(f) < TEXTURE}
-        for k in sorted(bad):
-            self.left_out.setdefault(
-                self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
-            )
+        for name, of_photograph in zip(self.names, features):
+            # fewer than the matches that must agree in a pair
+            if (number := len(of_photograph)) < self.settings.verification.min_matches:
+                self.left_out.setdefault(name, f"no texture: {count(number, 'feature')}")
         self._require_two()
         return features
 
@@ -234,41 +247,55 @@ class _ReconstructionRun:
             said = list_some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
             raise InputError(f"fewer than two photographs can be used: {said}")
 
-    def _reader(self, photograph: Photograph):
-        def read():
+    def _make_reader(
+        self, photograph: Photograph
+    ) -> Callable[[], UInt8[np.ndarray, "rows columns"]]:
+        """A function that reads a photograph; a black one, left out, if it is damaged."""
+
+        def read() -> UInt8[np.ndarray, "rows columns"]:
             try:
                 return read_photograph(photograph.path)
             except InputError as error:
                 why = str(error).removeprefix(f"{photograph.path}: ")
                 self.left_out[photograph.name] = why
+                # a header may be sound and the pixels not; the others go on without features of it
                 return np.zeros((8, 8), np.uint8)
 
         return read
 
-    def _calibrate(self, features, matches) -> None:
-        if self.cameras.given:
+    def _find_cameras(
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches]
+    ) -> None:
+        """Start values of the unknown cameras."""
+        if self.cameras.calibrated:
             return
         cameras, notes = start_cameras(
             self.cameras.cameras,
-            self.cameras.of,
+            self.cameras.camera_of,
             self.cameras.lens,
-            [one is not None for one in self.cameras.stated],
+            [stated is not None for stated in self.cameras.stated_distances],
             features,
             matches,
+            self.settings.camera_starts,
+            self.settings.verification,
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
 
-    def _verify(self, features, matches) -> list[Pair]:
-        cameras = self.cameras.cameras, self.cameras.of, features
-        pairs, wrong = without_contradicted(*cameras, verify(*cameras, matches, self.tell))
+    def _verify(
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches]
+    ) -> list[Pair]:
+        """The verified pairs that do not contradict each other."""
+        cameras, settings = (self.cameras.cameras, self.cameras.camera_of, features), self.settings
+        pairs = verify(*cameras, matches, self.tell, settings.verification)
+        pairs, wrong = without_contradicted(*cameras, pairs, settings.loops)
         if wrong:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(
                 f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
                 f"by others in triplets: {list_some(named, 3, str)}"
             )
-        if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
+        if len(wrong) > settings.contradictory_share * (len(wrong) + len(pairs)):
             self._warn(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
                 "repeats itself, and parts of it may have been superimposed; compare the "
@@ -276,10 +303,15 @@ class _ReconstructionRun:
             )
         return pairs
 
-    def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
+    def _make_parts(
+        self, features: Sequence[Features], matches: Sequence[FeatureMatches], pairs: Sequence[Pair]
+    ) -> list[ReconstructedPart]:
+        """The adjusted parts, the largest first. What is left of a part is tried as another one:
+        two scenes may be connected by a few wrong pairs."""
+        # two photographs in all are a part, two of many are not
         least = min(SMALLEST_PART, sum(name not in self.left_out for name in self.names))
         waiting = group_connected(len(self.photographs), pairs)
-        parts: list[Part] = []
+        parts: list[ReconstructedPart] = []
         failed: list[str] = []
         while waiting:
             group = waiting.pop(0)
@@ -290,7 +322,7 @@ class _ReconstructionRun:
                     )
                 continue
             try:
-                part, reasons = self._part(group, features, pairs, f"part {len(parts) + 1}")
+                part, reasons = self._make_part(group, features, pairs, f"part {len(parts) + 1}")
             except (InputError, NotSolvedError) as error:
                 failed.append(str(error))
                 for k in group:
@@ -298,26 +330,20 @@ class _ReconstructionRun:
                 continue
             parts.append(part)
             rest = [k for k in group if self.names[k] in reasons]
-            among = [p for p in pairs if set(p.images) <= set(rest)]
-            again = [
-                [rest[k] for k in g]
-                for g in group_connected(
-                    len(rest),
-                    [
-                        dataclasses.replace(
-                            p, images=(rest.index(p.images[0]), rest.index(p.images[1]))
-                        )
-                        for p in among
-                    ],
-                )
+            renumbered = [
+                dataclasses.replace(p, images=(rest.index(p.images[0]), rest.index(p.images[1])))
+                for p in pairs
+                if set(p.images) <= set(rest)
             ]
-            for g in again:
-                if len(g) >= SMALLEST_PART and len(g) < len(group):
-                    waiting.append(g)
+            for rows in group_connected(len(rest), renumbered):
+                again = [rest[k] for k in rows]
+                # a smaller group than before: the loop ends
+                if len(again) >= SMALLEST_PART and len(again) < len(group):
+                    waiting.append(again)
                 else:
-                    self.left_out |= {self.names[k]: reasons[self.names[k]] for k in g}
+                    self.left_out |= {self.names[k]: reasons[self.names[k]] for k in again}
         if not parts:
-            raise NotSolvedError(self._why_nothing(pairs, failed), self.names)
+            raise NotSolvedError(self._explain_failure(pairs, failed), self.names)
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
     def _warn(self, said: str, weight: float = 1.0) -> None:
@@ -332,8 +358,10 @@ class _ReconstructionRun:
         if stage:
             self.tell(stage, 0, 1)
 
-    def _why_nothing(self, pairs, failed) -> str:
+    def _explain_failure(self, pairs: Sequence[Pair], failed: Sequence[str]) -> str:
+        """Why no part could be oriented, with a remedy."""
         kinds = {p.kind for p in pairs}
+        # the remedy depends on what the verified pairs show
         if kinds == {"rotation"} or kinds == {"rotation", "plane"}:
             return (
                 "not solved: a rotation or a plane explains every pair: the photographs were taken "
@@ -348,36 +376,52 @@ class _ReconstructionRun:
             "to the next, on which the object or its surroundings have texture"
         )
 
-    def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
-        inside = [p for p in pairs if set(p.images) <= set(group)]
-        tracks = make_tracks(features, inside)
-        sizes = [photograph.size for photograph in self.photographs]
-        kept = choose_tracks(tracks, [f.xy for f in features], sizes, self.settings.points)
-        tracks = [track for track, keep in zip(tracks, kept) if keep]
+    def _measure(self, features: Sequence[Features], pairs: Sequence[Pair]) -> Measurements:
+        """The tracks of pairs, measured."""
+        settings, sizes = self.settings, [photograph.size for photograph in self.photographs]
+        tracks, xy = make_tracks(features, pairs), [f.xy for f in features]
+        chosen = choose_tracks(tracks, xy, sizes, settings.points, settings.tracks)
         done = iter(range(1, len(features) + 1))
-        measured = measure_tracks(
-            tracks,
+        return measure_tracks(
+            [track for track, use in zip(tracks, chosen) if use],
             features,
             lambda k: read_photograph(self.photographs[k].path, colour=True),
             lambda: self.tell("least squares matching", next(done), len(features)),
+            settings.track_matching,
         )
+
+    def _make_part(
+        self, group: Sequence[int], features: Sequence[Features], pairs: Sequence[Pair], name: str
+    ) -> tuple[ReconstructedPart, dict[str, str]]:
+        """An adjusted part; the photographs left out of it, with the reasons."""
+        settings = self.settings
+        inside = [p for p in pairs if set(p.images) <= set(group)]
+        measured = self._measure(features, inside)
         network = tie_network(
-            self.photographs, self.cameras, measured, self.extra, name, self.settings.aspect_sigma
+            self.photographs, self.cameras, measured, self.further, name, settings.aspect_sigma
         )
         self._begin("start values")
         named = {(self.names[p.images[0]], self.names[p.images[1]]): p for p in inside}
         oriented, weighted, note = self._adjust_first(network, measured, named)
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
-        refuse_folded(weighted, measured, self.names)
-        doubts = refuse_superimposed(weighted.adjustment, network, self.tried, self.names)
+        # before control, which fits a folded part as well as it can
+        refuse_folded(weighted, measured, self.names, settings.superposition)
+        doubts = refuse_superimposed(
+            weighted.adjustment, network, self.matched_pairs, self.names, settings.superposition
+        )
         self.notes += [note] if note else []
-        self.notes += _name_unused(name, weighted)
+        if weighted.unused_points:
+            self.notes.append(
+                f"{name}: {count(weighted.unused_points, 'point')} of two rays not used: with "
+                "them the measurements contradict each other, as on an object that repeats itself"
+            )
         control, no_control = None, ""
         if self.frame is not None:
+            # wrong control costs the frame, not the reconstruction
             try:
                 weighted, control = georeference(
-                    weighted, self.frame, self.settings.significance, self._begin
+                    weighted, self.frame, settings.significance, self._begin, settings.control
                 )
             except (InputError, NotSolvedError) as error:
                 no_control = str(error)
@@ -385,74 +429,78 @@ class _ReconstructionRun:
             self._begin("")
         exif = {photograph.name: photograph.exif for photograph in self.photographs}
         # without control and positions the frame is an arbitrary one
-        absolute = control is not None or self.extra.positions is not None
+        absolute = control is not None or self.further.positions is not None
         block = describe_block(weighted.adjustment, exif, self.system if absolute else "")
-        part = Part(
-            name,
-            weighted.adjustment,
-            _colours(measured),
-            weighted.factors,
-            block,
-            control,
-            no_control,
+        template = measured.is_template
+        tracks, colours = measured.track[template].tolist(), measured.colour[template].tolist()
+        colour_of = {track_name(track): tuple(colour) for track, colour in zip(tracks, colours)}
+        part = ReconstructedPart(
+            name, weighted.adjustment, colour_of, weighted.factors, block, control, no_control
         )
-        if part.misfit >= LARGEST_MISFIT:
+        if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
-        for said in (*self._contradict_files(weighted.adjustment), *doubts):
+        for said in (*self._compare_with_files(weighted.adjustment), *doubts):
             self._warn(f"{name}: {said}")
         return part, dict(oriented.images)
 
-    def _contradict_files(self, result: Adjustment) -> list[str]:
+    def _compare_with_files(self, result: Adjustment) -> list[str]:
         """Principal distances that contradict those of the files, in words."""
-        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated)}
+        stated = {c.id: s for c, s in zip(self.cameras.cameras, self.cameras.stated_distances)}
         said = []
-        for id, found in principal_distances(result).items():
+        for id, adjusted in principal_distances(result).items():
             file = stated.get(id)
-            if file is None or not found["sigma"]:
+            if file is None or not adjusted["sigma"]:
                 continue
-            sigma = np.hypot(file.sigma, found["sigma"])
-            if abs(found["value"] - file.value) > CONTRADICTS_FILE * sigma:
+            # the file's value is also an observation of the adjustment, which draws the result
+            # towards it: a contradiction is larger than it looks, and the test is cautious
+            sigma = np.hypot(file.sigma, adjusted["sigma"])
+            off = abs(adjusted["value"] - file.value)
+            if off > aspect_ratio.CRITICAL_DEVIATION * sigma:
                 said.append(
-                    f"camera {id}: principal distance {found['value']:.0f} px contradicts the "
+                    f"camera {id}: principal distance {adjusted['value']:.0f} px contradicts the "
                     f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
                     "photographs were cropped or zoomed, or the result is wrong"
                 )
         return said
 
-    def _adjust_first(self, network, measured, pairs) -> tuple[Oriented, Weighted, str]:
+    def _adjust_first(
+        self, network: Network, measured: Measurements, pairs: NamedPairs
+    ) -> tuple[Oriented, WeightedAdjustment, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
         guessed = [
             camera.id
-            for camera, stated in zip(self.cameras.cameras, self.cameras.stated)
-            if stated is None and not self.cameras.given
+            for camera, stated in zip(self.cameras.cameras, self.cameras.stated_distances)
+            if stated is None and not self.cameras.calibrated
         ]
         failed: NotSolvedError | None = None
-        for oriented in start_values(network, guessed, pairs):
+        settings = self.settings.start_values
+        for oriented in start_values(network, guessed, pairs, settings):
             try:
                 weighted, note = self._adjust(oriented, measured)
             except NotSolvedError as error:
                 failed = failed or error
                 continue
             result = weighted.adjustment
-            if not is_plausible(result):
+            if not is_plausible(result, settings):
                 failed = failed or _not_solved(result)
                 continue
-            again = start_again(network, oriented, result, pairs)
+            # once more with the adjusted camera, if that orients more photographs
+            again = start_again(network, oriented, result, pairs, settings)
             if again is not None:
                 try:
                     better, other_note = self._adjust(again, measured)
                 except NotSolvedError:
                     return oriented, weighted, note
-                if is_plausible(better.adjustment):
+                if is_plausible(better.adjustment, settings):
                     return again, better, other_note
             return oriented, weighted, note
         assert failed is not None, "start values are there, or an error says why not"
         raise failed
 
     def _check_ratios(
-        self, oriented: Oriented, weighted: Weighted, measured, note: str
-    ) -> tuple[Weighted, str]:
+        self, oriented: Oriented, weighted: WeightedAdjustment, measured: Measurements, note: str
+    ) -> tuple[WeightedAdjustment, str]:
         """The adjustment with square pixels, unless halves of the photographs agree that they are
         not."""
         contradicted = aspect_ratio.contradicted_ratios(weighted.adjustment)
@@ -461,15 +509,15 @@ class _ReconstructionRun:
         self._begin("ratio of the focal lengths")
         halves = aspect_ratio.replicated_ratios(weighted.adjustment)
         released = {}
-        for id, found in contradicted.items():
+        for id, ratio in contradicted.items():
             both = halves.get(id)
-            said = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(found)}, "
+            said = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
             if both is None:
                 said += "halves of them none: "
             else:
                 said += f"halves of them {' and '.join(map(_ratio_in_words, both))}: "
             if both is not None and aspect_ratio.is_replicated(*both):
-                released[id] = found
+                released[id] = ratio
                 self.notes.append(f"{said}the pixels are not square")
             else:
                 self.notes.append(
@@ -478,14 +526,17 @@ class _ReconstructionRun:
                 )
         if not released:
             return weighted, note
+        # from the start values: the result's gross errors were judged with square pixels
         network = aspect_ratio.release(oriented.network, released)
         return self._adjust(dataclasses.replace(oriented, network=network), measured)
 
-    def _adjust(self, oriented: Oriented, measured) -> tuple[Weighted, str]:
-        placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
-        kinds, named = _kinds(placed, measured, self.names)
-        significance = self.settings.significance
-        return adjust_weighted(placed, kinds, named, significance, self._begin), note
+    def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
+        """The adjustment from start values, and a note on attitudes."""
+        placed, note = with_attitudes(oriented.network, self.names, self.further.attitudes)
+        kinds, names = _kinds_of_measurements(placed, measured, self.names)
+        significance, weighting = self.settings.significance, self.settings.weighting
+        weighted = adjust_weighted(placed, kinds, names, significance, self._begin, weighting)
+        return weighted, note
 
 
 def _ratio_in_words(ratio: aspect_ratio.Ratio) -> str:
@@ -496,50 +547,31 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
     if not result.converged:
         why = "; ".join([result.termination, *result.findings, *result.weakness.lines])
         return NotSolvedError(f"not solved: {why}", list(result.undetermined))
-    found = ", ".join(
+    distances = ", ".join(
         f"{c['value']:.0f} px in {id}" for id, c in principal_distances(result).items()
     )
     return NotSolvedError(
-        f"not solved: impossible principal distance {found}; take photographs from "
+        f"not solved: impossible principal distance {distances}; take photographs from "
         "positions farther apart, or give --camera"
     )
 
 
-def _name_unused(name: str, weighted: Weighted) -> list[str]:
-    if not weighted.unused:
-        return []
-    return [
-        f"{name}: {count(weighted.unused, 'point')} of two rays not used: with them the "
-        "measurements contradict each other, as on an object that repeats itself"
-    ]
-
-
-def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
-    """The kind of every observation, and the names of kinds."""
+def _kinds_of_measurements(
+    network: Network, measured: Measurements, names: Sequence[str]
+) -> tuple[Int[np.ndarray, " rays"], dict[int, str]]:
+    """The kind of every observation, and the names of kinds, each of which has its own factor of
+    σ."""
     columns = (measured.image, measured.track, measured.level)
     level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id
-    kinds = np.array(
-        [
-            level.get((images[i], points[p]), NAMED)
-            for i, p in zip(rays.image.tolist(), rays.point.tolist())
-        ],
-        int,
-    )
-    kinds[(kinds > 2) & (kinds < NAMED)] = 2
+    ids = [(images[i], points[p]) for i, p in zip(rays.image.tolist(), rays.point.tolist())]
+    # the coarser the level, the fewer its matches: from the second on they share a factor
+    kinds = np.array([min(level[ray], 2) if ray in level else 3 for ray in ids], int)
     words = {
         -1: "features not matched",
         0: "matched in the original",
         1: "matched at half size",
         2: "matched at a quarter or smaller",
-        NAMED: "named points",
+        3: "named points",
     }
     return kinds, words
-
-
-def _colours(measured: Measurements) -> dict[str, tuple[int, int, int]]:
-    first = measured.first
-    return {
-        track_name(t): tuple(c)
-        for t, c in zip(measured.track[first].tolist(), measured.colour[first].tolist())
-    }

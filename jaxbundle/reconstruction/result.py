@@ -8,13 +8,13 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.columns import count
 from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
-from jaxbundle.reconstruction.block import Block
+from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.report.head import count_points
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class ReconstructedPart:
     """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
     kinds of measurements; facts about the `block`; the table of `control`, None without, or if it
     could not be used, with the reason in `no_control`."""
@@ -23,7 +23,7 @@ class Part:
     adjustment: Adjustment
     colours: Mapping[str, tuple[int, int, int]]
     factors: Mapping[str, float]
-    block: Block
+    block: BlockFacts
     control: ControlTable | None = None
     no_control: str = ""
 
@@ -41,7 +41,7 @@ class Reconstruction:
     matches, agreeing matches, kind; `photographs`: the examined files, by name;
     `name` of the whole."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[ReconstructedPart, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
@@ -88,8 +88,9 @@ def distances_found(result: Adjustment) -> str:
     )
 
 
-def misfit_in_words(part: Part) -> str:
+def misfit_in_words(part: ReconstructedPart) -> str:
     """Measurements that contradict each other by far more than their σ."""
+    # without a χ² test, which estimated factors would always pass, they are themselves the verdict
     wrong = part.misfit >= WRONG_MISFIT
     return (
         f"{'most likely wrong' if wrong else 'doubtful'}: measurements fit {part.misfit:.1f} times "

@@ -8,10 +8,6 @@ from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph
 
-FARTHEST_CONTROL = 10_000.0
-"""Metres between control in a system without a name and satellite positions in their UTM zone; a
-block from the air is smaller, another system is farther."""
-
 
 def find_positions(
     photographs: Sequence[Photograph], control: Control | None
@@ -21,43 +17,45 @@ def find_positions(
     places = [p.exif.place for p in photographs]
     there = sum(place is not None for place in places)
     if control is None:
-        found = map_positions(places)
-        if found is None:
+        positions = map_positions(places)
+        if positions is None:
             return None, [
                 f"satellite positions of {there} photographs are not used: expected "
                 "three or more with heights"
             ] * bool(there)
-        if not found.define_frame:
-            return found, [
+        if not positions.define_frame:
+            return positions, [
                 "satellite positions of the photographs extend over less than 8 σ: they "
                 "do not define the frame"
             ]
-        return found, [f"satellite positions of the photographs: {found.words}"]
+        return positions, [f"satellite positions of the photographs: {positions.words}"]
     notes = [f"control in {control.system or 'a system that its file does not name'}"]
     if not there:
         return None, [
             *notes,
             "no satellite positions in the photographs: control alone gives the frame",
         ]
-    found = map_positions(places, control.system)
-    if found is None:
+    positions = map_positions(places, control.system)
+    if positions is None:
         return None, [
             *notes,
             f"satellite positions of {there} photographs are not used: they need "
             "heights, three photographs, and a system of control in metres",
         ]
+    # a system without a name is taken for the UTM zone of the positions, unless it is far from them
     if not control.system:
-        away = np.nanmedian(found.X, 0) - np.median(control.points.position, axis=0)
+        away = np.nanmedian(positions.X, 0) - np.median(control.points.position, axis=0)
         distance = float(np.hypot(*away[:2]))
-        if distance > FARTHEST_CONTROL:
+        # metres in their UTM zone: a block from the air is smaller, another system is farther
+        if distance > 10_000:
             return None, [
                 *notes,
                 "satellite positions of the photographs are not used: they are "
-                f"{distance / 1000:.0f} km from control in {found.system}; name the "
+                f"{distance / 1000:.0f} km from control in {positions.system}; name the "
                 "system of control in the first line of gcp_list.txt",
             ]
-    return found, [
+    return positions, [
         *notes,
-        f"satellite positions of {int(np.isfinite(found.X[:, 0]).sum())} "
-        f"photographs with their σ, in {found.words}",
+        f"satellite positions of {int(np.isfinite(positions.X[:, 0]).sum())} "
+        f"photographs with their σ, in {positions.words}",
     ]

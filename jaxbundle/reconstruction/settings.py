@@ -5,26 +5,59 @@ import dataclasses
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import MATCHED_PAIRS
 from jaxbundle.errors import InputError
+from jaxbundle.reconstruction.adjusting import WeightingSettings
+from jaxbundle.reconstruction.folding import SuperpositionSettings
+from jaxbundle.reconstruction.oriented_block import ControlSettings
+from jaxbundle.reconstruction.starting import StartValueSettings
+from jaxbundle.tiepoints.camera_starts import CameraStartSettings
+from jaxbundle.tiepoints.duplicates import DuplicateSettings
 from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.loops import LoopSettings
+from jaxbundle.tiepoints.matching import MatchingSettings
+from jaxbundle.tiepoints.pairs import CandidateSettings
+from jaxbundle.tiepoints.still import MarkSettings
+from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
+from jaxbundle.tiepoints.tracks import TrackSettings
+from jaxbundle.tiepoints.verification import VerificationSettings
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """`detection`: features; `pairs`: which photographs are matched; `points`: desired measurements
-    in every photograph; `workers`: threads, all cores if 0; `significance`: of data snooping;
-    `targets`: kind of coded targets (`measure.coded_targets`).
-
-    `aspect_sigma`: σ with which fy/fx of an unknown camera is observed as 1, infinite: not at all.
-    Sensors have square pixels: for two reflex cameras, in 39 photographs of a panel of surveyed
-    targets, fy/fx is 1 − 8e-5 and 1 − 5e-5 (± 3e-6)."""
+class ReconstructionSettings:
+    """Settings of a reconstruction; those of its stages in the order in which they are used."""
 
     detection: Detection = Detection()
+    """Features of a photograph."""
     pairs: str = "auto"
+    """Which photographs are matched: `auto`, `all`, `sequence`, `place` or `alike`."""
     points: int = 1500
+    """Desired measurements in every photograph. The σ of the result falls with the root of it, the
+    time of the adjustment grows with it; errors of the camera model do not fall."""
     workers: int = 0
+    """Threads, all cores if 0."""
     significance: float = 0.001
+    """Significance of data snooping: the probability that a good measurement is removed."""
     targets: str | None = None
+    """Kind of coded targets (`measure.coded_targets`)."""
     aspect_sigma: float = 2e-4
+    """σ with which fy/fx of an unknown camera is observed as 1, infinite: not at all. Sensors have
+    square pixels: for two reflex cameras, in 39 photographs of a panel of surveyed targets, fy/fx
+    is 1 − 8e-5 and 1 − 5e-5 (± 3e-6)."""
+    contradictory_share: float = 0.3
+    """Share of pairs that contradict others in triplets above which a warning calls the result
+    doubtful. In the set `building`, which is right, 23 of 66 do."""
+    candidates: CandidateSettings = CandidateSettings()
+    matching: MatchingSettings = MatchingSettings()
+    duplicates: DuplicateSettings = DuplicateSettings()
+    marks: MarkSettings = MarkSettings()
+    camera_starts: CameraStartSettings = CameraStartSettings()
+    verification: VerificationSettings = VerificationSettings()
+    loops: LoopSettings = LoopSettings()
+    tracks: TrackSettings = TrackSettings()
+    track_matching: TrackMatchingSettings = TrackMatchingSettings()
+    start_values: StartValueSettings = StartValueSettings()
+    weighting: WeightingSettings = WeightingSettings()
+    superposition: SuperpositionSettings = SuperpositionSettings()
+    control: ControlSettings = ControlSettings()
 
     def __post_init__(self):
         one_of("pairs", self.pairs, MATCHED_PAIRS)

@@ -1,7 +1,7 @@
 """Start values of a part, by several methods, until one of them leads to an adjustment.
 
-1. With the cameras from consistent pairs of photographs: misclosures above `START_TOLERANCE` of the
-   image are contradictions. If photographs are left out, the limit is that of an unknown lens.
+1. With the cameras from consistent pairs of photographs: misclosures above 1 % of the image extent
+   are contradictions. If photographs are left out, the limit is that of an unknown lens.
 2. With other principal distances, unless the file gives one; those that explain the most matches
 come first.
 
@@ -13,6 +13,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxbundle.bundle.orient import orient
 from jaxbundle.bundle.result import Adjustment
@@ -21,27 +22,51 @@ from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.orientation.sights import TOLERANCE
-from jaxbundle.reconstruction.misplaced import NamedPairs, find_misplaced
+from jaxbundle.reconstruction.misplaced import MisplacedSettings, NamedPairs, find_misplaced
 from jaxbundle.reconstruction.network import observed_parameters, with_observed
 from jaxbundle.tiepoints.search import present_size
 
-START_TOLERANCE = 0.01
-"""Tolerance of start values by cameras from consistent pairs, relative to the image extent."""
-SHORTEST, LONGEST = 0.35, 12.0
-"""Limits of an adjusted principal distance, relative to the longer side."""
-OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
-"""Other principal distances to try, relative to the longer side, unless they differ by less
-than this factor."""
-NEAR = 1.05
-"""Ratio of principal distances below which verified pairs are still right."""
-FEWEST_RAYS = 12
-"""Minimum image points of a photograph; of fewer most may be gross errors."""
-LEAST_OF_IMAGES, OF_OTHERS = 0.5, 1
-"""Minimum share of photographs oriented by start values with another principal distance; and
-maximum number of such start values that are adjusted."""
+
+@dataclasses.dataclass(frozen=True)
+class StartValueSettings:
+    """Settings of the start values of a part."""
+
+    tolerance: float = 0.01
+    """Tolerance of start values by cameras from consistent pairs, relative to the image extent: 30
+    pixels of 3000: their K1 is not exact, and K2 and K3 are missing. Larger: points of repeated
+    parts agree by chance; smaller: photographs with much distortion are left out (and tried with
+    the tolerance of an unknown lens)."""
+    min_distance: float = 0.35
+    """Smallest plausible adjusted principal distance, relative to the longer side: 110° of view."""
+    max_distance: float = 12.0
+    """Largest plausible one: 5° of view. Adjustments that fail end in 0 or infinity."""
+    other_distances: tuple[float, ...] = (0.7, 0.9, 1.2, 1.6, 2.2)
+    """Other principal distances to try, relative to the longer side, in steps of about 4/3, so
+    that one lies within 15 % of the right one, from telephones and drones (0.7) to beyond normal
+    lenses (1.4)."""
+    distinct_ratio: float = 1.15
+    """Others are tried only if they differ from the present ones by more than this factor: half a
+    step."""
+    near_ratio: float = 1.05
+    """Ratio of principal distances below which verified pairs are still right: rotations between
+    views 30 degrees apart then change by 1.5 degrees."""
+    min_rays: int = 12
+    """Minimum image points of a photograph that other photographs share: 24 coordinates for 6
+    unknowns. Of fewer most may be gross errors."""
+    min_oriented: float = 0.5
+    """Minimum share of photographs oriented by start values with another principal distance."""
+    max_others: int = 1
+    """Maximum number of such start values that are adjusted: those that explain most image points.
+    Each takes the time of an adjustment, and the next best have explained fewer."""
+    misplaced: MisplacedSettings = MisplacedSettings()
 
 
-def start_values(network: Network, guessed: Sequence[str], pairs: NamedPairs) -> Iterator[Oriented]:
+def start_values(
+    network: Network,
+    guessed: Sequence[str],
+    pairs: NamedPairs,
+    settings: StartValueSettings = StartValueSettings(),
+) -> Iterator[Oriented]:
     """The network with start values, by one method after another.
 
     **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files; `pairs`:
@@ -49,53 +74,59 @@ def start_values(network: Network, guessed: Sequence[str], pairs: NamedPairs) ->
 
     **Raises:** `NotSolvedError` if there are none.
     """
-    found, failed = [], None
-    for tolerance in (START_TOLERANCE, TOLERANCE):
+    candidates, failed = [], None
+    for tolerance in (settings.tolerance, TOLERANCE):
         try:
-            found.append(_orient(network, tolerance, pairs))
+            candidates.append(_orient(network, tolerance, pairs, settings))
         except NotSolvedError as error:
             failed = error
         else:
-            if not found[-1].images:
+            # a wide tolerance lets wrong points in: only if the narrow one loses photographs
+            if not candidates[-1].images:
                 break
-    yield from sorted(found, key=lambda one: len(one.images))
+    # those that leave out the fewest photographs first
+    yield from sorted(candidates, key=lambda oriented: len(oriented.images))
     others = []
-    for changed in _with_other_distances(network, guessed):
+    for changed in _try_other_distances(network, guessed, settings):
         try:
-            others.append(_orient(changed, START_TOLERANCE, {}))
+            # without pairs: their orientations were found with the other distance
+            others.append(_orient(changed, settings.tolerance, {}, settings))
         except NotSolvedError:
             continue
-    enough = [
-        one for one in others if len(one.network.images) >= LEAST_OF_IMAGES * len(network.images)
-    ]
-    yield from sorted(enough, key=lambda one: -len(one.network.observations))[:OF_OTHERS]
-    if failed is not None and not found and not enough:
+    least = settings.min_oriented * len(network.images)
+    enough = [oriented for oriented in others if len(oriented.network.images) >= least]
+    enough.sort(key=lambda oriented: -len(oriented.network.observations))
+    yield from enough[: settings.max_others]
+    if failed is not None and not candidates and not enough:
         raise failed
 
 
-def _orient(network: Network, tolerance: float, pairs: NamedPairs) -> Oriented:
+def _orient(
+    network: Network, tolerance: float, pairs: NamedPairs, settings: StartValueSettings
+) -> Oriented:
     """Start values, without photographs that contradict their pairs, or are weakly connected to the
     others."""
-    found = orient(network, tolerance=tolerance)
-    misplaced = find_misplaced(found.network, pairs)
+    oriented = orient(network, tolerance=tolerance)
+    misplaced = find_misplaced(oriented.network, pairs, settings.misplaced)
     if misplaced:
         others = _without(network, np.isin(np.array(network.images.id), [*misplaced]))
-        found = orient(others, tolerance=tolerance)
-    network, images = found.network, {**found.images, **misplaced}
+        oriented = orient(others, tolerance=tolerance)
+    network, images = oriented.network, {**oriented.images, **misplaced}
+    # leaving out one photograph takes rays from the points of others: until none has too few
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))
         tied = (rays > 1)[network.observations.point]
         number = np.bincount(network.observations.image, tied, len(network.images))
-        few = number < FEWEST_RAYS
+        few = number < settings.min_rays
         if not few.any() or few.all():
-            return dataclasses.replace(found, network=network, images=images)
+            return dataclasses.replace(oriented, network=network, images=images)
         for k in np.flatnonzero(few):
             why = f"only {int(number[k])} of its points agree with the others"
             images[network.images.id[k]] = why
         network = _without(network, few)
 
 
-def _without(network: Network, images) -> Network:
+def _without(network: Network, images: Bool[np.ndarray, " images"]) -> Network:
     """The network without images, and without the tie points that lose all but one ray."""
     if not images.any():
         return network
@@ -104,26 +135,21 @@ def _without(network: Network, images) -> Network:
     return keep_points(network, (rays > 1) | ~network.points.has_role("tie"))
 
 
-def _with_other_distances(network: Network, guessed: Sequence[str]) -> Iterator[Network]:
-    of = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
-    for factor in OTHERS if of else ():
-        distances = {id: factor * max(present_size(c)) for id, c in of.items()}
-        ratios = [of[id].parameters["fx"] / f for id, f in distances.items()]
-        if any(max(r, 1 / r) > APART for r in ratios):
+def _try_other_distances(
+    network: Network, guessed: Sequence[str], settings: StartValueSettings
+) -> Iterator[Network]:
+    cameras = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
+    for factor in settings.other_distances if cameras else ():
+        distances = {id: factor * max(present_size(c)) for id, c in cameras.items()}
+        ratios = [cameras[id].parameters["fx"] / f for id, f in distances.items()]
+        if any(max(r, 1 / r) > settings.distinct_ratio for r in ratios):
             yield _with_distances(network, distances)
 
 
 def _with_distances(network: Network, distances: Mapping[str, float]) -> Network:
     """The network with principal distances of some cameras, also in their observations."""
-    changed = lambda c: dataclasses.replace(
-        c,
-        parameters={
-            **c.parameters,
-            "fx": distances[c.id],
-            "fy": distances[c.id],
-            "k1": 0.0,
-        },
-    )
+    new = lambda c: {**c.parameters, "fx": distances[c.id], "fy": distances[c.id], "k1": 0.0}
+    changed = lambda c: dataclasses.replace(c, parameters=new(c))
     network = network.replace(
         cameras=tuple(changed(c) if c.id in distances else c for c in network.cameras)
     )
@@ -132,22 +158,28 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
         return network
     value, sigma = observed.value.copy(), observed.sigma.copy()
     for row, (id, name) in enumerate(zip(observed.camera, observed.parameter)):
+        # the prior moves with the start value, with the same relative σ: else it would pull back
         if id in distances and name == "fx":
             value[row], sigma[row] = distances[id], distances[id] * sigma[row] / value[row]
     return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))
 
 
-def is_plausible(result: Adjustment) -> bool:
+def is_plausible(result: Adjustment, settings: StartValueSettings = StartValueSettings()) -> bool:
     """Whether an adjustment converged to plausible principal distances."""
+    low, high = settings.min_distance, settings.max_distance
     return bool(result.converged) and all(
-        SHORTEST < found["fx"] / max(camera.image_size) < LONGEST
+        low < adjusted["fx"] / max(camera.image_size) < high
         for camera in result.network.cameras
-        if camera.image_size and "fx" in (found := _parameters(result, camera))
+        if camera.image_size and "fx" in (adjusted := _parameters(result, camera))
     )
 
 
 def start_again(
-    network: Network, oriented: Oriented, result: Adjustment, pairs: NamedPairs
+    network: Network,
+    oriented: Oriented,
+    result: Adjustment,
+    pairs: NamedPairs,
+    settings: StartValueSettings = StartValueSettings(),
 ) -> Oriented | None:
     """Start values with the adjusted cameras, if these orient more photographs."""
     if not oriented.images:
@@ -158,19 +190,16 @@ def start_again(
     }
     cameras = tuple(better.get(c.id, c) for c in network.cameras)
     try:
-        near = all(_is_near(c, better.get(c.id, c)) for c in network.cameras)
-        found = _orient(network.replace(cameras=cameras), START_TOLERANCE, pairs if near else {})
+        distance = lambda camera: camera.parameters.get("fx", 1.0)
+        ratios = [distance(c) / distance(new) for c, new in zip(network.cameras, cameras)]
+        near = all(max(ratio, 1 / ratio) < settings.near_ratio for ratio in ratios)
+        changed = network.replace(cameras=cameras)
+        again = _orient(changed, settings.tolerance, pairs if near else {}, settings)
     except NotSolvedError:
         return None
-    return found if len(found.images) < len(oriented.images) else None
-
-
-def _is_near(camera: Camera, other: Camera) -> bool:
-    """Whether relative orientations with one camera also hold with the other."""
-    ratio = camera.parameters.get("fx", 1.0) / other.parameters.get("fx", 1.0)
-    return max(ratio, 1 / ratio) < NEAR
+    return again if len(again.images) < len(oriented.images) else None
 
 
 def _parameters(result: Adjustment, camera: Camera) -> dict[str, float]:
-    values = result.cameras[camera.id]["parameters"]
-    return {name: float(one["value"]) for name, one in values.items()}
+    parameters = result.cameras[camera.id]["parameters"]
+    return {name: float(parameter["value"]) for name, parameter in parameters.items()}

@@ -11,92 +11,118 @@ the object move. Places are relative to the size of the photographs, which may a
 degrees against each other (saved upright).
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 
-LARGEST_MOTION = 0.002
-"""Maximum motion of a match, relative to the longer side: a base this short gives intersection
-angles of a tenth of a degree. A match of a blurred photograph is as uncertain as a quarter of the
-size of its feature, which is added."""
-OF_FEATURE = 0.25
-SAME = 0.9
-"""Minimum share of the matches at the same place; the others are wrong."""
-LEAST, OF_FEATURES = 30, 0.2
-"""Minimum matches at the same place, and their share of the features of the photograph with fewer
-of them: a date written into two photographs has fewer."""
-SPREAD = 0.5
-"""Minimum standard deviation of these matches, in both directions, relative to that of all
-features."""
+
+@dataclasses.dataclass(frozen=True)
+class DuplicateSettings:
+    """Settings of the search for photographs that show the same."""
+
+    max_motion: float = 0.002
+    """Maximum motion of a match, relative to the longer side: a base this short gives intersection
+    angles of a tenth of a degree (at a principal distance of the longer side)."""
+    feature_share: float = 0.25
+    """Motion allowed in addition, relative to the size of the feature: a match of a blurred
+    photograph is that uncertain. Smaller: blurred copies stay; larger: so may frames of a slow
+    video, whose features are large."""
+    min_share: float = 0.9
+    """Minimum share of the matches at the same place; the others are wrong. If an object moves in
+    front of a fixed camera, its matches are more than the remaining tenth."""
+    min_matches: int = 30
+    """Minimum matches at the same place: a few are at the same place by chance."""
+    min_feature_share: float = 0.2
+    """Minimum matches at the same place relative to the features of the photograph with fewer
+    of them: a date written into two photographs has fewer."""
+    min_spread: float = 0.5
+    """Minimum standard deviation of these matches, in both directions, relative to that of all
+    features: a mark in a corner has less."""
 
 
 def find_duplicates(
-    matches: Sequence[Matches], features: Sequence[Features], sizes: Sequence[tuple[int, int]]
+    matches: Sequence[FeatureMatches],
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    settings: DuplicateSettings = DuplicateSettings(),
 ) -> dict[int, tuple[int, int, int]]:
     """By photograph to leave out: the one that shows the same, matches at the same place, and all
     their matches."""
     same: dict[tuple[int, int], tuple[int, int]] = {}
     for m in matches:
-        still = _count_still(m, features, sizes)
+        still = _count_still(m, features, sizes, settings)
         if still:
             same[m.images] = still, len(m.rows)
-    return _leave_out(same, [len(f) for f in features])
+    return _choose_left_out(same, [len(f) for f in features])
 
 
-def _leave_out(
+def _choose_left_out(
     same: Mapping[tuple[int, int], tuple[int, int]], number: Sequence[int]
 ) -> dict[int, tuple[int, int, int]]:
     """Every photograph that shows the same as a better one that stays."""
-    found: dict[int, tuple[int, int, int]] = {}
+    left_out: dict[int, tuple[int, int, int]] = {}
+    # the best first: whether it stays is known before those that it replaces are judged
     for k in sorted(range(len(number)), key=lambda k: (-number[k], k)):
         for pair, counted in same.items():
             if k in pair:
                 other = pair[pair[0] == k]
                 better = (-number[other], other) < (-number[k], k)
-                if better and other not in found:
-                    found[k] = other, *counted
+                if better and other not in left_out:
+                    left_out[k] = other, *counted
                     break
-    return found
+    return left_out
 
 
-def _count_still(m: Matches, features, sizes) -> int:
+def _count_still(
+    m: FeatureMatches,
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    settings: DuplicateSettings,
+) -> int:
     """The number of matches at the same place; 0 if the photographs do not show the same."""
     fewer = min(len(features[k]) for k in m.images)
-    needed = max(LEAST, OF_FEATURES * fewer)
+    needed = max(settings.min_matches, settings.min_feature_share * fewer)
     if len(m.rows) < needed:
         return 0
     i, j = m.images
-    one, other = (_places(features[k].xy, sizes[k]) for k in (i, j))
+    # positions in a photograph, 0 to 1 in both directions
+    one, other = ((features[k].xy + 0.5) / np.array(sizes[k]) for k in (i, j))
     a, b = one[m.rows[:, 0]], other[m.rows[:, 1]]
     blur = [
-        OF_FEATURE * features[k].size[rows] / max(sizes[k]) for k, rows in zip((i, j), m.rows.T)
+        settings.feature_share * features[k].size[rows] / max(sizes[k])
+        for k, rows in zip((i, j), m.rows.T)
     ]
-    limit = LARGEST_MOTION + np.maximum(*blur)
+    limit = settings.max_motion + np.maximum(*blur)
+    # one of them may have been saved upright, in either direction, or upside down
     for turns in range(4):
         still = _are_still(a, b, sizes[i], limit, turns, sizes[j])
         number = int(still.sum())
-        if number >= max(needed, SAME * len(still)) and all(
-            np.all(some[still].std(0) > SPREAD * every.std(0))
+        if number >= max(needed, settings.min_share * len(still)) and all(
+            np.all(some[still].std(0) > settings.min_spread * every.std(0))
             for some, every in ((a, one), (b, other))
         ):
             return number
     return 0
 
 
-def _places(xy: Float[np.ndarray, "n 2"], size) -> Float[np.ndarray, "n 2"]:
-    """Positions in a photograph, 0 to 1 in both directions."""
-    return (xy + 0.5) / np.array(size)
-
-
-def _are_still(a, b, size, limit, turns: int, other_size) -> Bool[np.ndarray, " n"]:
+def _are_still(
+    a: Float[np.ndarray, "n 2"],
+    b: Float[np.ndarray, "n 2"],
+    size: tuple[int, int],
+    limit: Float[np.ndarray, " n"],
+    turns: int,
+    other_size: tuple[int, int],
+) -> Bool[np.ndarray, " n"]:
     """Which matches are at the same place, the second photograph turned by quarters."""
     if turns % 2:
-        other_size = other_size[::-1]
+        other_size = other_size[1], other_size[0]
     ratio = size[0] / size[1] * other_size[1] / other_size[0]
+    # 1 %: whole pixels of a reduced photograph; cropped ones do not show the same
     if abs(np.log(ratio)) > 0.01:
         return np.zeros(len(a), bool)
     for _ in range(turns):

@@ -7,9 +7,12 @@ many in each cell of a grid: they cover photographs evenly, including parts with
 """
 
 import dataclasses
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import FEATURES
@@ -17,31 +20,40 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.opencv import need_opencv
 
-CELLS = 16
-"""Cells of the grid along the longer side."""
-SEARCH_FACTOR = 1.6
-"""Searched features, as a multiple of those kept."""
-CONTRAST, FAINT_CONTRAST = 0.02, 0.008
-"""SIFT's threshold of contrast, and that for photographs with fewer than `FEW` of the features to
-keep: blurred ones, or of bare objects. At 800 × 600 pixels, with a blur of 2 pixels and a third of
-the contrast, 476 features became 3092, and 10 of 10 pairs were verified instead of 7."""
-FEW = 1 / 3
 TILE = 2400
-"""Side of the tiles in which a large photograph is searched, reduced pixels."""
-OVERLAP = 64
-MEMORY = 235
-"""Bytes a pixel of the reduced photograph: SIFT doubles it (4 pixels) and keeps 6 + 5 layers of
-4 bytes of it and of all smaller octaves (4/3); 225 measured."""
+"""Side of the tiles in which a large photograph is searched, reduced pixels: at 235 bytes a pixel
+(`memory_of_features`) the search then takes 1.5 GB at most, however large the photograph is."""
+TILE_MARGIN = 64
+"""Pixels around a tile that are searched too, so that its border does not change descriptors:
+OpenCV's reach 3·√2·2.5 = 10.6 σ from a feature, so this holds up to σ = 6 pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """Settings of the search: `kind`; `number` of features kept per photograph; `side`: the longer
-    side to which a photograph is reduced, 0: not at all."""
+    """Settings of the search for features."""
 
     kind: str = "sift"
+    """Detector: `sift`, `akaze` or `orb`."""
     number: int = 6000
+    """Features kept per photograph."""
     side: int = 1800
+    """Longer side, pixels, to which a photograph is reduced; 0: not at all."""
+    cells: int = 16
+    """Cells of the grid along the longer side; each keeps the same number. More: features also
+    where there is little texture, but weaker ones; fewer: the textured parts get most of them."""
+    search_factor: float = 1.6
+    """Searched features, as a multiple of those kept: the surplus of textured cells, from which the
+    grid chooses. SIFT computes a descriptor for each, so time grows with it."""
+    contrast: float = 0.02
+    """SIFT's threshold of contrast, half of OpenCV's default: the grid, not the threshold, decides
+    what is kept."""
+    faint_contrast: float = 0.008
+    """The threshold for photographs with few features: blurred ones, or of bare objects. At 800 ×
+    600 pixels, with a blur of 2 pixels and a third of the contrast, 476 features became 3092, and
+    10 of 10 pairs were verified instead of 7."""
+    faint_share: float = 1 / 3
+    """Share of `number` below which a photograph has few features. The second search doubles the
+    time of such a photograph; with 1 all of simple objects would be searched twice."""
 
     def __post_init__(self):
         one_of("features", self.kind, FEATURES)
@@ -62,7 +74,7 @@ class Features:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def take(self, rows) -> "Features":
+    def take(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"] | slice) -> "Features":
         """The chosen features."""
         return Features(self.xy[rows], self.size[rows], self.angle[rows], self.descriptor[rows])
 
@@ -76,37 +88,47 @@ def find_features(
     factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
     if factor < 1:
         size = max(round(columns * factor), 1), max(round(rows * factor), 1)
+        # the mean over the area of a pixel: the other interpolations alias when they reduce
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    points, descriptors = _search(cv2, grey, settings, CONTRAST)
-    if settings.kind == "sift" and len(points) < FEW * settings.number:
-        points, descriptors = _search(cv2, grey, settings, FAINT_CONTRAST)
+    points, descriptors = _search(cv2, grey, settings, settings.contrast)
+    # a low threshold for all would fill sharp photographs with features of noise
+    if settings.kind == "sift" and len(points) < settings.faint_share * settings.number:
+        points, descriptors = _search(cv2, grey, settings, settings.faint_contrast)
     if not points or not descriptors:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 1), np.uint8))
-    xy, size, angle, response = _columns(points)
-    kept = _spread(xy, size, response, grey.shape, settings.number)
+    xy = np.array([p.pt for p in points], float)
+    size, angle, response = (
+        np.array([getattr(p, name) for p in points]) for name in ("size", "angle", "response")
+    )
+    chosen = _choose_evenly(xy, size, response, grey.shape, settings)
     scale = np.array([columns / grey.shape[1], rows / grey.shape[0]])
-    xy = (xy[kept] + 0.5) * scale - 0.5
-    descriptor = np.concatenate(descriptors)[kept].astype(np.uint8)
-    return Features(xy, size[kept] * scale.mean(), np.deg2rad(angle[kept]), descriptor)
+    # (0, 0) is the centre of the first pixel, so a reduction scales about (−0.5, −0.5)
+    xy = (xy[chosen] + 0.5) * scale - 0.5
+    descriptor = np.concatenate(descriptors)[chosen].astype(np.uint8)
+    return Features(xy, size[chosen] * scale.mean(), np.deg2rad(angle[chosen]), descriptor)
 
 
 def memory_of_features(rows: int, columns: int, settings: Detection) -> float:
     """Bytes that the search takes in a photograph, beside its grey values."""
     factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
-    tall, wide = (min(factor * side, TILE + 2 * OVERLAP) for side in (rows, columns))
-    return MEMORY * tall * wide
+    tall, wide = (min(factor * side, TILE + 2 * TILE_MARGIN) for side in (rows, columns))
+    # SIFT doubles the photograph (4 pixels for one) and keeps 6 + 5 layers of float32, of it and of
+    # all smaller octaves (1 + 1/4 + 1/16 … = 4/3): 235 bytes a pixel; 225 were measured
+    return 4 * (6 + 5) * 4 * (4 / 3) * tall * wide
 
 
-def _search(cv2, grey, settings: Detection, contrast: float):
-    """Key points and descriptors, by tiles."""
-    detector = _detector(cv2, settings, contrast)
-    found = [_in_tile(detector, grey, *tile) for tile in _tiles(*grey.shape)]
-    points = [p for part, _ in found for p in part]
-    return points, [d for _, d in found if d is not None and len(d)]
+def _search(
+    cv2: ModuleType, grey: UInt8[np.ndarray, "rows columns"], settings: Detection, contrast: float
+) -> tuple[list[Any], list[np.ndarray]]:
+    """Key points of OpenCV and their descriptors, by tiles."""
+    detector = _make_detector(cv2, settings, contrast)
+    parts = [_search_tile(detector, grey, *tile) for tile in _tiles(*grey.shape)]
+    points = [p for part, _ in parts for p in part]
+    return points, [d for _, d in parts if d is not None and len(d)]
 
 
-def _detector(cv2, settings: Detection, contrast: float):
-    ample = int(SEARCH_FACTOR * settings.number)
+def _make_detector(cv2: ModuleType, settings: Detection, contrast: float) -> Any:
+    ample = int(settings.search_factor * settings.number)
     if settings.kind == "sift":
         # without precise upscaling, features are a quarter of a pixel too far right and down
         return cv2.SIFT_create(
@@ -119,11 +141,12 @@ def _detector(cv2, settings: Detection, contrast: float):
             f"OpenCV {cv2.__version__} is built without AKAZE: take features sift, or install "
             "opencv-contrib-python-headless"
         )
+    # half of OpenCV's default threshold, as for the contrast of SIFT
     return cv2.AKAZE_create(threshold=0.0005)
 
 
-def _tiles(rows: int, columns: int):
-    """(top, left, bottom, right) of overlapping tiles, and of the part from which each is used."""
+def _tiles(rows: int, columns: int) -> Iterator[tuple[int, int, int, int]]:
+    """(top, left, bottom, right) of the parts of a photograph, at most `TILE` wide and high."""
     tall, wide = (max(1, -(-n // TILE)) for n in (rows, columns))
     for i in range(tall):
         for j in range(wide):
@@ -132,38 +155,47 @@ def _tiles(rows: int, columns: int):
             yield top, left, bottom, right
 
 
-def _in_tile(detector, grey, top, left, bottom, right):
+def _search_tile(
+    detector: Any,
+    grey: UInt8[np.ndarray, "rows columns"],
+    top: int,
+    left: int,
+    bottom: int,
+    right: int,
+) -> tuple[list[Any], UInt8[np.ndarray, "n bytes"] | Float[np.ndarray, "n 128"] | None]:
     """Key points within a tile, searched with a margin, and their descriptors."""
-    t, l = max(top - OVERLAP, 0), max(left - OVERLAP, 0)
-    part = np.ascontiguousarray(grey[t : bottom + OVERLAP, l : right + OVERLAP])
+    t, l = max(top - TILE_MARGIN, 0), max(left - TILE_MARGIN, 0)
+    part = np.ascontiguousarray(grey[t : bottom + TILE_MARGIN, l : right + TILE_MARGIN])
     points, descriptors = detector.detectAndCompute(part, None)
     if descriptors is None:
         return [], None
-    keep = []
+    inside = []
     for k, point in enumerate(points):
         x, y = point.pt[0] + l, point.pt[1] + t
         point.pt = (x, y)
+        # half-open, so that a feature in the margin of two tiles is taken once
         if left - 0.5 <= x < right - 0.5 and top - 0.5 <= y < bottom - 0.5:
-            keep.append(k)
-    return [points[k] for k in keep], descriptors[keep]
+            inside.append(k)
+    return [points[k] for k in inside], descriptors[inside]
 
 
-def _columns(points):
-    xy = np.array([p.pt for p in points], float)
-    return xy, *(
-        np.array([getattr(p, name) for p in points]) for name in ("size", "angle", "response")
-    )
-
-
-def _spread(xy, size, response, shape, number):
+def _choose_evenly(
+    xy: Float[np.ndarray, "n 2"],
+    size: Float[np.ndarray, " n"],
+    response: Float[np.ndarray, " n"],
+    shape: tuple[int, ...],
+    settings: Detection,
+) -> Int[np.ndarray, " m"]:
     """The rows to keep, the largest features first: the most distinct ones of each cell."""
-    if len(xy) <= number:
+    if len(xy) <= settings.number:
         return np.argsort(-size, kind="stable")
-    side = max(shape) / CELLS
-    cell = (xy[:, 1] // side).astype(int) * (CELLS + 1) + (xy[:, 0] // side).astype(int)
+    side = max(shape) / settings.cells
+    column, row = (xy // side).astype(int).T
+    cell = row * (settings.cells + 1) + column
     order = np.lexsort((-response, cell))
     first = np.searchsorted(cell[order], cell[order])
+    # the rank of each feature within its cell: all first ones are taken, then all second ones, …
     rank = np.empty(len(xy), int)
     rank[order] = np.arange(len(xy)) - first
-    kept = np.lexsort((-response, rank))[:number]
-    return kept[np.argsort(-size[kept], kind="stable")]
+    chosen = np.lexsort((-response, rank))[: settings.number]
+    return chosen[np.argsort(-size[chosen], kind="stable")]

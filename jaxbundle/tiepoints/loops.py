@@ -21,6 +21,7 @@ pairs may show them unnoticed: only those with at least half the matches of its 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,69 +29,101 @@ from jaxtyping import Float
 
 from jaxbundle.tiepoints.verification import Pair, rotation_angle
 
-TURN, GAP = np.radians(5.0), 0.15
-"""Maximum rotation remaining around a loop, and gap of the bases relative to the longest."""
-ASIDE, NARROW = 0.5, 0.03
-"""Maximum distance of a base of unknown length from the angle between the two others; and angle of
-intersection, radians, below which its direction is uncertain."""
-ACCEPTED_SHARE = 1 / 3
-"""Share of accepted pairs of a photograph below which only its best are used."""
-FEWEST_COMMON = 8
-"""Minimum common features of two pairs for the ratio of their bases."""
-MOST_LOOPS = 12
-"""Maximum loops examined per pair, those with the most matches."""
+Ids = tuple[int, int]
+"""The photographs of a pair, the smaller number first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopSettings:
+    """Settings of the test of pairs around three photographs."""
+
+    max_rotation: float = np.radians(5.0)
+    """Maximum rotation remaining around a loop, radians: a principal distance 5 % wrong changes
+    the rotation between views 30 degrees apart by 1.5 degrees, and three pairs add up. Larger:
+    wrong pairs close."""
+    max_gap: float = 0.15
+    """Maximum gap of the bases, relative to the longest. Windows matched one further move a camera
+    by their distance, which is seen if that is more than this part of the base; a smaller limit
+    rejects right pairs whose ratios of bases rest on `min_common` features."""
+    max_aside: float = 0.5
+    """Maximum distance of a base (unit length) of unknown ratio from the angle between the others:
+    30 degrees. Without common features only gross contradictions count."""
+    narrow_angle: float = 0.03
+    """Angle of intersection, radians (2 degrees), below which the direction of a base is
+    uncertain."""
+    accepted_share: float = 1 / 3
+    """Share of accepted pairs of a photograph below which only its best are used. This rule and
+    `max_aside` reduced the errors of the set `building`, where a car stands elsewhere in every
+    photograph, from 1.3e-2 to 1.2e-3."""
+    min_common: int = 8
+    """Minimum common features of two pairs for the ratio of their bases, which is a median: up to
+    three of eight may be wrong."""
+    max_loops: int = 12
+    """Maximum loops examined per pair, those with the most matches: bounds the time in blocks where
+    everything overlaps; a vote of 12 is clear."""
 
 
 def split_contradicted(
-    pairs: Sequence[Pair], ideal: Sequence[Float[np.ndarray, "_ 2"]]
+    pairs: Sequence[Pair],
+    ideal: Sequence[Float[np.ndarray, "_ 2"]],
+    settings: LoopSettings = LoopSettings(),
 ) -> tuple[list[Pair], list[Pair]]:
     """Consistent pairs, and contradictory ones, in the given order.
 
     **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
     """
-    loops = _Loops(pairs, ideal)
-    votes = {of: [loops.closes(of, k) for k in loops.thirds(of)] for of in loops.pairs}
+    loops = _Loops(pairs, ideal, settings)
+    # first with all pairs, wrong ones included, which only orders them
+    votes = {ids: [loops.closes(ids, k) for k in loops.thirds(ids)] for ids in loops.pairs}
 
-    def strength(pair: Pair):
-        of = votes.get(pair.images, [])
-        good, bad = of.count(True), of.count(False)
+    def strength(pair: Pair) -> tuple[bool, float]:
+        """Matches times the estimated probability that a loop closes, (good + 1)/(good + bad + 1):
+        1 without loops, so that these do not count against a pair."""
+        closed = votes.get(pair.images, [])
+        good, bad = closed.count(True), closed.count(False)
         return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
 
-    taken: set[tuple[int, int]] = set()
+    # greedy, the strongest first, like Kruskal's spanning tree: a wrong pair is then judged by
+    # right ones, and wrong ones that agree with it do not count
+    accepted: set[Ids] = set()
     group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
         i, j = pair.images
-        found = [
+        closed = [
             loops.closes((i, j), k)
             for k in loops.thirds((i, j))
-            if {_pair(i, k), _pair(j, k)} <= taken
+            if {_pair(i, k), _pair(j, k)} <= accepted
         ]
+        # a pair by repeated features must be confirmed, unless nothing else connects its sides
         needed = pair.sure or group[i] != group[j]
-        if found.count(False) <= found.count(True) and (needed or any(found)):
-            taken.add((i, j))
+        if closed.count(False) <= closed.count(True) and (needed or any(closed)):
+            accepted.add((i, j))
             group = {k: group[i] if g == group[j] else g for k, g in group.items()}
-    taken = _without_weak(pairs, taken)
-    return ([p for p in pairs if p.images in taken], [p for p in pairs if p.images not in taken])
+    accepted = _without_weak(pairs, accepted, settings.accepted_share)
+    return (
+        [p for p in pairs if p.images in accepted],
+        [p for p in pairs if p.images not in accepted],
+    )
 
 
-def _without_weak(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tuple[int, int]]:
+def _without_weak(pairs: Sequence[Pair], accepted: set[Ids], min_share: float) -> set[Ids]:
     """The accepted pairs without the weaker ones of photographs most of whose pairs contradict
     others; a pair that alone connects photographs stays."""
     weak = []
     for k in {k for pair in pairs for k in pair.images}:
-        of = [p for p in pairs if k in p.images]
-        left = [p for p in of if p.images in taken]
-        if len(left) < ACCEPTED_SHARE * len(of):
+        every = [p for p in pairs if k in p.images]
+        left = [p for p in every if p.images in accepted]
+        if len(left) < min_share * len(every):
             most = max(map(len, left), default=0)
             weak += [p for p in left if 2 * len(p) < most]
     for pair in sorted(weak, key=len):
-        others = taken - {pair.images}
+        others = accepted - {pair.images}
         if _are_connected(others, *pair.images):
-            taken = others
-    return taken
+            accepted = others
+    return accepted
 
 
-def _are_connected(pairs: set[tuple[int, int]], i: int, j: int) -> bool:
+def _are_connected(pairs: set[Ids], i: int, j: int) -> bool:
     """Whether a chain of pairs leads from a photograph to another."""
     reached, before = {i}, set()
     while reached != before and j not in reached:
@@ -99,55 +132,65 @@ def _are_connected(pairs: set[tuple[int, int]], i: int, j: int) -> bool:
     return j in reached
 
 
-def _pair(i: int, j: int) -> tuple[int, int]:
+def _pair(i: int, j: int) -> Ids:
     return min(i, j), max(i, j)
 
 
 class _Loops:
     """Loops of pairs with a base."""
 
-    def __init__(self, pairs: Sequence[Pair], ideal):
+    def __init__(
+        self,
+        pairs: Sequence[Pair],
+        ideal: Sequence[Float[np.ndarray, "_ 2"]],
+        settings: LoopSettings,
+    ):
+        self.settings = settings
         self.pairs = {p.images: p for p in pairs if p.kind != "rotation"}
         self.depth = {p.images: _depths(p, ideal) for p in self.pairs.values()}
-        self.next: dict[int, set[int]] = {}
+        self.neighbours: dict[int, set[int]] = {}
         for i, j in self.pairs:
-            self.next.setdefault(i, set()).add(j)
-            self.next.setdefault(j, set()).add(i)
-        self.known: dict[tuple[int, ...], bool | None] = {}
+            self.neighbours.setdefault(i, set()).add(j)
+            self.neighbours.setdefault(j, set()).add(i)
+        self.closed: dict[tuple[int, ...], bool | None] = {}
 
-    def thirds(self, of: tuple[int, int]) -> list[int]:
+    def thirds(self, ids: Ids) -> list[int]:
         """Photographs that form a pair with both, those with the most matches first."""
-        if of not in self.pairs:
+        if ids not in self.pairs:
             return []
-        i, j = of
+        i, j = ids
         fewest = lambda k: min(len(self.pairs[_pair(i, k)]), len(self.pairs[_pair(j, k)]))
-        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST_LOOPS]
+        common = sorted(self.neighbours[i] & self.neighbours[j], key=lambda k: (-fewest(k), k))
+        return common[: self.settings.max_loops]
 
-    def closes(self, of: tuple[int, int], k: int) -> bool | None:
+    def closes(self, ids: Ids, k: int) -> bool | None:
         """Whether a loop closes; None if the bases are unknown."""
-        loop = tuple(sorted((*of, k)))
-        if loop not in self.known:
-            self.known[loop] = self._closes(*loop)
-        return self.known[loop]
+        loop = tuple(sorted((*ids, k)))
+        if loop not in self.closed:
+            self.closed[loop] = self._closes(*loop)
+        return self.closed[loop]
 
-    def _closes(self, i, j, k):
-        ij, jk, ik = (self.pairs[of] for of in ((i, j), (j, k), (i, k)))
+    def _closes(self, i: int, j: int, k: int) -> bool | None:
+        ij, jk, ik = (self.pairs[ids] for ids in ((i, j), (j, k), (i, k)))
         turn = jk.M @ ij.M @ ik.M.T
-        if rotation_angle(turn) > TURN:
+        if rotation_angle(turn) > self.settings.max_rotation:
             return False
-        # ln β of jk and ik, β of ij is 1
+        # ln β of jk and ik, β of ij is 1: each from the features that two pairs share in the
+        # photograph that they share; two of the three ratios suffice
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
+        # without two of them the bases can have any lengths: β > 0 is left of the second equation
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
-            between = _is_between(ij.b, ij.M.T @ jk.b, ik.b)
-            return None if between or ik.angle < NARROW else False
+            between = _is_between(ij.b, ij.M.T @ jk.b, ik.b, self.settings.max_aside)
+            return None if between or ik.angle < self.settings.narrow_angle else False
         of_jk = at_i - at_k if np.isnan(at_j) else at_j
         of_ik = at_j + at_k if np.isnan(at_i) else at_i
         second, third = np.exp(of_jk) * ij.M.T @ jk.b, np.exp(of_ik) * ik.b
         gap = np.linalg.norm(ij.b + second - third)
-        return bool(gap < GAP * max(1.0, np.exp(of_jk), np.exp(of_ik)))
+        longest = max(1.0, np.exp(of_jk), np.exp(of_ik))
+        return bool(gap < self.settings.max_gap * longest)
 
-    def _ratio(self, one, other, of_one, of_other) -> float:
+    def _ratio(self, one: Ids, other: Ids, of_one: int, of_other: int) -> float:
         """ln of the ratio of the base of `other` to that of `one`, by the depths in their common
         photograph: the first or second (0, 1) of each; NaN: unknown."""
         a, depth = self.pairs[one].matches[:, of_one], self.depth[one][of_one]
@@ -155,24 +198,33 @@ class _Loops:
         _, rows, columns = np.intersect1d(a, b, return_indices=True)
         ratio = depth[rows] / far[columns]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        return float(np.log(np.median(ratio))) if len(ratio) >= FEWEST_COMMON else np.nan
+        enough = len(ratio) >= self.settings.min_common
+        return float(np.log(np.median(ratio))) if enough else np.nan
 
 
-def _is_between(one, other, b) -> bool:
-    """Whether a direction is a sum of two others with positive factors, to `ASIDE`."""
+def _is_between(
+    one: Float[np.ndarray, "3"],
+    other: Float[np.ndarray, "3"],
+    b: Float[np.ndarray, "3"],
+    most: float,
+) -> bool:
+    """Whether a direction is a sum of two others with positive factors, to a distance `most`."""
     from scipy.optimize import nnls
 
     factors, miss = nnls(np.stack([one, other], 1), b)
-    return bool(miss < ASIDE and factors.any())
+    return bool(miss < most and factors.any())
 
 
-def _depths(pair: Pair, ideal):
+def _depths(
+    pair: Pair, ideal: Sequence[Float[np.ndarray, "_ 2"]]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Depths of the matches in both photographs for base 1."""
     a, c = (
         np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
         for k, rows in zip(pair.images, pair.matches.T)
     )
     c = c @ pair.M
+    # normal equations of s·a − t·c = b for the nearest points of two rays
     aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
     determinant = aa * cc - dot * dot
     with np.errstate(divide="ignore", invalid="ignore"):

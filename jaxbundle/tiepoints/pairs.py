@@ -1,5 +1,6 @@
 """Selection of pairs of photographs for matching."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from itertools import combinations
 
@@ -9,14 +10,27 @@ from jaxtyping import Float
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import number_alike
 
-ALL_PAIRS_UP_TO = 60
-"""Maximum number of photographs with all pairs matched."""
-NEXT = 5
-"""Neighbours of a photograph on each side in a sequence."""
-NEIGHBOURS = 20
-"""Number of neighbours of a photograph, by position or by similarity."""
-FEWEST_MATCHES = 4
-"""Minimum matches of the largest features for a candidate pair."""
+
+@dataclasses.dataclass(frozen=True)
+class CandidateSettings:
+    """Settings of the selection of pairs: one in vain costs a matching, one missed a connection."""
+
+    all_pairs_up_to: int = 60
+    """Maximum number of photographs with all pairs matched: 1770 pairs, each a product of two
+    [6000, 128] matrices. Choosing fewer pays only beyond that."""
+    sequence_neighbours: int = 5
+    """Neighbours of a photograph on each side in a sequence: of six photographs with 80 % forward
+    overlap the first and the last still touch."""
+    neighbours: int = 20
+    """Neighbours of a photograph, by position or by similarity: in a block of parallel strips those
+    of the own strip and of two on each side. More: all pairs, in the end; fewer: strips come
+    apart."""
+    min_matches: int = 4
+    """Minimum matches of the largest features for a candidate pair. Low, since a candidate in vain
+    is rejected by its verification."""
+    largest_features: int = 800
+    """Number of largest features that decide whether two photographs may overlap. The time of this
+    check grows with the square, and with that of the number of photographs."""
 
 
 def candidate_pairs(
@@ -24,6 +38,7 @@ def candidate_pairs(
     way: str = "auto",
     place: Float[np.ndarray, "photographs 3"] | None = None,
     run: Callable = map,
+    settings: CandidateSettings = CandidateSettings(),
 ) -> list[tuple[int, int]]:
     """Pairs of photographs to match.
 
@@ -35,35 +50,42 @@ def candidate_pairs(
     n = len(features)
     known = place is not None and np.isfinite(place).all()
     if way == "auto":
-        way = "all" if n <= ALL_PAIRS_UP_TO else "place" if known else "alike"
+        way = "all" if n <= settings.all_pairs_up_to else "place" if known else "alike"
     if way == "all":
         return list(combinations(range(n), 2))
     if way == "sequence":
-        return [(i, j) for i in range(n) for j in range(i + 1, min(i + NEXT + 1, n))]
+        last = settings.sequence_neighbours
+        return [(i, j) for i in range(n) for j in range(i + 1, min(i + last + 1, n))]
     if way == "place" and known:
-        return _nearest(np.asarray(place))
-    return _alike(features, run)
+        return _nearest_by_position(np.asarray(place), settings.neighbours)
+    return _most_similar(features, run, settings)
 
 
-def _nearest(place):
+def _nearest_by_position(
+    place: Float[np.ndarray, "photographs 3"], neighbours: int
+) -> list[tuple[int, int]]:
     from scipy.spatial import cKDTree
 
-    _, rows = cKDTree(place).query(place, k=min(NEIGHBOURS + 1, len(place)))
+    # one more: the nearest of each photograph is the photograph itself
+    _, rows = cKDTree(place).query(place, k=min(neighbours + 1, len(place)))
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(rows) for j in row.tolist() if i != j}
     return sorted(pairs)
 
 
-def _alike(features, run):
+def _most_similar(
+    features: Sequence[Features], run: Callable, settings: CandidateSettings
+) -> list[tuple[int, int]]:
     every = list(combinations(range(len(features)), 2))
-    number = list(run(lambda pair: number_alike(features[pair[0]], features[pair[1]]), every))
-    of = [[] for _ in features]
-    for (i, j), found in zip(every, number):
-        if found >= FEWEST_MATCHES:
-            of[i].append((found, j))
-            of[j].append((found, i))
+    most = settings.largest_features
+    count = lambda pair: number_alike(features[pair[0]], features[pair[1]], most)
+    similar = [[] for _ in features]
+    for (i, j), number in zip(every, run(count, every)):
+        if number >= settings.min_matches:
+            similar[i].append((number, j))
+            similar[j].append((number, i))
     pairs = {
         (min(i, j), max(i, j))
-        for i, best in enumerate(of)
-        for _, j in sorted(best, reverse=True)[:NEIGHBOURS]
+        for i, best in enumerate(similar)
+        for _, j in sorted(best, reverse=True)[: settings.neighbours]
     }
     return sorted(pairs)

@@ -12,22 +12,25 @@ from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.photographs.reading import image_errors
 from jaxbundle.system.threads import map_in_threads
-from jaxbundle.tiepoints import interior, verification
+from jaxbundle.tiepoints import coplanarity, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
-from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import Matches, distances_within, match_features, single_matches
-from jaxbundle.tiepoints.pairs import candidate_pairs
+from jaxbundle.tiepoints.loops import LoopSettings, split_contradicted
+from jaxbundle.tiepoints.matching import (
+    FeatureMatches,
+    MatchingSettings,
+    distances_within,
+    match_features,
+    single_matches,
+)
+from jaxbundle.tiepoints.pairs import CandidateSettings, candidate_pairs
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.verification import Pair, verify_pairs
-
-Tell = Callable[[str, int, int], None]
-TOLERANCE = 0.0012
-"""Maximum Sampson distance of an agreeing match, relative to the longer side."""
+from jaxbundle.tiepoints.verification import Pair, VerificationSettings, verify_pairs
+from jaxbundle.types import Progress
 
 
 def prepare() -> None:
     """Compile the programs of principal distances and verification, ahead of their data."""
-    interior.prepare()
+    coplanarity.prepare()
     verification.prepare()
 
 
@@ -38,19 +41,21 @@ def detect(
     settings: Detection,
     store: Store,
     workers: int,
-    tell: Tell,
+    tell: Progress,
 ) -> list[Features]:
     """The features of every photograph, stored ones if available."""
 
-    def one(k):
-        found = store.load_features(fingerprints[k])
-        if found is None:
+    def load_or_find(k: int) -> Features:
+        features = store.load_features(fingerprints[k])
+        if features is None:
             with image_errors(paths[k]):
-                found = find_features(read[k](), settings)
-            store.save_features(fingerprints[k], found)
-        return found
+                features = find_features(read[k](), settings)
+            store.save_features(fingerprints[k], features)
+        return features
 
-    return map_in_threads(one, range(len(read)), workers, lambda n: tell("features", n, len(read)))
+    return map_in_threads(
+        load_or_find, range(len(read)), workers, lambda n: tell("features", n, len(read))
+    )
 
 
 def match(
@@ -60,79 +65,81 @@ def match(
     place: Float[np.ndarray, "photographs 3"] | None,
     store: Store,
     workers: int,
-    tell: Tell,
-) -> list[Matches]:
-    """The matches of candidate pairs."""
+    tell: Progress,
+    settings: MatchingSettings,
+    candidates: CandidateSettings,
+) -> list[FeatureMatches]:
+    """The matches of candidate pairs, stored ones if available."""
     with ThreadPoolExecutor(workers) as pool:
-        pairs = candidate_pairs(features, way, place, pool.map)
+        pairs = candidate_pairs(features, way, place, pool.map, candidates)
 
-    of = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
-    kept = {pair: store.load_matches(*of(pair)) for pair in pairs}
-    needed = sorted({k for pair, found in kept.items() if found is None for k in pair})
+    names = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
+    stored = {pair: store.load_matches(*names(pair)) for pair in pairs}
+    needed = sorted({k for pair, columns in stored.items() if columns is None for k in pair})
+    # once for each photograph, not for each of its pairs: as much work as a pair
     with ThreadPoolExecutor(workers) as pool:
-        own = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
+        within = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
 
-    def one(pair):
-        found = kept[pair]
-        if found is None:
-            both = own[pair[0]], own[pair[1]]
-            rows, clarity = match_features(features[pair[0]], features[pair[1]], own=both)
-            found = rows, clarity, single_matches(rows, both)
-            store.save_matches(*of(pair), *found)
-        return Matches(pair, *found)
+    def match_pair(pair: tuple[int, int]) -> FeatureMatches:
+        columns = stored[pair]
+        if columns is None:
+            i, j = pair
+            both = within[i], within[j]
+            rows, clarity = match_features(features[i], features[j], settings, both)
+            columns = rows, clarity, single_matches(rows, both, settings)
+            store.save_matches(*names(pair), *columns)
+        return FeatureMatches(pair, *columns)
 
-    return map_in_threads(one, pairs, workers, lambda n: tell("matching", n, len(pairs)))
+    return map_in_threads(match_pair, pairs, workers, lambda n: tell("matching", n, len(pairs)))
 
 
 def verify(
     cameras: Sequence[Camera],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
-    matches: Sequence[Matches],
-    tell: Tell,
+    matches: Sequence[FeatureMatches],
+    tell: Progress,
+    settings: VerificationSettings,
 ) -> list[Pair]:
-    """The pairs explained by one object, with the agreeing matches."""
-    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
-    size = np.array([max(present_size(cameras[c])) / _scale(cameras[c]) for c in of])
+    """The pairs explained by one object, with the agreeing matches.
+
+    **Arguments:** `camera_of`: the camera of every photograph.
+    """
+    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
+    # the longer side in units of c
+    size = np.array(
+        [max(present_size(cameras[c])) / _central_distance(cameras[c]) for c in camera_of]
+    )
     matches = [m for m in matches if len(m.rows)]
-    kept, portion = [], 64
-    for first in range(0, len(matches), portion):
-        some = [_inside(ideal, m) for m in matches[first : first + portion]]
-        tolerance = np.array([TOLERANCE * size[list(m.images)].mean() for m in some])
+    # 64 pairs at once fill eight runs of eight lanes; in between the progress is shown
+    pairs, chunk = [], 64
+    for first in range(0, len(matches), chunk):
+        some = [_with_ideal(ideal, m) for m in matches[first : first + chunk]]
+        tolerance = np.array([settings.tolerance * size[list(m.images)].mean() for m in some])
         one, other = ([ideal[m.images[k]][m.rows[:, k]] for m in some] for k in (0, 1))
-        found = verify_pairs(one, other, tolerance, [m.single for m in some])
-        for m, pair in zip(some, found):
+        verified = verify_pairs(one, other, tolerance, [m.single for m in some], settings)
+        for m, pair in zip(some, verified):
             if pair is not None:
                 good, M, b, angle, kind, sure = pair
-                kept.append(
-                    Pair(
-                        m.images,
-                        m.rows[good],
-                        m.clarity[good],
-                        M,
-                        b,
-                        angle,
-                        kind,
-                        len(m.rows),
-                        sure,
-                    )
-                )
-        tell("verification", min(first + portion, len(matches)), len(matches))
-    return kept
+                rows, clarity = m.rows[good], m.clarity[good]
+                pairs.append(Pair(m.images, rows, clarity, M, b, angle, kind, len(m.rows), sure))
+        tell("verification", min(first + chunk, len(matches)), len(matches))
+    return pairs
 
 
 def without_contradicted(
     cameras: Sequence[Camera],
-    of: Sequence[int],
+    camera_of: Sequence[int],
     features: Sequence[Features],
     pairs: Sequence[Pair],
+    settings: LoopSettings,
 ) -> tuple[list[Pair], list[Pair]]:
     """The pairs consistent in loops of three, and the others."""
-    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
-    return split_contradicted(pairs, ideal)
+    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(camera_of, features)]
+    return split_contradicted(pairs, ideal, settings)
 
 
-def ideal_features(camera: Camera, uv):
+def ideal_features(camera: Camera, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Ideal image coordinates, c = 1, of pixels; NaN for rays sideways."""
     xy, _ = from_image_unit([camera], np.zeros(len(uv), int), uv, np.ones_like(uv), "px")
     return ideal_points(camera, xy) if len(xy) else xy
@@ -144,13 +151,17 @@ def present_size(camera: Camera) -> tuple[int, int]:
     return camera.image_size
 
 
-def _scale(camera):
+def _central_distance(camera: Camera) -> float:
     """The principal distance in pixels, from the images of two points near the centre."""
     columns, rows = present_size(camera)
     middle = np.array([[columns / 2 - 0.5, rows / 2 - 0.5], [columns / 2 + 0.5, rows / 2 - 0.5]])
-    return 1 / np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0))
+    return 1 / float(np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0)))
 
 
-def _inside(ideal, matches: Matches) -> Matches:
-    there = [np.isfinite(ideal[k][rows]).all(1) for k, rows in zip(matches.images, matches.rows.T)]
+def _with_ideal(
+    ideal: Sequence[Float[np.ndarray, "_ 2"]], matches: FeatureMatches
+) -> FeatureMatches:
+    """The matches whose rays point forward in both photographs."""
+    xy = [ideal[k][rows] for k, rows in zip(matches.images, matches.rows.T)]
+    there = [np.all(np.isfinite(a), axis=1) for a in xy]
     return matches.take(there[0] & there[1])

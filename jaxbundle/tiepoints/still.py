@@ -10,71 +10,111 @@ Far objects seen by a camera without rotation are still as well, but those in fr
 by all amounts, and photographs from one position are still everywhere: neither gives marks.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 
-LARGEST_MOTION = 0.001
-"""Maximum motion of a still feature, relative to the longer side."""
-SMALL_MOTION = 5.0
-"""A small motion: below this multiple of it."""
-FEATURE_TOLERANCES = 1.25, 0.2
-"""Ratio of the sizes of equal features, and difference of their directions, radians."""
-LEAST, CLEAR = 16, 0.4
-"""Minimum moved matches of a pair, and at least as many as still ones; and maximum of those with
-small motion, relative to the still ones."""
-PHOTOGRAPHS = 3
-"""Minimum photographs of a mark."""
+Cell = tuple[tuple[int, int], int, int]
+"""Size of the photographs, column and row of a cell of a grid over them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MarkSettings:
+    """Settings of the search for marks at the same pixels of photographs."""
+
+    max_motion: float = 0.001
+    """Maximum motion of a still feature, relative to the longer side: 2 pixels of a photograph
+    reduced to 1800, a few σ of the position of a feature."""
+    small_motion: float = 5.0
+    """A small motion: below this multiple of it. Also the side of the cells in which marks are
+    collected, so that a mark lies in one cell or its neighbours in every photograph."""
+    max_size_ratio: float = 1.25
+    """Maximum ratio of the sizes of equal features: SIFT has three sizes to an octave, 1.26 apart,
+    and interpolates between them."""
+    max_turn: float = 0.2
+    """Maximum difference of the directions of equal features, radians: one of the 36 bins, 0.17, of
+    the histogram in which SIFT finds a direction."""
+    min_moved: int = 16
+    """Minimum matches of a pair that have moved, and at least as many as still ones: as many as a
+    pair needs to be oriented (`VerificationSettings.min_matches`)."""
+    max_small_share: float = 0.4
+    """Maximum matches with small motion, relative to the still ones. More: far objects seen by a
+    camera that hardly turns are mistaken for marks; fewer: marks beside a nearly still background
+    remain, and orient pairs of photographs that have only them in common."""
+    min_photographs: int = 3
+    """Minimum photographs of a mark: in two, a far object may be still by chance."""
 
 
 def without_marks(
-    matches: Sequence[Matches], features: Sequence[Features], sizes: Sequence[tuple[int, int]]
-) -> tuple[list[Matches], int]:
+    matches: Sequence[FeatureMatches],
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    settings: MarkSettings = MarkSettings(),
+) -> tuple[list[FeatureMatches], int]:
     """The matches without those of marks, and the number of photographs with marks."""
-    still = [_still(m, features, sizes) for m in matches]
-    shown: dict[tuple, set[int]] = {}
+    still = [_find_still(m, features, sizes, settings) for m in matches]
+    images_of_cell: dict[Cell, set[int]] = {}
     for m, (rows, motion) in zip(matches, still):
         moved = int((motion > 1).sum())
-        little = int(((motion > 1) & (motion < SMALL_MOTION)).sum())
+        little = int(((motion > 1) & (motion < settings.small_motion)).sum())
         number = int(rows.sum())
-        if number and moved >= max(LEAST, number) and little <= CLEAR * number:
-            for cell in _cells(m, features, sizes, rows):
-                shown.setdefault(cell, set()).update(m.images)
-    marks = {cell for cell, images in shown.items() if len(images) >= PHOTOGRAPHS}
+        if (
+            number
+            and moved >= max(settings.min_moved, number)
+            and little <= settings.max_small_share * number
+        ):
+            for cell in _cells(m, features, sizes, rows, settings):
+                images_of_cell.setdefault(cell, set()).update(m.images)
+    marks = {
+        cell for cell, images in images_of_cell.items() if len(images) >= settings.min_photographs
+    }
     if not marks:
         return list(matches), 0
+    # a mark at the border of a cell falls into its neighbour in another photograph
     near = {(size, i + a, j + b) for size, i, j in marks for a in (-1, 0, 1) for b in (-1, 0, 1)}
-    kept, seen = [], set()
+    remaining, marked = [], set()
     for m, (rows, _) in zip(matches, still):
         drop = np.zeros(len(m.rows), bool)
-        drop[rows] = [cell in near for cell in _cells(m, features, sizes, rows)]
+        drop[rows] = [cell in near for cell in _cells(m, features, sizes, rows, settings)]
         if drop.any():
-            seen.update(m.images)
+            marked.update(m.images)
             m = m.take(~drop)
-        kept.append(m)
-    return kept, len(seen)
+        remaining.append(m)
+    return remaining, len(marked)
 
 
-def _still(m: Matches, features, sizes) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _find_still(
+    m: FeatureMatches,
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    settings: MarkSettings,
+) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Which matches are still, and the motion of all, relative to the limit."""
     i, j = m.images
     if sizes[i] != sizes[j] or not len(m.rows):
         return np.zeros(len(m.rows), bool), np.full(len(m.rows), np.inf)
     a, b = features[i].take(m.rows[:, 0]), features[j].take(m.rows[:, 1])
-    motion = np.linalg.norm(a.xy - b.xy, axis=1) / (LARGEST_MOTION * max(sizes[i]))
-    ratio, turn = FEATURE_TOLERANCES
-    same = np.abs(np.log(a.size / b.size)) < np.log(ratio)
-    same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < turn
+    motion = np.linalg.norm(a.xy - b.xy, axis=1) / (settings.max_motion * max(sizes[i]))
+    same = np.abs(np.log(a.size / b.size)) < np.log(settings.max_size_ratio)
+    # the difference of two directions, in (−π, π]
+    same &= np.abs(np.angle(np.exp(1j * (a.angle - b.angle)))) < settings.max_turn
     return same & (motion < 1), motion
 
 
-def _cells(m: Matches, features, sizes, rows) -> list[tuple]:
-    """Size of the photographs, column and row of the cells of matches."""
+def _cells(
+    m: FeatureMatches,
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    rows: Bool[np.ndarray, " n"],
+    settings: MarkSettings,
+) -> list[Cell]:
+    """The cells of some matches."""
     i = m.images[0]
-    side = SMALL_MOTION * LARGEST_MOTION * max(sizes[i])
-    at = np.floor(features[i].xy[m.rows[rows, 0]] / side).astype(int)
-    return [(sizes[i], *cell) for cell in at.tolist()]
+    side = settings.small_motion * settings.max_motion * max(sizes[i])
+    cells = np.floor(features[i].xy[m.rows[rows, 0]] / side).astype(int)
+    return [(sizes[i], column, row) for column, row in cells.tolist()]

@@ -11,23 +11,24 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
 from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
+from jaxbundle.tiepoints.matching import MatchingSettings
 
-LENGTH = 16
-ABANDONED_AFTER = 600.0
-"""Seconds after which no process writes a file any more."""
 RULES = "6"
-"""Version of features and matches: files of others are not used."""
+"""Version of features and matches: files of others are not used. To be raised with every change of
+the program, other than of settings, that changes either."""
 
 
 class Store:
-    """Files of features and matches in a folder; without a folder nothing is stored."""
+    """Files of features and matches in a folder; without a folder nothing is stored. `settings`:
+    all that features and matches depend on, beside the photographs."""
 
-    def __init__(self, folder: Path | None, settings: Detection):
-        self.folder, self.settings = folder, repr(settings)
+    def __init__(self, folder: Path | None, *settings: Detection | MatchingSettings):
+        self.folder, self.settings = folder, "\n".join(map(repr, settings))
         self.used: set[str] = set()
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
@@ -35,9 +36,10 @@ class Store:
     def name(self, *fingerprints: str) -> str:
         """The name of a file about these photographs."""
         text = "\n".join((RULES, self.settings, *fingerprints))
-        found = hashlib.blake2b(text.encode(), digest_size=LENGTH // 2).hexdigest()
-        self.used.add(found)
-        return found
+        # 64 bits: among 10⁶ files two have the same name with a probability of 3e-8
+        digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+        self.used.add(digest)
+        return digest
 
     def load_features(self, fingerprint: str) -> Features | None:
         """The stored features of a photograph, if any."""
@@ -64,7 +66,14 @@ class Store:
             return None
         return found["rows"], found["clarity"], found["single"]
 
-    def save_matches(self, one: str, other: str, rows, clarity, single) -> None:
+    def save_matches(
+        self,
+        one: str,
+        other: str,
+        rows: Int[np.ndarray, "n 2"],
+        clarity: Float[np.ndarray, " n"],
+        single: Bool[np.ndarray, " n"],
+    ) -> None:
         """Store the matches of two photographs."""
         self._save(self.name(one, other), rows=rows, clarity=clarity, single=single)
 
@@ -75,12 +84,13 @@ class Store:
                 if path.stem not in self.used:
                     path.unlink(missing_ok=True)
             for path in self.folder.glob("*.part*"):
-                # from a killed run, unless so new that another run may be writing it
+                # from a killed run, unless so new that another run may be writing it; a file of a
+                # few megabytes takes no ten minutes, even on a slow disk
                 with suppress(OSError):
-                    if time.time() - path.stat().st_mtime > ABANDONED_AFTER:
+                    if time.time() - path.stat().st_mtime > 600:
                         path.unlink()
 
-    def _load(self, name):
+    def _load(self, name: str) -> dict[str, np.ndarray] | None:
         if self.folder is None:
             return None
         try:
@@ -92,10 +102,11 @@ class Store:
         # NumPy gives the bytes of other members
         return arrays if all(isinstance(a, np.ndarray) for a in arrays.values()) else None
 
-    def _save(self, name, **arrays):
+    def _save(self, name: str, **arrays: np.ndarray) -> None:
         if self.folder is None:
             return
+        # renamed when it is complete, which is atomic; by process, as two may run in one folder
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
             with part.open("wb") as file:
-                np.savez(file, **arrays)
+                np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
             part.replace(self.folder / f"{name}.npz")

@@ -1,10 +1,11 @@
 """Tracks: one point in all its photographs, from matches of pairs.
 
-Matches are joined, the most distinct first (union-find); one that would put two points of a
+FeatureMatches are joined, the most distinct first (union-find); one that would put two points of a
 photograph into a track contradicts better ones and is left out. The kept tracks cover
 every photograph evenly, long ones first, and none next to another.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,16 +14,26 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.verification import Pair
 
-CELLS = 10
-"""Cells along the longer side of a photograph."""
-MERGING_DISTANCE = 0.0015
-"""Tracks nearer than this part of the longer side, in two photographs, are one point."""
+
+@dataclasses.dataclass(frozen=True)
+class TrackSettings:
+    """Settings of the choice of tracks."""
+
+    cells: int = 10
+    """Cells along the longer side of a photograph, each with its share of the points: with 1500
+    points in 3:2, 21 in each. Fewer: the points follow the texture; more: the quota of a cell
+    is a handful, and long tracks lose against even cover."""
+    merging_distance: float = 0.0015
+    """Tracks nearer than this part of the longer side, in two photographs, are one point: 4 pixels
+    of 3000. Larger: fewer points where there is much texture; smaller: points whose windows
+    nearly coincide, with correlated errors."""
 
 
 def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[list[tuple[int, int]]]:
     """Tracks as lists of (photograph, feature), two photographs at least."""
+    # every feature of all photographs has a number; `first` is that of the first of a photograph
     first = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
-    same = np.concatenate([_first_at_a_place(f.xy) + k for f, k in zip(features, first)] or [[]])
+    same = np.concatenate([_merge_directions(f.xy) + k for f, k in zip(features, first)] or [[]])
     rows = [first[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
     if not rows:
         return []
@@ -36,19 +47,23 @@ def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[lis
     return tracks
 
 
-def _first_at_a_place(xy):
+def _merge_directions(xy: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
     """For every feature the first one at its position: SIFT may give several directions."""
+    # to a hundredth of a pixel, since it interpolates the position for each of them
     _, first, back = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
     return first[back.ravel()]
 
 
-def _join(edges, image):
+def _join(
+    edges: Int[np.ndarray, "edges 2"], image: Int[np.ndarray, " nodes"]
+) -> list[Int[np.ndarray, " _"]]:
     """The groups of nodes joined by edges, none with two nodes of an image."""
     parent: dict[int, int] = {}
     group: dict[int, dict[int, int]] = {}
 
-    def root(node):
+    def root(node: int) -> int:
         while parent[node] != node:
+            # path halving (van Leeuwen and van der Weide 1977): nearly constant time a query
             parent[node] = parent[parent[node]]
             node = parent[node]
         return node
@@ -61,7 +76,7 @@ def _join(edges, image):
         if a == b or not group[a].keys().isdisjoint(group[b]):
             continue
         if len(group[a]) < len(group[b]):
-            a, b = b, a
+            a, b = b, a  # the smaller joins the larger: every node moves at most log₂ n times
         parent[b] = a
         group[a].update(group.pop(b))
     return [np.array(sorted(g.values())) for g in group.values() if len(g) > 1]
@@ -72,39 +87,47 @@ def choose_tracks(
     xy: Sequence[Float[np.ndarray, "_ 2"]],
     sizes: Sequence[tuple[int, int]],
     number: int,
+    settings: TrackSettings = TrackSettings(),
 ) -> Bool[np.ndarray, " tracks"]:
     """Which tracks to keep, for about `number` points in every photograph, evenly distributed.
 
     **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
-    cell, near, shape = _cells(xy, sizes)
+    cell, near, shape = _cells(xy, sizes, settings)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
     filled = [np.zeros(nx * ny, int) for nx, ny in shape]
     taken: list[set] = [set() for _ in xy]
-    kept = np.zeros(len(tracks), bool)
+    chosen = np.zeros(len(tracks), bool)
     for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
         track = tracks[k]
         wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
         double = sum(near[i][f] in taken[i] for i, f in track)
+        # a track that fills a quota in one photograph only adds no connection; one that lies on a
+        # chosen one in one photograph only is another point behind or in front of it
         if wanted < 2 or double >= 2:
             continue
-        kept[k] = True
+        chosen[k] = True
         for i, f in track:
             filled[i][cell[i][f]] += 1
             taken[i].add(near[i][f])
-    return kept
+    return chosen
 
 
-def _cells(xy, sizes):
+def _cells(
+    xy: Sequence[Float[np.ndarray, "_ 2"]],
+    sizes: Sequence[tuple[int, int]],
+    settings: TrackSettings,
+) -> tuple[list[Int[np.ndarray, " _"]], list[list[int]], list[tuple[int, int]]]:
     """For every feature its cell of the grid, and that of a fine grid; shape of the grids."""
     cell, near, shape = [], [], []
     for places, (columns, rows) in zip(xy, sizes):
-        side = max(columns, rows) / CELLS
+        side = max(columns, rows) / settings.cells
         nx, ny = (max(1, int(np.ceil(n / side))) for n in (columns, rows))
         column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
         cell.append(row * nx + column)
         shape.append((nx, ny))
-        fine = np.floor(places / (MERGING_DISTANCE * max(columns, rows))).astype(int)
+        fine = np.floor(places / (settings.merging_distance * max(columns, rows))).astype(int)
+        # row and column as one number: there are fewer than 100 000 columns
         near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
     return cell, near, shape
 

@@ -6,24 +6,23 @@ matches: the coplanarity misclosure (Sampson), and both rays in front. A pure ro
 homography, that explains nearly all of them as well is reported: two photographs from one position,
 or of a plane, which do not start a model.
 
-Unique matches come first (`Matches.single`): in a row of windows, matches of each window to its
-neighbour are consistent with a wrong orientation, shifted by their distance. All matches are used
-only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
-`SUFFICIENT_MATCHES` unique matches the others are left out: windows follow one another along an
-epipolar line.
+Unique matches come first (`FeatureMatches.single`): in a row of windows, matches of each window to
+its neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
+used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with sufficient
+unique matches the others are left out: windows follow one another along an epipolar line.
 
 Agreeing matches must be distributed over both photographs, not in one corner: a common sign
 in two scenes does not prove that they are the same.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.iterations.small import minimise
@@ -37,24 +36,50 @@ from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.system.compilation import quick_jit
 
-LEAST, PART = 16, 0.2
-"""Minimum number of agreeing matches, and their minimum share of all."""
-DISTINCT = 0.6
-"""Share of the most distinct matches used to find the orientation."""
-SUFFICIENT_MATCHES = 60
-"""Sufficient number of unique matches."""
-EXTENT = 0.05
-"""Minimum standard deviation of agreeing matches across their longest direction, relative to
-that of a photograph's features: not a spot, and not a line."""
 SLOTS, LANES = 192, 8
-ROUNDS, STEPS = 2, 8
-TURNS = 40
-"""Number of pairs of matches for trial rotations."""
-FIRST_TOLERANCE = 3.0
-"""The first choice of matches, in tolerances."""
-EXPLAINED_SHARE = 0.9
-"""Share of the matches that a simpler relation must explain."""
-KINDS = ("relative", "plane", "rotation")
+"""Padded numbers of matches of a pair, and of pairs in one run of a compiled program. 192 matches
+give a third of the σ that 20 give, which suffices to judge the others; time grows with them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VerificationSettings:
+    """Settings of the verification of pairs."""
+
+    tolerance: float = 0.0012
+    """Maximum Sampson distance of an agreeing match, relative to the longer side: 2 pixels of a
+    photograph reduced to 1800, several σ of a feature and some distortion that the first camera
+    lacks. Larger: more wrong matches near the epipolar lines agree; smaller: right ones near the
+    border, where distortion is largest, do not."""
+    min_matches: int = 16
+    """Minimum number of agreeing matches: a relative orientation has 5 unknowns, and of matches
+    with random errors some agree with the best of many trials."""
+    min_share: float = 0.2
+    """Minimum share of agreeing matches. Random matches agree with a share of about two
+    tolerances in the height of a photograph, below 1 %, but those of repeated structures along
+    epipolar lines with far more. Larger: pairs far apart, most of whose matches are wrong, are
+    lost."""
+    distinct_share: float = 0.6
+    """Share of the most distinct matches used to find the orientation: fewer of them are wrong, and
+    the number of trials that a RANSAC needs grows with the fifth power of 1/(share of right
+    ones). The least distinct ones are used later, if they agree."""
+    sufficient_matches: int = 60
+    """Number of unique matches with which the others are left out: enough for tracks across a
+    photograph. Larger: windows that repeat themselves take part more often; smaller: pairs with few
+    unique matches lose most of their connection."""
+    min_extent: float = 0.05
+    """Minimum standard deviation of agreeing matches across their longest direction, relative to
+    that of a photograph's features: not a spot, and not a line. An object in a tenth of a
+    photograph has 0.3."""
+    first_tolerance: float = 3.0
+    """The first choice of matches, in tolerances: an orientation from five matches predicts the
+    others worse than one refined with all of them."""
+    rotation_trials: int = 40
+    """Number of pairs of matches for trial rotations: with half of the matches right (fewer are
+    not accepted) all trials have a wrong match with a probability of 0.75⁴⁰ = 1e-5."""
+    explained_share: float = 0.9
+    """Share of the matches that a simpler relation must explain. Smaller: pairs with a short base
+    are taken for rotations, and a model does not start from them though it could; larger: ones
+    without a base start a model."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +87,7 @@ class Pair:
     """Two overlapping photographs: rows of matching features; M from the first camera to
     the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or a
     sufficient simpler relation: `"plane"`, `"rotation"` (b is then zero or without meaning);
-    `found`: matches before verification; `sure`: oriented by unique matches."""
+    `match_count`: before verification; `sure`: oriented by unique matches."""
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
@@ -71,14 +96,14 @@ class Pair:
     b: Float[np.ndarray, "3"]
     angle: float
     kind: str
-    found: int
+    match_count: int
     sure: bool = True
 
     def __len__(self) -> int:
         return len(self.matches)
 
 
-class Verified(NamedTuple):
+class VerifiedPair(NamedTuple):
     """The matches of a pair explained by one object; M, b, angle and kind as of `Pair`."""
 
     good: Bool[np.ndarray, " n"]
@@ -89,60 +114,95 @@ class Verified(NamedTuple):
     sure: bool
 
 
+Agreement = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
+"""Which matches of a pair agree with its relative orientation; M and b of it."""
+
+
 def verify_pairs(
     xy1: Sequence[Float[np.ndarray, "_ 2"]],
     xy2: Sequence[Float[np.ndarray, "_ 2"]],
     tolerance: Float[np.ndarray, " pairs"],
     single: Sequence[Bool[np.ndarray, " _"]] | None = None,
-) -> list[Verified | None]:
+    settings: VerificationSettings = VerificationSettings(),
+) -> list[VerifiedPair | None]:
     """The part of each pair explained by one object; None if too few matches agree.
 
     **Arguments:** matches, the most distinct first, as ideal image coordinates, c = 1; `tolerance`:
     of Sampson's distance, c = 1; `single`: which matches are unique; all, if not given.
     """
     single = [np.ones(len(xy), bool) for xy in xy1] if single is None else single
-    usable = [k for k, xy in enumerate(xy1) if len(xy) >= LEAST]
-    found: list = [None] * len(xy1)
+    least = settings.min_matches
+    usable = [k for k, xy in enumerate(xy1) if len(xy) >= least]
+    verified: list[VerifiedPair | None] = [None] * len(xy1)
     if not usable:
-        return found
-    sure = _find_agreeing({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
-    others = {
-        k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~single[k]).sum() >= LEAST
-    }
-    agreed = {**_find_agreeing(others, xy1, xy2, tolerance), **sure}
+        return verified
+    find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
+    sure = find({k: np.flatnonzero(single[k]) for k in usable})
+    agreed = find(
+        {k: np.arange(len(xy1[k])) for k in usable if k not in sure and (~single[k]).sum() >= least}
+    )
+    agreed |= sure
     for k in sure:
         good, M, b = agreed[k]
-        if (good & single[k]).sum() >= SUFFICIENT_MATCHES:
+        if (good & single[k]).sum() >= settings.sufficient_matches:
             agreed[k] = good & single[k], M, b
+    # without a base the coplanarity condition is empty, and the robust orientation may fail; a
+    # rotation alone has fewer unknowns and is sought for itself
     turned = {
         k: turn
         for k in usable
-        if k not in agreed and (turn := _by_rotation(xy1[k], xy2[k], tolerance[k])) is not None
+        if k not in agreed
+        and (turn := _find_rotation(xy1[k], xy2[k], tolerance[k], settings)) is not None
     }
     left = sorted(agreed)
-    kinds = _kinds(
-        [agreed[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left], tolerance[left]
+    kinds = _classify(
+        [agreed[k] for k in left],
+        [xy1[k] for k in left],
+        [xy2[k] for k in left],
+        tolerance[left],
+        settings.explained_share,
     )
     for k, (good, angle, kind) in zip(left, kinds):
         _, M, b = agreed[k]
-        found[k] = Verified(good, M, b, angle, kind, k in sure)
+        verified[k] = VerifiedPair(good, M, b, angle, kind, k in sure)
     for k, (good, M) in turned.items():
-        found[k] = Verified(good, M, np.zeros(3), 0.0, "rotation", True)
-    return found
+        verified[k] = VerifiedPair(good, M, np.zeros(3), 0.0, "rotation", True)
+    return verified
 
 
-def _find_agreeing(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
-    """The agreeing matches of pairs with the orientation from some of them (`rows`), M and b, if
-    enough of these agree. Otherwise only the most distinct ones are tried: for photographs far
-    apart most matches may be wrong."""
-    rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
-    found = _by_some(rows, _clear_rows, xy1, xy2, tolerance)
-    again = {k: r for k, r in rows.items() if k not in found and DISTINCT * len(r) > many.SLOTS}
-    return {**_by_some(again, lambda _: np.arange(many.SLOTS), xy1, xy2, tolerance), **found}
+def _find_agreeing(
+    rows: Mapping[int, Int[np.ndarray, " _"]],
+    xy1: Sequence[Float[np.ndarray, "_ 2"]],
+    xy2: Sequence[Float[np.ndarray, "_ 2"]],
+    tolerance: Float[np.ndarray, " pairs"],
+    settings: VerificationSettings,
+) -> dict[int, Agreement]:
+    """By pair, the matches that agree with the orientation from some of them (`rows`), if enough of
+    these agree. Otherwise only the most distinct ones are tried: for photographs far apart most
+    matches may be wrong."""
+    rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
+    # the most distinct ones, but all of a few
+    clear = lambda n: many.spread(max(int(settings.distinct_share * n), min(n, many.SLOTS)))
+    first = _orient_by_rows(rows, clear, xy1, xy2, tolerance, settings)
+    again = {
+        k: r
+        for k, r in rows.items()
+        if k not in first and settings.distinct_share * len(r) > many.SLOTS
+    }
+    most_distinct = lambda _: np.arange(many.SLOTS)
+    return {**_orient_by_rows(again, most_distinct, xy1, xy2, tolerance, settings), **first}
 
 
-def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
-    """As `_find_agreeing`, from the number of matches given by `clear`."""
+def _orient_by_rows(
+    rows: Mapping[int, Int[np.ndarray, " _"]],
+    clear: Callable[[int], Int[np.ndarray, " _"]],
+    xy1: Sequence[Float[np.ndarray, "_ 2"]],
+    xy2: Sequence[Float[np.ndarray, "_ 2"]],
+    tolerance: Float[np.ndarray, " pairs"],
+    settings: VerificationSettings,
+) -> dict[int, Agreement]:
+    """By pair, the matches that agree with the orientation from those that `clear` chooses of the
+    number of `rows`, if enough of `rows` do."""
     if not rows:
         return {}
     keys = np.array(list(rows))
@@ -150,24 +210,24 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
     M, b, part, _ = many.orient_pairs(
         [xy1[k][r] for k, r in zip(rows, few)],
         [xy2[k][r] for k, r in zip(rows, few)],
-        FIRST_TOLERANCE * tolerance[keys],
+        settings.first_tolerance * tolerance[keys],
     )
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
-    for limit in (FIRST_TOLERANCE, 1.0):
-        poses = _improve(poses, rows, xy1, xy2, tolerance, limit)
-    found = {}
+    # matches and orientation by turns, the second time with those of the final tolerance
+    for factor in (settings.first_tolerance, 1.0):
+        poses = _improve(poses, rows, xy1, xy2, factor * tolerance, settings.min_matches)
+    agreed = {}
     for k, (M, b) in poses.items():
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         use = rows[k][good[rows[k]]]
-        enough = len(use) >= max(LEAST, PART * len(rows[k]))
-        if enough and all(_is_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
-            found[k] = good, M, b
-    return found
-
-
-def _is_extended(some, every) -> bool:
-    """Whether some points extend over more than a spot or a line among all."""
-    return np.linalg.eigvalsh(np.cov(some.T))[0] > (EXTENT * every.std()) ** 2
+        enough = len(use) >= max(settings.min_matches, settings.min_share * len(rows[k]))
+        # the smaller eigenvalue of the covariance is the variance across a line
+        if enough and all(
+            np.linalg.eigvalsh(np.cov(xy[k][use].T))[0] > (settings.min_extent * xy[k].std()) ** 2
+            for xy in (xy1, xy2)
+        ):
+            agreed[k] = good, M, b
+    return agreed
 
 
 def prepare() -> None:
@@ -176,63 +236,81 @@ def prepare() -> None:
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
     weights = np.ones((LANES, SLOTS))
     many.run_in_lanes(_refine, LANES, M, b, xy, xy, weights)
-    many.run_in_lanes(_simpler, LANES, M, b, xy, xy, weights)
+    many.run_in_lanes(_simpler, LANES, M, xy, xy, weights)
 
 
-def _by_rotation(xy1, xy2, tolerance):
+def _find_rotation(
+    xy1: Float[np.ndarray, "n 2"],
+    xy2: Float[np.ndarray, "n 2"],
+    tolerance: float,
+    settings: VerificationSettings,
+) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "3 3"]] | None:
     """The matches explained by a rotation about the projection centre, and M, if they are most."""
     rays = [np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2)]
     one, two = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rays)
     rng, best = np.random.default_rng(0), None
-    most = max(LEAST, len(xy1) // 2) - 1
-    for _ in range(TURNS):
+    most = max(settings.min_matches, len(xy1) // 2) - 1
+    for _ in range(settings.rotation_trials):
         i, j = rng.choice(len(one), 2, replace=False)
         first, second = (_triad(a[i], a[j]) for a in (one, two))
         if first is None or second is None:
             continue
         M = second.T @ first
+        # twice the tolerance: Sampson's distance is 1/√2 of the distance from an epipolar line, and
+        # that is one of the two components of the distance of two rays
         good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
         if good.sum() > most:
             most, best = good.sum(), (good, M)
     return best
 
 
-def _triad(a, b):
+def _triad(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"] | None:
+    """Three orthogonal unit vectors from two rays (TRIAD; Black 1964); None if the angle between
+    them is below a milliradian, about that of their errors."""
     normal = np.cross(a, b)
     length = np.linalg.norm(normal)
     return None if length < 1e-3 else np.stack([a, normal / length, np.cross(a, normal / length)])
 
 
-def _clear_rows(number):
-    """The most distinct matches, all of a few."""
-    return many.spread(max(int(DISTINCT * number), min(number, many.SLOTS)))
+def _agree(
+    M: Float[np.ndarray, "3 3"],
+    b: Float[np.ndarray, "3"],
+    xy1: Float[np.ndarray, "n 2"],
+    xy2: Float[np.ndarray, "n 2"],
+    tolerance: float,
+) -> Bool[np.ndarray, " n"]:
+    """Which matches have a Sampson distance below the tolerance, and lie in front of both cameras.
 
-
-def _agree(M, b, xy1, xy2, tolerance):
-    e, front = _distances(M, b, xy1, xy2)
-    return (e < tolerance) & front
-
-
-def _distances(M, b, xy1, xy2):
-    """Sampson's distance of every match, and whether it is in front (numpy, any number)."""
+    In NumPy: the number of matches differs from pair to pair, and each would be a compilation."""
     a1, a2 = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
     back = a2 @ M
+    # e = |a₂ᵀ·l₂| / √(l₂ₓ² + l₂ᵧ² + l₁ₓ² + l₁ᵧ²) with the epipolar lines l₂ = M·(b × a₁) and
+    # l₁ = (Mᵀ·a₂) × b (Sampson 1982)
     line2, line1 = np.cross(b, a1) @ M.T, np.cross(back, b)
     square = (line2[:, :2] ** 2).sum(1) + (line1[:, :2] ** 2).sum(1)
     e = np.abs((a2 * line2).sum(1)) / np.sqrt(np.maximum(square, 1e-300))
+    # the signs of both depths s, s₁·a₁ − s₂·Mᵀ·a₂ = b, by normal equations whose determinant is > 0
     aa, cc, dot = (a1**2).sum(1), (back**2).sum(1), (a1 * back).sum(1)
     first, second = a1 @ b, back @ b
     front = (cc * first - dot * second > 0) & (dot * first - aa * second > 0)
-    return e, front
+    return (e < tolerance) & front
 
 
-def _improve(poses, of, xy1, xy2, tolerance, limit):
-    """The relative orientations refined by the matches (`of` these rows) within `limit`
-    tolerances."""
+def _improve(
+    poses: Mapping[int, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]],
+    candidates: Mapping[int, Int[np.ndarray, " _"]],
+    xy1: Sequence[Float[np.ndarray, "_ 2"]],
+    xy2: Sequence[Float[np.ndarray, "_ 2"]],
+    tolerance: Float[np.ndarray, " pairs"],
+    least: int,
+) -> dict[int, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
+    """M and b refined by those of the `candidates` (rows of matches) within the tolerance, of pairs
+    with at least `least` of them."""
     keys, rows = [], []
     for k, (M, b) in poses.items():
-        good = of[k][_agree(M, b, xy1[k][of[k]], xy2[k][of[k]], limit * tolerance[k])]
-        if len(good) >= LEAST:
+        chosen = candidates[k]
+        good = chosen[_agree(M, b, xy1[k][chosen], xy2[k][chosen], tolerance[k])]
+        if len(good) >= least:
             keys.append(k)
             rows.append(good[many.spread(len(good), SLOTS)])
     if not keys:
@@ -252,6 +330,7 @@ def turn_pairs(
     rows = [many.spread(len(pair), SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
+    # with a strong K1 rays of the border have no image: without weight
     weights *= np.isfinite(xy1 + xy2).all(-1)
     xy1, xy2 = np.nan_to_num(xy1), np.nan_to_num(xy2)
     start = [np.stack([getattr(pair, name) for pair in pairs]) for name in ("M", "b")]
@@ -260,52 +339,77 @@ def turn_pairs(
 
 def rotation_angle(M: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """The angle of rotations, radians."""
+    # sin ω from M − Mᵀ, cos ω from the trace: each alone loses half of the digits near 0 or π
     across = M - np.swapaxes(M, -1, -2)
     sine = np.sqrt((across**2).sum((-2, -1)) / 8)
     return np.arctan2(sine, (np.trace(M, axis1=-2, axis2=-1) - 1) / 2)
 
 
-def _used_slots(rows) -> Float[np.ndarray, "pairs slots"]:
+def _used_slots(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "pairs slots"]:
     """Weights of the matches of pairs: 1, and 0 in slots that they do not need."""
     return np.stack([(np.arange(SLOTS) < len(r)).astype(float) for r in rows])
 
 
-def _fill(a):
+def _fill(a: Float[np.ndarray, "n *shape"]) -> Float[np.ndarray, "slots *shape"]:
     return np.resize(a, (SLOTS, *a.shape[1:]))
 
 
 @quick_jit
 @jax.vmap
-def _refine(M, b, xy1, xy2, weights):
-    def misclosures(pair, xy1, xy2, root):
+def _refine(
+    M: Float[Array, "3 3"],
+    b: Float[Array, "3"],
+    xy1: Float[Array, "slots 2"],
+    xy2: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    def misclosures(
+        pair: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+        xy1: Float[Array, "slots 2"],
+        xy2: Float[Array, "slots 2"],
+        root: Float[Array, " slots"],
+    ) -> Float[Array, " slots"]:
         M, b = pair
         return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
-    (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, STEPS)
+    # five unknowns; eight steps, since from an orientation by five matches few are needed, and the
+    # choice of matches, not the last digit, limits the result
+    (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, 8)
     return M, b
 
 
-def _kinds(found, xy1, xy2, tolerance):
+def _classify(
+    agreed: Sequence[Agreement],
+    xy1: Sequence[Float[np.ndarray, "_ 2"]],
+    xy2: Sequence[Float[np.ndarray, "_ 2"]],
+    tolerance: Float[np.ndarray, " pairs"],
+    explained_share: float,
+) -> list[tuple[Bool[np.ndarray, " _"], float, str]]:
     """Matches, angle and kind of every pair."""
-    rows = [np.flatnonzero(good)[many.spread(int(good.sum()), SLOTS)] for good, *_ in found]
-    if not found:
+    rows = [np.flatnonzero(good)[many.spread(int(good.sum()), SLOTS)] for good, *_ in agreed]
+    if not agreed:
         return []
     filled = lambda xy: np.stack([_fill(a[r]) for a, r in zip(xy, rows)])
     weights = _used_slots(rows)
-    M, b = (np.stack([f[i] for f in found]) for i in (1, 2))
-    angle, turn, plane = many.run_in_lanes(_simpler, LANES, M, b, filled(xy1), filled(xy2), weights)
+    M = np.stack([M for _, M, _ in agreed])
+    angle, turn, plane = many.run_in_lanes(_simpler, LANES, M, filled(xy1), filled(xy2), weights)
     kinds = []
-    for k, (good, *_) in enumerate(found):
-        number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]
+    for k, (good, *_) in enumerate(agreed):
+        number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]  # as in `_find_rotation`
         by_rotation, by_plane = (float((e[k, :number] < near).mean()) for e in (turn, plane))
-        kind = "plane" if by_plane > EXPLAINED_SHARE else "relative"
-        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED_SHARE else kind))
+        kind = "plane" if by_plane > explained_share else "relative"
+        kinds.append((good, float(angle[k]), "rotation" if by_rotation > explained_share else kind))
     return kinds
 
 
 @quick_jit
 @jax.vmap
-def _simpler(M, b, xy1, xy2, weights):
+def _simpler(
+    M: Float[Array, "3 3"],
+    xy1: Float[Array, "slots 2"],
+    xy2: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+) -> tuple[Float[Array, ""], Float[Array, " slots"], Float[Array, " slots"]]:
     """Median angle of intersection; misclosures of a rotation and of a homography."""
     unit = lambda a: a / jnp.linalg.norm(a)
     rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))

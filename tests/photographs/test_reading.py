@@ -10,7 +10,7 @@ from PIL import Image
 
 from jaxbundle.errors import InputError
 from jaxbundle.photographs import photograph_size, read_exif, read_photograph
-from jaxbundle.photographs.exif import Place
+from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions, to_map, utm_system
 from jaxbundle.photographs.sensors import sensor_width
 
@@ -82,7 +82,7 @@ def test_exif(tmp_path):
     assert found.camera == "NIKON D800" and found.time.minute == 11
     f = pytest.approx(24 / 35.9 * 90)
     assert found.principal_distance()[::2] == (f, "focal length and sensor")
-    assert found.place == Place(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
+    assert found.place == GeographicPosition(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
 
 
 def test_resolution_in_the_focal_plane_is_that_of_the_photograph_as_it_was_taken(tmp_path):
@@ -119,12 +119,12 @@ def test_sensors_are_not_mistaken():
 
 def test_positions_in_a_map():
     assert utm_system(48.2, 16.4) == "EPSG:32633" and utm_system(-33.5, -70.7) == "EPSG:32719"
-    places = [Place(48.0 + 1e-3 * k, 16.0, 200.0 + k) for k in range(4)]
+    places = [GeographicPosition(48.0 + 1e-3 * k, 16.0, 200.0 + k) for k in range(4)]
     X, sigma, _, said, wide = map_positions([*places, None])
     # a thousandth of a degree of the meridian at 48° is 111.2 m, times the scale of UTM
     assert np.allclose(np.diff(X[:4, 1]), 111.2 * 0.9996, atol=0.15)
     assert np.isnan(X[4]).all() and np.allclose(sigma[0], [3, 3, 6]) and "EPSG:32633" in said
-    near = [Place(48.0 + 1e-6 * k, 16.0, 200.0) for k in range(4)]
+    near = [GeographicPosition(48.0 + 1e-6 * k, 16.0, 200.0) for k in range(4)]
     assert wide and not map_positions(near).define_frame
     moved, said = to_map(np.array([[16.0, 48.0, 200.0]]), "EPSG:4326", "gcp")
     assert np.allclose(moved, X[:1], atol=1e-3) and said == "EPSG:32633"

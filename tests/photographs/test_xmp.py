@@ -6,7 +6,7 @@ from PIL import Image
 
 from jaxbundle.network.build import make_network
 from jaxbundle.photographs import read_exif
-from jaxbundle.photographs.xmp import SIGMA_ATTITUDE, Attitude, Xmp, parse_xmp, rotation_of
+from jaxbundle.photographs.xmp import SIGMA_ATTITUDE, CameraAttitude, Xmp, parse_xmp, rotation_of
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 
 HEAD = '<?xpacket begin="" id="W5M0"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
@@ -27,10 +27,10 @@ PIX4D = (
 
 
 def test_tags_of_dji_and_pix4d(tmp_path):
-    assert parse_xmp(DJI) == Xmp(Attitude(-30, -89.9, 1.5, SIGMA_ATTITUDE), 0.014, 0.031)
-    assert parse_xmp(PIX4D.encode()) == Xmp(Attitude(90, -80, -2, 2.0), 1 / 40, None)
+    assert parse_xmp(DJI) == Xmp(CameraAttitude(-30, -89.9, 1.5, SIGMA_ATTITUDE), 0.014, 0.031)
+    assert parse_xmp(PIX4D.encode()) == Xmp(CameraAttitude(90, -80, -2, 2.0), 1 / 40, None)
     Image.new("L", (90, 60)).save(tmp_path / "a.jpg", xmp=DJI.encode())
-    assert read_exif(tmp_path / "a.jpg").attitude == Attitude(-30, -89.9, 1.5, SIGMA_ATTITUDE)
+    assert read_exif(tmp_path / "a.jpg").attitude == CameraAttitude(-30, -89.9, 1.5, SIGMA_ATTITUDE)
 
 
 @pytest.mark.parametrize("packet", [
@@ -45,21 +45,21 @@ def test_damaged_and_other_packets_say_nothing_of_the_attitude(packet):
 def test_rotation_of_an_attitude():
     """Rows of M: right, top and back of the camera in east, north, up."""
     east, north, up = np.eye(3)
-    down = rotation_of(Attitude(0, -90, 0))
+    down = rotation_of(CameraAttitude(0, -90, 0))
     np.testing.assert_allclose(down, [east, north, up], atol=1e-15)
-    np.testing.assert_allclose(rotation_of(Attitude(90, -90, 0)), [-north, east, up], atol=1e-15)
-    ahead = rotation_of(Attitude(0, 0, 0))
+    turned = rotation_of(CameraAttitude(90, -90, 0))
+    np.testing.assert_allclose(turned, [-north, east, up], atol=1e-15)
+    ahead = rotation_of(CameraAttitude(0, 0, 0))
     np.testing.assert_allclose(ahead, [east, up, -north], atol=1e-15)
-    lowered = rotation_of(Attitude(0, 0, 30))
+    lowered = rotation_of(CameraAttitude(0, 0, 30))
     assert lowered[0] @ up == pytest.approx(-0.5)  # the right side
     # Grid north lies east of true north where the meridian converges by a positive angle.
-    np.testing.assert_allclose(
-        rotation_of(Attitude(12, -70, 3), 2.0), rotation_of(Attitude(10, -70, 3)), atol=1e-15
-    )
+    true, grid = CameraAttitude(12, -70, 3), CameraAttitude(10, -70, 3)
+    np.testing.assert_allclose(rotation_of(true, 2.0), rotation_of(grid), atol=1e-15)
 
 
 def test_attitudes_take_part_where_they_agree():
-    measured = [Attitude(yaw, -90, 0, 2.0) for yaw in (0, 10, 20, 30)]
+    measured = [CameraAttitude(yaw, -90, 0, 2.0) for yaw in (0, 10, 20, 30)]
     attitudes = map_attitudes(measured, np.zeros(4))
     names = [f"{k}.jpg" for k in range(4)]
 

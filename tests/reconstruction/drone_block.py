@@ -10,9 +10,9 @@ from jaxbundle import Camera
 from jaxbundle.network.tables import Points
 from jaxbundle.planning.simulate import simulate_with_truth
 from jaxbundle.planning.stations import Stations
-from jaxbundle.reconstruction.adjusting import Weighted
-from jaxbundle.reconstruction.named import Named
-from jaxbundle.reconstruction.oriented_block import Given
+from jaxbundle.reconstruction.adjusting import WeightedAdjustment
+from jaxbundle.reconstruction.named import NamedMeasurements
+from jaxbundle.reconstruction.oriented_block import FrameData
 
 ORIGIN = np.array([235_000.0, 3_811_000.0, 250.0])
 OFFSET = np.array([1.5, -2.0, 31.0])
@@ -32,27 +32,27 @@ class Drone:
     satellite positions."""
 
     truth: np.ndarray
-    named: Named
+    named: NamedMeasurements
     network: jaxbundle.Network
     images: tuple[str, ...]
     positions: tuple[np.ndarray, np.ndarray]
     blocks: dict = dataclasses.field(default_factory=dict)
 
-    def given(self, X, sigma=np.nan, roles=None, positions=True, named=None) -> Given:
+    def given(self, X, sigma=np.nan, roles=None, positions=True, named=None) -> FrameData:
         """What a surveyor gives: control coordinates [9, 3] and their σ."""
         s = np.broadcast_to(np.asarray(sigma, float), (CONTROL, 3)).copy()
         points = Points(NAMES, roles or ("control",) * CONTROL, X, s)
-        return Given(points, named or self.named, self.images, "EPSG:32611",
+        return FrameData(points, named or self.named, self.images, "EPSG:32611",
                      self.positions if positions else None)  # fmt: skip
 
-    def block(self, positions=True) -> Weighted:
+    def block(self, positions=True) -> WeightedAdjustment:
         """The block adjusted without control, in the system of the positions or in its own; once
         for all tests."""
         if positions not in self.blocks:
             self.blocks[positions] = self._block(positions)
         return self.blocks[positions]
 
-    def _block(self, positions: bool) -> Weighted:
+    def _block(self, positions: bool) -> WeightedAdjustment:
         network = self.network
         if not positions:
             images, points = network.images, network.points
@@ -64,10 +64,10 @@ class Drone:
             )  # fmt: skip
         result = jaxbundle.adjust(network)
         assert result.converged
-        return Weighted(result, {}, len(network.observations))
+        return WeightedAdjustment(result, {}, len(network.observations))
 
 
-def swapped(named: Named, point: str, other: str) -> tuple[Named, int]:
+def swapped(named: NamedMeasurements, point: str, other: str) -> tuple[NamedMeasurements, int]:
     """Measurements in which one of a point has the place of another in the same photograph, and
     this row."""
     for k, (image, name) in enumerate(zip(named.image, named.name)):
@@ -95,7 +95,7 @@ def drone_block(seed: int) -> Drone:
     ids = [NAMES[int(id)] if int(id) < CONTROL else f"t{id}" for id in _numbers(network.points.id)]
     rays = network.observations
     named = np.flatnonzero(np.array([ids[p] in NAMES for p in rays.point]))
-    measured = Named(rays.image[named], tuple(ids[p] for p in rays.point[named]),
+    measured = NamedMeasurements(rays.image[named], tuple(ids[p] for p in rays.point[named]),
                      rays.xy[named].copy(), np.ones((len(named), 2)))  # fmt: skip
     manual = np.array([ids[p] in NAMES for p in rays.point])
     sigma = np.repeat(np.where(manual, 1.0, 0.3)[:, None], 2, 1)

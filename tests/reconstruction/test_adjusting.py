@@ -20,7 +20,7 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
     targets = grid_of_targets(4, 4, 0.5)
     network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
     attempts = []
-    unfinished = adjusting.Weighted(SimpleNamespace(converged=False), {}, 0)
+    unfinished = adjusting.WeightedAdjustment(SimpleNamespace(converged=False), {}, 0)
 
     def weight(given, *_):
         attempts.append(len(given.observations))
@@ -48,7 +48,7 @@ def test_points_of_three_rays_confirm_a_result_with_many_gross_errors(
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
     targets = grid_of_targets(4, 4, 0.5)
     network = simulate(ring_of_stations(4, 2.5, 6.0), targets, camera, noise=0.002)
-    result = lambda converged: adjusting.Weighted(
+    result = lambda converged: adjusting.WeightedAdjustment(
         SimpleNamespace(converged=converged, removed=range(removed), network=network), {}, 64
     )
     results = [result(True), result(confirmed)]
@@ -131,6 +131,6 @@ def test_points_of_two_rays_at_different_columns_do_not_distort_the_others(share
     for name, true in {"c": 24.0, "K1": 0.0, "x0": 0.0, "y0": 0.0}.items():
         assert abs(found[name]["value"] - true) < 3 * found[name]["sigma"]
     assert done.factors["all"] == pytest.approx(1, abs=0.1)
-    assert done.unused == (two.sum() if wrong.any() else 0)
+    assert done.unused_points == (two.sum() if wrong.any() else 0)
     # those at the neighbouring column agree only by chance
-    assert number - 2 * wrong.sum() <= done.agreeing <= number - wrong.sum()
+    assert number - 2 * wrong.sum() <= done.agreeing_rays <= number - wrong.sum()

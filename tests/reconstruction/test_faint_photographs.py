@@ -8,9 +8,11 @@ from rendered_photographs import CAMERA, scene, stations
 
 from jaxbundle.planning.render import Sensor, render
 from jaxbundle.tiepoints.features import Detection, find_features
+from jaxbundle.tiepoints.matching import MatchingSettings
+from jaxbundle.tiepoints.pairs import CandidateSettings
 from jaxbundle.tiepoints.search import match, verify
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.verification import rotation_angle
+from jaxbundle.tiepoints.verification import VerificationSettings, rotation_angle
 
 
 def faint(grey, seed, blur=1.6, contrast=0.2, noise=1.0):
@@ -28,8 +30,10 @@ def test_faint_photographs_are_oriented_relatively():
         for k, view in enumerate(views)
     ]
     nothing = lambda *_: None
-    found = match(features, list("abc"), "all", None, Store(None, Detection()), 1, nothing)
-    pairs = {p.images: p for p in verify([CAMERA], [0] * 3, features, found, nothing)}
+    store, settings = Store(None, Detection()), (MatchingSettings(), CandidateSettings())
+    found = match(features, list("abc"), "all", None, store, 1, nothing, *settings)
+    verified = verify([CAMERA], [0] * 3, features, found, nothing, VerificationSettings())
+    pairs = {p.images: p for p in verified}
     assert set(pairs) == set(combinations(range(3), 2))
     for (i, j), pair in pairs.items():
         true = views[j][1] @ views[i][1].T

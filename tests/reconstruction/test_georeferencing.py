@@ -18,7 +18,7 @@ from jaxbundle.photographs.exif import Exif
 from jaxbundle.reconstruction import georeferencing
 from jaxbundle.reconstruction.block import CameraPositions, describe_block
 from jaxbundle.reconstruction.georeferencing import georeference
-from jaxbundle.reconstruction.result import Part, Reconstruction
+from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 
 SIGMA = 0.5
 """Of handheld control, metres."""
@@ -167,7 +167,7 @@ def test_report_page_and_json_show_control_and_block(drone, spoilt, tmp_path):
     time = datetime.datetime(2026, 5, 4, 10, 30)
     exif = {id: Exif((2000, 1500), time=time) for id in drone.images}
     facts = describe_block(result, exif, "EPSG:32611")
-    part = Part("part 1", result, {}, {}, facts, table)
+    part = ReconstructedPart("part 1", result, {}, {}, facts, table)
     found = Reconstruction((part,), {}, ("a note",), (), {}, name="quarry")
     folder = tmp_path / "out"
     write_reconstruction(found, "", folder, True, False, False)

@@ -10,12 +10,12 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import Exif, StatedDistance
 from jaxbundle.reconstruction.aspect_ratio import release
 from jaxbundle.reconstruction.named import no_named_points
-from jaxbundle.reconstruction.network import Extra, observed_parameters, tie_network
+from jaxbundle.reconstruction.network import FurtherData, observed_parameters, tie_network
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.reconstruction.starting import _with_distances
-from jaxbundle.tiepoints import calibration
-from jaxbundle.tiepoints.interior import Start
-from jaxbundle.tiepoints.refinement import Measurements
+from jaxbundle.tiepoints import camera_starts
+from jaxbundle.tiepoints.coplanarity import CoplanarityResult
+from jaxbundle.tiepoints.track_measurement import Measurements
 
 SIZE = (3000, 2000)
 FILE = StatedDistance(2350.0, 117.5, "focal length and sensor")
@@ -34,7 +34,8 @@ def network(stated, aspect_sigma=2e-4, lens=(0, 1)):
     measured = Measurements(track, image, xy, np.full((n, 2), 0.1), np.zeros(n, int),
                             image == 0, np.zeros((n, 3), np.uint8))  # fmt: skip
     of = Cameras(cameras, (0, 0, 1, 1), stated, False, (), lens)
-    return tie_network(photographs, of, measured, Extra(no_named_points()), "part", aspect_sigma)
+    further = FurtherData(no_named_points())
+    return tie_network(photographs, of, measured, further, "part", aspect_sigma)
 
 
 def rows(network):
@@ -88,11 +89,12 @@ def test_a_start_from_matches_far_from_the_file_is_not_believed(
 ):
     camera = jaxbundle.Camera("cam", "opencv", {"fx": 2350.0, "fy": 2350.0, "k1": 0.0},
                               image_size=SIZE)  # fmt: skip
-    monkeypatch.setattr(calibration, "estimate_interior", lambda c, *_: Start(c, 5, 0.3))
+    result = lambda camera, *_: CoplanarityResult(camera, 5, 0.3)
+    monkeypatch.setattr(camera_starts, "estimate_interior", result)
     monkeypatch.setattr(
-        calibration, "close_rotations", lambda *_: np.array([np.log(from_matches), -0.2])
+        camera_starts, "close_rotations", lambda *_: np.array([np.log(from_matches), -0.2])
     )
-    (found,), (said,) = calibration.start_cameras([camera], [0], [0], [told], [], [])
+    (found,), (said,) = camera_starts.start_cameras([camera], [0], [0], [told], [], [])
     assert found.parameters["fx"] == found.parameters["fy"] == pytest.approx(used)
     assert f"principal distance {from_matches:.0f} px" in said
     if used != from_matches:

@@ -10,10 +10,10 @@ import pytest
 from jaxbundle import read_network
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import select_checks
-from jaxbundle.photographs.exif import Place
+from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
-from jaxbundle.reconstruction.named import Named, name_unused, read_distances
+from jaxbundle.reconstruction.named import NamedMeasurements, name_unused, read_distances
 from jaxbundle.reconstruction.satellite_positions import find_positions
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -33,7 +33,7 @@ def test_gcp_list_of_opendronemap(tmp_path):
         "544157.7 5320899.2 5.5 4193 1552 a.jpg\n"
     )))  # fmt: skip
     assert found.points.id == ("gcp1", "544157.7,5320899.2") and found.system == "EPSG:32633"
-    assert found.seen[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
+    assert found.sightings[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
     np.testing.assert_allclose(found.xy[1], [1022.5, 18])
     assert np.isnan(found.points.sigma).all()
 
@@ -55,7 +55,7 @@ def test_tables_with_and_without_measurements(tmp_path):
     np.testing.assert_allclose(found.points.sigma, [[0.01, 0.01, 0.02]])
     np.testing.assert_allclose(found.sigma, [0.5, 1.0])
     plain = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n"))
-    assert plain.points.id == ("45",) and plain.seen == ()
+    assert plain.points.id == ("45",) and plain.sightings == ()
 
 
 @pytest.mark.parametrize("text, said", [
@@ -71,7 +71,8 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
 
 
 def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
-    seen = Named(np.array([0, 1, 0]), ("45", "45", "51"), np.zeros((3, 2)), np.ones((3, 2)))
+    names = ("45", "45", "51")
+    seen = NamedMeasurements(np.array([0, 1, 0]), names, np.zeros((3, 2)), np.ones((3, 2)))
     bar = lambda a, b: {"from": a, "to": b, "value": 1.0, "sigma": 0.001}
     assert name_unused(seen, None, [], 3) == []
     with pytest.raises(InputError, match="no scale bar has both ends in two .*45 to 51"):
@@ -122,7 +123,9 @@ def test_check_points_of_a_project_are_control_points(command):
     assert chosen.has_role("check").sum() == points.has_role("control").sum() // 2
 
 
-PLACES = [Place(34.4064 + 2e-4 * k, -119.88 + 3e-4 * (k % 3), 100.0 + k) for k in range(6)]
+PLACES = [
+    GeographicPosition(34.4064 + 2e-4 * k, -119.88 + 3e-4 * (k % 3), 100.0 + k) for k in range(6)
+]
 
 
 def test_positions_in_the_system_of_control():

@@ -5,7 +5,7 @@ import pytest
 
 from jaxbundle.tiepoints.duplicates import find_duplicates
 from jaxbundle.tiepoints.features import Features
-from jaxbundle.tiepoints.matching import Matches
+from jaxbundle.tiepoints.matching import FeatureMatches
 
 SIZE = (3000, 2000)
 NUMBER = 400
@@ -19,7 +19,7 @@ def features(xy, size=12.0):
 
 def every_match(i, j, number):
     rows = np.stack([np.arange(number)] * 2, 1)
-    return Matches((i, j), rows, np.full(number, 0.5), np.ones(number, bool))
+    return FeatureMatches((i, j), rows, np.full(number, 0.5), np.ones(number, bool))
 
 
 @pytest.fixture

@@ -8,15 +8,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
-from jaxbundle.tiepoints.calibration import start_cameras
-from jaxbundle.tiepoints.closing import Minimum, close_rotations, count_independent, find_loops
+from jaxbundle.errors import InputError
+from jaxbundle.tiepoints.camera_starts import start_cameras
+from jaxbundle.tiepoints.closure import (
+    ClosureMinimum,
+    close_rotations,
+    count_independent,
+    find_loops,
+)
+from jaxbundle.tiepoints.coplanarity import estimate_interior
 from jaxbundle.tiepoints.features import Detection, Features, find_features
-from jaxbundle.tiepoints.interior import estimate_interior
 from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import Matches, distances_within, match_features
+from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
+from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair, rotation_angle, verify_pairs
 
@@ -84,7 +91,7 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
         rows = np.tile(np.arange(len(X))[:, None], 2)
         wrong = rng.random(len(X)) < (0.2 if (i, j) != (1, 4) else 1.0)
         rows[wrong, 1] = rng.permutation(rows[wrong, 1])
-        matches.append(Matches((i, j), rows, np.full(len(X), 0.5), np.ones(len(X), bool)))
+        matches.append(FeatureMatches((i, j), rows, np.full(len(X), 0.5), np.ones(len(X), bool)))
     told = {"fx": 1.2 * F, "fy": 1.2 * F, "cx": 599.5, "cy": 449.5, "k1": 0.0}
     camera = jaxbundle.Camera("c", "opencv", told, image_size=SIZE)
     (found,), notes = start_cameras([camera], [0] * 6, [0], [True], features, matches)
@@ -104,13 +111,14 @@ def test_rotations_close_with_the_right_principal_distance_and_distortion():
 def test_a_first_principal_distance_without_loops_is_passed_over(monkeypatch):
     """And one with few loops, which close by chance, is not taken for the best."""
     start = np.array([7.0, -0.1])
-    answers = {0.8: None, 1.0: Minimum(start + 0.01, 2.0, 30), 1.25: Minimum(start + 0.3, 0.6, 4)}
+    many, few = ClosureMinimum(start + 0.01, 2.0, 30), ClosureMinimum(start + 0.3, 0.6, 4)
+    answers = {0.8: None, 1.0: many, 1.25: few}
 
-    def search(oriented, first, middle):
+    def search(oriented, first, middle, settings):
         factor = min(answers, key=lambda f: abs(np.log(f) - first[0] + middle))
         return answers[factor]
 
-    monkeypatch.setattr("jaxbundle.tiepoints.closing._search", search)
+    monkeypatch.setattr("jaxbundle.tiepoints.closure._search", search)
     np.testing.assert_allclose(close_rotations(lambda x: None, start), start + 0.01)
     answers.update(dict.fromkeys(answers))
     np.testing.assert_array_equal(close_rotations(lambda x: None, start), start)
@@ -296,6 +304,13 @@ def test_matches_are_those_of_both_sides():
     assert np.all(np.diff(ratio) >= 0) and ratio.max() < 0.8
 
 
+def test_residuals_are_correlated_over_less_than_half_the_window():
+    """Over the whole window the sum of the gradients, and so the covariance, would vanish."""
+    TrackMatchingSettings(window=17, correlation_length=8)
+    with pytest.raises(InputError, match="expected .* less than half the window, 8.5, got 9"):
+        TrackMatchingSettings(window=17, correlation_length=9)
+
+
 def test_candidates():
     none = [features_at(np.zeros((3, 2)))] * 9
     assert len(candidate_pairs(none, "all")) == 36
@@ -330,7 +345,7 @@ def test_what_is_in_a_photograph_twice_matches_nothing():
     one = Features(once.xy, once.size, once.angle, noisy(once.descriptor.astype(int)))
     own = distances_within(twice), distances_within(one)
     assert np.all(own[0][np.r_[:20, 60:80]] < 0.3 * np.median(own[0][20:60]))
-    rows, _ = match_features(twice, one, own=own)
+    rows, _ = match_features(twice, one, within=own)
     assert set(range(20, 60)) <= set(rows[:, 0].tolist()) and len(rows) <= 42
 
 
@@ -344,7 +359,8 @@ def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
         for view in views
     ]  # fmt: skip
     rows = np.tile(np.arange(len(size))[:, None], 2)
-    pair = lambda i, j: Matches((i, j), rows, np.full(len(rows), 0.5), np.ones(len(rows), bool))
+    clarity, single = np.full(len(rows), 0.5), np.ones(len(rows), bool)
+    pair = lambda i, j: FeatureMatches((i, j), rows, clarity, single)
     matches = [pair(i, j) for i in range(5) for j in range(i)]
     found, marked = without_marks(matches, photographs, [SIZE] * 5)
     assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)

@@ -1,0 +1,220 @@
+"""Start values of the principal distance and K1 of unknown lenses, from matches.
+
+1. From the coplanarity condition of a few pairs (`coplanarity`).
+2. From these, those with which the rotations of many pairs close around three photographs
+   (`closure`), if enough pairs do.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.network.tables import Camera
+from jaxbundle.orientation import many
+from jaxbundle.tiepoints.closure import (
+    ClosureSettings,
+    Interior,
+    OrientedPairs,
+    close_rotations,
+    find_loops,
+)
+from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.matching import FeatureMatches
+from jaxbundle.tiepoints.search import ideal_features, present_size, verify
+from jaxbundle.tiepoints.verification import SLOTS, Pair, VerificationSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraStartSettings:
+    """Settings of the start values of unknown cameras."""
+
+    min_share: float = 0.6
+    """Pairs for the coplanarity condition: those with at least this part of the largest number of
+    matches, and others with fewer, which have longer bases."""
+    most_alike: int = 5
+    """Maximum number of the former among the `coplanarity.candidates`, a third of them: neighbours
+    have the most matches, but the narrowest angles."""
+    loop_pairs: int = 60
+    """Number of pairs for closing rotations: of 12 photographs with all pairs nearly all (66). The
+    time of a search grows with it, its σ falls with the root."""
+    believed_ratio: float = 1.5
+    """Ratio to the principal distance stated by the files above which that of the matches is not
+    believed: flat objects and nearly parallel views hardly determine it (half of it on a beach),
+    whereas files are wrong by that much only if a photograph was cropped."""
+    coplanarity: CoplanaritySettings = CoplanaritySettings()
+    closure: ClosureSettings = ClosureSettings()
+
+
+def start_cameras(
+    cameras: Sequence[Camera],
+    camera_of: Sequence[int],
+    lens: Sequence[int],
+    known: Sequence[bool],
+    features: Sequence[Features],
+    matches: Sequence[FeatureMatches],
+    settings: CameraStartSettings = CameraStartSettings(),
+    verification: VerificationSettings | None = None,
+) -> tuple[list[Camera], list[str]]:
+    """Cameras with the principal distance and K1 of consistent pairs of their lens, and notes.
+
+    **Arguments:** `camera_of`: the camera of every photograph; `lens` of every camera; `known`:
+    whether its principal distance is stated by the files: then it is also the result if that of the
+    matches contradicts it (`CameraStartSettings.believed_ratio`).
+    """
+    verification = verification or VerificationSettings()
+    better, notes, sufficient = list(cameras), [], verification.sufficient_matches
+    for number in dict.fromkeys(lens):
+        own = [c for c in range(len(cameras)) if lens[c] == number]
+        pairs = [
+            _prefer_single(m, sufficient)
+            for m in matches
+            if {camera_of[k] for k in m.images} <= {*own}
+        ]
+        first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
+        # relative to the image centres, which are taken as principal points
+        centred = lambda k: features[k].xy - (np.array(present_size(cameras[camera_of[k]])) - 1) / 2
+        xy = [
+            tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T))
+            for m in _choose_pairs(pairs, settings, sufficient)
+        ]
+        begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
+        start = estimate_interior(begin, xy, told, settings.coplanarity)
+        better = with_lens(better, own, start.camera)
+        if start.pairs:
+            prior = first.parameters["fx"] if told else start.camera.parameters["fx"]
+            chosen = _choose_loops(pairs, settings.loop_pairs, verification.min_matches)
+            search = np.log(prior), settings.closure, verification
+            better = _close(better, own, camera_of, features, chosen, *search)
+            p = better[own[0]].parameters
+            said = f"start values from matches: principal distance {p['fx']:.0f} px"
+            stated, ratio = first.parameters["fx"], settings.believed_ratio
+            if told and not 1 / ratio < p["fx"] / stated < ratio:
+                plain = dataclasses.replace(first, parameters={**first.parameters, "k1": 0.0})
+                better = with_lens(better, own, plain)
+                notes.append(
+                    f"camera {name}: {said}, but {stated:.0f} px by the files: that of "
+                    "the files is used"
+                )
+            else:
+                notes.append(f"camera {name}: {said}, k1 {p['k1']:.3f}")
+        elif not told:
+            notes.append(
+                f"camera {name}: the principal distance is a guess: no two of its "
+                "photographs agree on one"
+            )
+    return better, notes
+
+
+def with_lens(cameras: Sequence[Camera], own: Sequence[int], camera: Camera) -> list[Camera]:
+    """The cameras; those at positions `own` with the principal distance and K1 of `camera`."""
+    names = [name for name in ("fx", "fy", "k1") if name in camera.parameters]
+    same = {name: camera.parameters[name] for name in names}
+    with_same = lambda c: dataclasses.replace(c, parameters={**c.parameters, **same})
+    return [with_same(c) if k in own else c for k, c in enumerate(cameras)]
+
+
+def _close(
+    cameras: Sequence[Camera],
+    own: Sequence[int],
+    camera_of: Sequence[int],
+    features: Sequence[Features],
+    matches: Sequence[FeatureMatches],
+    middle: float,
+    settings: ClosureSettings,
+    verification: VerificationSettings,
+) -> list[Camera]:
+    """The cameras, those at positions `own` with the interior orientation with which rotations
+    close; `middle`: ln c before."""
+    lens = cameras[own[0]]
+
+    def with_interior(x: Interior) -> list[Camera]:
+        f = float(np.exp(x[0]))
+        changed = {**lens.parameters, "fx": f, "fy": f, "k1": float(x[1])}
+        return with_lens(cameras, own, dataclasses.replace(lens, parameters=changed))
+
+    def orient(x: Interior) -> OrientedPairs:
+        quiet = lambda *_: None
+        pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
+        # only the matches that refine a rotation in every evaluation of the search
+        pairs = [
+            dataclasses.replace(pair, matches=pair.matches[many.spread(len(pair), SLOTS)])
+            for pair in pairs
+            if pair.kind != "rotation"
+        ]
+        return OrientedPairs(pairs, _ideal_matches(pairs, own, camera_of, features, with_interior))
+
+    start = np.array([np.log(lens.parameters["fx"]), lens.parameters["k1"]])
+    return with_interior(close_rotations(orient, start, middle, settings))
+
+
+def _ideal_matches(
+    pairs: Sequence[Pair],
+    own: Sequence[int],
+    camera_of: Sequence[int],
+    features: Sequence[Features],
+    with_interior: Callable[[Interior], list[Camera]],
+) -> Callable[[Interior], list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]]:
+    """A function of ln c and K1: the coordinates, c = 1, of the matches of pairs."""
+    if not pairs:
+        return lambda _: []
+    sides = [(k, rows) for p in pairs for k, rows in zip(p.images, p.matches.T)]
+    uv = np.concatenate([features[k].xy[rows] for k, rows in sides])
+    camera = np.concatenate([np.full(len(rows), camera_of[k]) for k, rows in sides])
+    ends = np.cumsum([len(rows) for _, rows in sides])[:-1]
+
+    # one call for each camera instead of two for each pair
+    def ideal(x: Interior) -> list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]:
+        xy, cameras = np.empty_like(uv), with_interior(x)
+        for c in own:
+            xy[camera == c] = ideal_features(cameras[c], uv[camera == c])
+        each = np.split(xy, ends)
+        return list(zip(each[::2], each[1::2]))
+
+    return ideal
+
+
+def _prefer_single(matches: FeatureMatches, sufficient: int) -> FeatureMatches:
+    """The unique matches, if they are enough."""
+    use = matches.single
+    return matches.take(use) if use.sum() >= sufficient else matches
+
+
+def _choose_pairs(
+    pairs: Sequence[FeatureMatches], settings: CameraStartSettings, sufficient: int
+) -> list[FeatureMatches]:
+    """The pairs with the most matches, and others with enough, spread over their numbers."""
+    pairs = sorted(pairs, key=lambda m: -len(m.rows))
+    if not pairs:
+        return []
+    many_matches = settings.min_share * len(pairs[0].rows)
+    alike = [m for m in pairs if len(m.rows) >= many_matches][: settings.most_alike]
+    others = [m for m in pairs if sufficient <= len(m.rows) < many_matches]
+    number = settings.coplanarity.candidates - settings.most_alike
+    step = max(1, len(others) // number)
+    return alike + others[: number * step : step]
+
+
+def _choose_loops(
+    own: Sequence[FeatureMatches], most: int, min_matches: int
+) -> list[FeatureMatches]:
+    """The pairs of loops of three photographs, those whose weakest pair has the most matches, each
+    next to others."""
+    number = {m.images: len(m.rows) for m in own if len(m.rows) >= min_matches}
+    loops = find_loops(list(number))
+    weakest = np.array(list(number.values()), int)[loops].min(1)
+    loops = loops[np.argsort(-weakest, kind="stable")]
+    pairs = np.array(list(number)).reshape(-1, 2)
+    new, chosen = np.ones(len(loops), bool), np.zeros(len(pairs), bool)
+    # each loop next to chosen ones, so that they share pairs: k loops of k + 2 photographs with
+    # 2k + 1 pairs are independent, those apart need 3k pairs
+    while new.any() and chosen.sum() < most:
+        reached = np.any(np.isin(pairs, pairs[chosen]), axis=1) if chosen.any() else ~chosen
+        next_to = new & np.any(reached[loops], axis=1)
+        if not next_to.any():
+            break
+        first = np.argmax(next_to)
+        chosen[loops[first]], new[first] = True, False
+    return [m for m in own if m.images in set(map(tuple, pairs[chosen].tolist()))]

@@ -1,0 +1,399 @@
+"""Every measurement of a track by least squares matching, with individual covariances.
+
+One photograph of a track gives the window (the template), around the pixel nearest to its feature:
+the point is this pixel. The window is matched in the others (`measure.least_squares_matching`),
+starting from the similarity of the two features, on the level of the pyramid with equal scale. Half
+of the variance of a match is due to the noise of the window, which shifts all of its matches: the
+measurement in the template's photograph has the mean of these halves, every other one its own half.
+
+The prior σ of terms of second order is that of perspective and curved surfaces. Without them, the
+RMS of errors on hills was 2 σ at 400 × 300 pixels; neighbours within 40 pixels agreed.
+
+Unmatched measurements are at the position of their feature, with a σ that grows with its size.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.least_squares_matching import MatchingStatus, match_least_squares
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.system.programs import compile_once
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.tracks import flatten
+
+LANES = 128
+"""Matches in one run of the compiled program. The last run repeats a match to fill it: more lanes
+waste more, fewer call the program more often."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackMatchingSettings:
+    """Settings of the least squares matching of tracks."""
+
+    window: int = 17
+    """Side of the window, pixels, odd. Larger: smaller σ, by the root of the number of pixels, but
+    more surfaces that are no plane within it, and more occlusions; smaller: repeated texture is
+    mistaken, and more than the 8 unknowns take part of the noise."""
+    search_window: int = 41
+    """Side of the part of another photograph in which it is matched, pixels, odd. Half of it, 20,
+    holds half of the window, 8, turned by 45 degrees and larger by √2 (as between two levels), and
+    `max_shift`: 8 · √2 · √2 + 3 = 19."""
+    finest_size: float = 7.0
+    """Diameter, pixels, of features matched in the original; larger ones are matched on a coarser
+    level, with about this size: the window then holds the feature and its surroundings, of 2.4
+    times the diameter."""
+    levels: int = 6
+    """Maximum level of the pyramid: features of up to 2⁶ · 7 = 450 pixels."""
+    min_correlation: float = 0.75
+    """Minimum correlation ρ of a match: ρ² = 0.56 of the variance of the grey values is then
+    explained. Smaller: windows at an occlusion match; larger: those with noise or reflections do
+    not, and their features, some times less exact, take their place."""
+    max_shift: float = 3.0
+    """Maximum distance of a match from its feature, pixels of its level: 2.5 σ of the difference of
+    two features of 7 pixels (`feature_sigma`). Larger: matches with the next period of
+    a texture."""
+    max_sigma: float = 0.4
+    """Maximum σ of a match, pixels of its level: a half of that of a feature of 7 pixels
+    (`feature_sigma`), which is then taken."""
+    correlation_length: int = 7
+    """Pixels over which residuals within a window are correlated; less than half the window, since
+    Σ Jᵀv over all of it vanishes at the minimum, and with it the estimated covariance. On
+    photographs of objects 3 to 40 m away this covariance reduced errors above 4 σ from 3.4 to
+    0.9 %. Smaller: occlusions within a window are taken for noise; larger: fewer independent parts
+    of the window, and σ too small."""
+    min_sigma: float = 0.01
+    """Floor of σ, pixels of its level, added in quadrature: interpolation and sampling add as much.
+    By noise alone strong edges have σ of thousandths of a pixel, and would outweigh the others."""
+    second_order_sigma: float = 1.0
+    """σ of the terms of second order of a match, times the longer side of the photograph:
+    perspective and curvature of the surface bend a window by about (half its side)²/(principal
+    distance)."""
+    feature_sigma: float = 0.12
+    """σ of the position of a feature relative to its diameter. Only a start: the variance component
+    of this kind (`reconstruction.adjusting`) replaces it where there are 60 of them."""
+
+    def __post_init__(self):
+        if not 0 < self.correlation_length < self.window / 2:
+            raise InputError(
+                "correlation_length: expected a positive number less than half the window, "
+                f"{self.window / 2:g}, got {self.correlation_length}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurements:
+    """Measurements: track and photograph; `xy`, `sigma`: pixels; `level`: of the pyramid,
+    −1: the position of the feature; `is_template`: whether it gave the window; `colour`: RGB
+    there."""
+
+    track: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+    level: Int[np.ndarray, " n"]
+    is_template: Bool[np.ndarray, " n"]
+    colour: UInt8[np.ndarray, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def take(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Measurements":
+        """The chosen measurements."""
+        return Measurements(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _TrackRays:
+    """The features of all tracks, by measurement; `is_template`, `level` as of `Measurements`;
+    `template`: the measurement that gives the window of its track; `corner`: the first column and
+    row of its window or search window, and `start`: A, from pixels about the centre of the window
+    to those of the search window."""
+
+    track: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    size: Float[np.ndarray, " n"]
+    is_template: Bool[np.ndarray, " n"]
+    level: Int[np.ndarray, " n"]
+    template: Int[np.ndarray, " n"]
+    corner: Float[np.ndarray, "n 2"]
+    start: Float[np.ndarray, "n 2 3"]
+
+    @property
+    def scale(self) -> Float[np.ndarray, " n"]:
+        """Pixels of the original to one of its level."""
+        return 2.0**self.level
+
+
+@dataclasses.dataclass(frozen=True)
+class _TrackWindows:
+    """Windows by track; search windows, whether they are inside, and the colours of the points by
+    measurement; the longer sides of the photographs."""
+
+    windows: UInt8[np.ndarray, "tracks w w"]
+    pieces: UInt8[np.ndarray, "n p p"]
+    inside: Bool[np.ndarray, " n"]
+    colour: UInt8[np.ndarray, "n 3"]
+    longer: Float[np.ndarray, " photographs"]
+
+
+def measure_tracks(
+    tracks: Sequence[Sequence[tuple[int, int]]],
+    features: Sequence[Features],
+    read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    advance: Callable[[], object] = lambda: None,
+    settings: TrackMatchingSettings = TrackMatchingSettings(),
+) -> Measurements:
+    """Measure all points of every track; each photograph is read once.
+
+    **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
+    """
+    rays = _place_windows(tracks, features, settings)
+    cutouts = _cut_out(rays, len(features), read, advance, settings)
+    inside = cutouts.inside
+    # the window inside its own photograph, and a place for it in the other
+    others = np.flatnonzero(~rays.is_template & inside & inside[rays.template])
+    half = settings.window // 2
+    bend = settings.second_order_sigma * half**2 * rays.scale / cutouts.longer[rays.image]
+    matches = _match_in_chunks(
+        cutouts.windows[rays.track[others]],
+        cutouts.pieces,
+        others,
+        rays.start[others].astype(np.float32),
+        bend[others].astype(np.float32),
+        settings.correlation_length,
+    )
+    return _collect(rays, others, matches, cutouts.colour, settings)
+
+
+def prepare(settings: TrackMatchingSettings = TrackMatchingSettings()) -> None:
+    """Compile the matching, ahead of its data."""
+    window, side = settings.window, settings.search_window
+    pieces = np.random.default_rng(0).integers(0, 255, (LANES, side, side), np.uint8)
+    start = np.tile(np.array([[1, 0, side // 2], [0, 1, side // 2]], np.float32), (LANES, 1, 1))
+    windows, bend = pieces[:, :window, :window], np.ones(LANES, np.float32)
+    _match(windows, pieces, start, bend, settings.correlation_length)
+
+
+def _place_windows(
+    tracks: Sequence[Sequence[tuple[int, int]]],
+    features: Sequence[Features],
+    settings: TrackMatchingSettings,
+) -> _TrackRays:
+    """Where the windows of all tracks are cut out, and where they are expected in the others."""
+    track, image, feature = flatten(tracks)
+    n = len(track)
+    xy, size, angle = np.zeros((n, 2)), np.zeros(n), np.zeros(n)
+    for k, of_image in enumerate(features):
+        rows = image == k
+        xy[rows], size[rows] = of_image.xy[feature[rows]], of_image.size[feature[rows]]
+        angle[rows] = of_image.angle[feature[rows]]
+    is_template, level = _choose_templates(track, size, settings)
+    template = np.flatnonzero(is_template)[track]
+    scale = 2.0**level
+    centre = np.rint(xy / scale[:, None])
+    start = _predict_affine(xy, size, angle, scale, centre, template)
+    corner = np.rint(start[:, :, 2]) - settings.search_window // 2
+    corner[is_template] = centre[is_template] - settings.window // 2
+    start[:, :, 2] -= corner
+    return _TrackRays(track, image, xy, size, is_template, level, template, corner, start)
+
+
+def _choose_templates(
+    track: Int[np.ndarray, " n"], size: Float[np.ndarray, " n"], settings: TrackMatchingSettings
+) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """The measurement of a track that gives the window, and the levels.
+
+    The window is that of the feature of median size: the scales of the others differ from it least.
+    Its level is coarse enough that the smallest feature of the track is matched in the original."""
+    order = np.lexsort((size, track))
+    begin = np.searchsorted(track[order], np.arange(track.max(initial=-1) + 1))
+    length = np.bincount(track)
+    is_template = np.zeros(len(track), bool)
+    is_template[order[begin + length // 2]] = True
+    smallest = size[order[begin]]
+    of_window = size[is_template][np.argsort(track[is_template])]
+    coarse = np.maximum(np.log2(of_window / settings.finest_size), np.log2(of_window / smallest))
+    base = np.clip(np.rint(coarse), 0, settings.levels).astype(int)
+    level = np.rint(base[track] + np.log2(size / of_window[track]))
+    level = np.clip(level, 0, settings.levels).astype(int)
+    return is_template, np.where(is_template, base[track], level)
+
+
+def _predict_affine(
+    xy: Float[np.ndarray, "n 2"],
+    size: Float[np.ndarray, " n"],
+    angle: Float[np.ndarray, " n"],
+    scale: Float[np.ndarray, " n"],
+    centre: Float[np.ndarray, "n 2"],
+    template: Int[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 2 3"]:
+    """A of every measurement, from pixels about the centre of the window to those of its level: the
+    similarity between the feature and that of the template."""
+    w = template
+    turn = angle - angle[w]
+    grown = size / scale / (size[w] / scale[w])
+    c, s = grown * np.cos(turn), grown * np.sin(turn)
+    start = np.zeros((len(xy), 2, 3))
+    start[:, 0, 0], start[:, 0, 1], start[:, 1, 0], start[:, 1, 1] = c, -s, s, c
+    # the point is the centre pixel of the window, a fraction of a pixel from the feature
+    offset = centre[w] - xy[w] / scale[w, None]
+    start[:, :, 2] = xy / scale[:, None] + np.einsum("nij,nj->ni", start[:, :, :2], offset)
+    return start
+
+
+def _cut_out(
+    rays: _TrackRays,
+    photographs: int,
+    read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    advance: Callable[[], object],
+    settings: TrackMatchingSettings,
+) -> _TrackWindows:
+    """Windows and search windows of all photographs, each of which is in memory only once."""
+    cv2 = need_opencv()
+    n, is_template = len(rays.image), rays.is_template
+    window, side = settings.window, settings.search_window
+    # one pixel for interpolation and one for the last step, beyond the window that moves within
+    margins = {window: window // 2, side: side // 2 - window // 2 - 2}
+    windows = np.zeros((int(is_template.sum()), window, window), np.uint8)
+    row_of_window = np.cumsum(is_template) - 1
+    pieces = np.zeros((n, side, side), np.uint8)
+    inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
+    longer = np.ones(photographs)
+    order = np.argsort(rays.image, kind="stable")
+    for k in range(photographs):
+        rows = order[slice(*np.searchsorted(rays.image[order], [k, k + 1]))]
+        if len(rows):
+            picture = read(k)
+            longer[k] = max(picture.shape[:2])
+            last = np.array(picture.shape[1::-1]) - 1
+            u, v = np.clip(np.rint(rays.xy[rows]), 0, last).astype(int).T
+            colour[rows] = picture[v, u]
+            pyramid = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+            for step in range(rays.level[rows].max() + 1):
+                pyramid = cv2.pyrDown(pyramid) if step else pyramid
+                here = rows[rays.level[rows] == step]
+                first, other = here[is_template[here]], here[~is_template[here]]
+                windows[row_of_window[first]], inside[first] = _cut_squares(
+                    pyramid, rays.corner[first].astype(int), window, margins[window]
+                )
+                pieces[other], inside[other] = _cut_squares(
+                    pyramid, rays.corner[other].astype(int), side, margins[side]
+                )
+        advance()
+    return _TrackWindows(windows, pieces, inside, colour, longer)
+
+
+def _cut_squares(
+    picture: UInt8[np.ndarray, "rows columns"],
+    corner: Int[np.ndarray, "n 2"],
+    side: int,
+    margin: int,
+) -> tuple[UInt8[np.ndarray, "n side side"], Bool[np.ndarray, " n"]]:
+    """Squares of a photograph, and which of their centres are in it, `margin` from its edge; edge
+    pixels are repeated."""
+    rows, columns = picture.shape
+    offset = np.arange(side)
+    v = np.clip(corner[:, 1, None] + offset, 0, rows - 1)
+    u = np.clip(corner[:, 0, None] + offset, 0, columns - 1)
+    middle = corner + side // 2
+    inside = np.all((middle >= margin) & (middle < np.array([columns, rows]) - margin), axis=1)
+    return picture[v[:, :, None], u[:, None, :]], inside
+
+
+Matched = tuple[
+    Float[np.ndarray, "n 2 3"],
+    Float[np.ndarray, "n 2 2"],
+    Float[np.ndarray, " n"],
+    Int[np.ndarray, " n"],
+]
+"""A, covariance, correlation and status of matches."""
+
+
+@partial(compile_once, static=4)
+def _match(
+    windows: UInt8[Array, "lanes w w"],
+    pieces: UInt8[Array, "lanes p p"],
+    start: Float32[Array, "lanes 2 3"],
+    bend: Float32[Array, " lanes"],
+    correlation_length: int,
+) -> tuple[Array, Array, Array, Array]:
+    # float32 at twice the speed: grey values have 8 bits, positions are needed to 1e-3 pixels
+    match = lambda window, piece, start, bend: match_least_squares(
+        window.astype(np.float32),
+        piece.astype(np.float32),
+        start,
+        reach=correlation_length,
+        bend=bend,
+    )
+    matched = jax.vmap(match)(windows, pieces, start, bend)
+    return matched.affine, matched.covariance, matched.correlation, matched.status
+
+
+def _match_in_chunks(
+    windows: UInt8[np.ndarray, "m w w"],
+    pieces: UInt8[np.ndarray, "n p p"],
+    others: Int[np.ndarray, " m"],
+    start: Float32[np.ndarray, "m 2 3"],
+    bend: Float32[np.ndarray, " m"],
+    correlation_length: int,
+) -> Matched:
+    """The matches of the measurements `others`, whose search windows are among `pieces`."""
+    parts = []
+    for begin in range(0, len(others), LANES):
+        rows = np.minimum(np.arange(begin, begin + LANES), len(others) - 1)
+        parts.append(
+            _match(windows[rows], pieces[others[rows]], start[rows], bend[rows], correlation_length)
+        )
+    if not parts:
+        return np.zeros((0, 2, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, int)
+    affine, covariance, rho, status = (
+        np.concatenate([np.asarray(p) for p in column])[: len(others)] for column in zip(*parts)
+    )
+    return affine, covariance, rho, status
+
+
+def _collect(
+    rays: _TrackRays,
+    others: Int[np.ndarray, " m"],
+    matches: Matched,
+    colour: UInt8[np.ndarray, "n 3"],
+    settings: TrackMatchingSettings,
+) -> Measurements:
+    """Measurements by the good matches, and by the positions of features without one."""
+    affine, covariance, rho, status = matches
+    track, scale, corner = rays.track, rays.scale, rays.corner
+    place = affine[:, :, 2] + corner[others]
+    away = np.linalg.norm(place - rays.xy[others] / scale[others, None], axis=1)
+    # half of the variance of a match belongs to each of its two windows
+    sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
+    good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)
+    good &= (away < settings.max_shift) & (sigma < settings.max_sigma).all(1)
+    sigma = np.hypot(sigma, settings.min_sigma)
+    rows = others[good]
+    sigma_of = np.repeat(settings.feature_sigma * rays.size[:, None], 2, 1)
+    sigma_of[rows] = sigma[good] * scale[rows, None]
+    matched = np.zeros(len(track), bool)
+    matched[rows] = True
+    templates = np.flatnonzero(rays.is_template)
+    number = np.bincount(track[rows], minlength=len(templates))
+    # the point is the centre of the window, if that is matched, else the feature
+    from_window = (rays.start[:, :, 2] + corner) * scale[:, None]
+    xy = np.where(number[track, None] > 0, from_window, rays.xy)
+    xy[rows] = place[good] * scale[rows, None]
+    # the share of the window, from each of its matches, and their mean
+    sums = [np.bincount(track[rows], sigma[good, i] ** 2, len(templates)) for i in (0, 1)]
+    square = np.stack(sums, 1)
+    use = number > 0
+    w = templates[use]
+    xy[w] = (corner[w] + settings.window // 2) * scale[w, None]
+    sigma_of[w] = np.sqrt(square[use] / number[use, None]) * scale[w, None]
+    matched[w] = True
+    level = np.where(matched, rays.level, -1)
+    return Measurements(track, rays.image, xy, sigma_of, level, rays.is_template, colour)
