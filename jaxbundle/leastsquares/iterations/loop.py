@@ -11,10 +11,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxbundle.leastsquares.iterations.search import RegionState, gain_ratio
-from jaxbundle.leastsquares.iterations.stopping import LIMIT, Approach, Tolerance
+from jaxbundle.leastsquares.iterations.search import (
+    TRUST_REGION,
+    RegionState,
+    gain_ratio,
+)
+from jaxbundle.leastsquares.iterations.stopping import (
+    LIMIT,
+    STOPPING,
+    Approach,
+    StoppingSettings,
+    Tolerance,
+)
 
 
 class Loop(eqx.Module):
@@ -41,7 +51,8 @@ def iterate(
     start: PyTree,
     tolerance: Callable[[Any], Tolerance],
     max_steps: int | Int[Array, ""],
-    go: bool | Array = True,
+    go: bool | Bool[Array, ""] = True,
+    stopping: StoppingSettings = STOPPING,
 ) -> Loop:
     """Iterate from start values until a stopping criterion is met.
 
@@ -53,6 +64,7 @@ def iterate(
     - `retract(x, δ)`: applies the change.
     - `tolerance(equations)`: the tolerances.
     - `go`: if false, nothing is done.
+    - `stopping`: when the damping is dropped.
     """
 
     def body(loop: Loop) -> Loop:
@@ -110,8 +122,8 @@ def iterate(
             cost=zero,
             predicted=zero,
             step_size=jnp.full_like(zero, jnp.inf),
-            region=RegionState.begin(),
-            approach=Approach.begin(),
+            region=RegionState.begin(TRUST_REGION),
+            approach=Approach.begin(stopping),
             termination=jnp.asarray(LIMIT),
             steps=jnp.asarray(0),
         ),
