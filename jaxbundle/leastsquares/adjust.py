@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, c
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_factor
 from jaxbundle.leastsquares.quality.components import (
     Component,
-    Group,
+    VarianceGroup,
     estimate,
     variance_components,
 )
@@ -297,12 +297,12 @@ def adjust(
     return Result(found.problem, minima[-1], removed, suspects, factors)
 
 
-def kinds_as_groups(problem: Problem) -> list[Group]:
+def kinds_as_groups(problem: Problem) -> list[VarianceGroup]:
     """Every kind of observations is a separate group."""
     sets: dict[str, list] = {}
     for given in problem.observations:
         sets.setdefault(given.kind.name, []).append((given.name, np.s_[:]))
-    return [Group(name, parts) for name, parts in sets.items()]
+    return [VarianceGroup(name, parts) for name, parts in sets.items()]
 
 
 def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observations]) -> str | None:

@@ -4,11 +4,12 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.geometry import transform_point
-from jaxbundle.leastsquares.datum.motions import Together
-from jaxbundle.leastsquares.spaces import tangent_basis
+from jaxbundle.leastsquares.datum.motions import JointMotion
+from jaxbundle.leastsquares.spaces import Change, tangent_basis
+from jaxbundle.types import AnyArray, Scalar
 
 LARGEST_DISTANCE = 1e8
 """Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
@@ -32,24 +33,30 @@ class AnyDistance:
 
     width = 3
 
-    def prepare(self, value):
+    def prepare(
+        self, value: Float[Array, " 4"]
+    ) -> tuple[Change, tuple[Change, ...], Float[Array, ""]]:
         A, c = _frame(value)
         return tuple(value[:3]), tuple(map(tuple, A)), c
 
-    def move(self, block, change):
+    def move(self, block: tuple[Change, tuple[Change, ...], Scalar], change: Change) -> Change:
         X, A, c = block
         if not change:
             return X
         scale = 1 / (1 + c * change[2])
         return tuple((x + sum(a * d for a, d in zip(row, change))) * scale for x, row in zip(X, A))
 
-    def retract(self, value, change):
+    def retract(
+        self, value: Float[Array, " 4"], change: Float[AnyArray, " 3"]
+    ) -> Float[Array, " 4"]:
         A, c = _frame(value)
         moved, s = value[:3] + A @ change, value[3]
         least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, LARGEST_DISTANCE * s, 1.0), 0.0)
         return value.at[:3].set(moved / jnp.maximum(1 + c * change[2], least))
 
-    def difference(self, value, origin):
+    def difference(
+        self, value: Float[Array, " 4"], origin: Float[Array, " 4"]
+    ) -> Float[Array, " 3"]:
         A, c = _frame(origin)
         u, X = origin[:3] / length(origin[:3]), value[:3]
         along = (length(origin[:3]) - u @ X) / jnp.where(c > 0, origin[3] + c * (u @ X), 1.0)
@@ -57,39 +64,45 @@ class AnyDistance:
         across = A.T @ shift / (A * A).sum(0)
         return jnp.where(c > 0, across.at[2].set(along), X - origin[:3])
 
-    def hold(self, value, given, free):
+    def hold(
+        self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " 3"]
+    ) -> Float[Array, " 4"]:
         held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
         return jnp.where(free.min() > 0, value, held)
 
-    def chart(self, value):
+    def chart(self, value: Float[Array, " 4"]) -> None:
         return None
 
 
-def derivative(value):
+def derivative(value: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     """∂X/∂δ [3, 3]."""
     A, c = _frame(value)
     return A.at[:, 2].add(-c * value[:3])
 
 
-def is_at_infinity(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
+def is_at_infinity(
+    X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
     """Which points at any distance are at infinity."""
     return (np.linalg.norm(X, axis=1) > INFINITY_FROM * LARGEST_DISTANCE * s) & (s > 0)
 
 
-def shares(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
+def shares(
+    X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """For points at any distance, the change of direction (radians) by a unit change across the
     ray, and the change of 1/|X| by a unit change along it."""
     square = (X**2).sum(1)
     return np.sqrt(1 + s**2 / square), s / square + 1 / s
 
 
-def length(X):
+def length(X: Float[Array, " 3"]) -> Float[Array, ""]:
     """|X|, 1 where it is 0."""
     square = X @ X
     return jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
-def _frame(value):
+def _frame(value: Float[Array, " 4"]) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
     """A [3, 3] and |X|/s; the unit matrix and 0 for points that move by coordinates."""
     X, s = value[:3], value[3]
     r = length(X)
@@ -99,7 +112,7 @@ def _frame(value):
     return jnp.where(far, A, jnp.eye(3)), jnp.where(far, r / jnp.where(far, s, 1.0), 0.0)
 
 
-def _transform(motion, value):
+def _transform(motion: Float[Array, " 7"], value: Float[Array, " 4"]) -> Float[Array, " 4"]:
     """A point that moves with space; at infinity only its direction rotates."""
     moved = transform_point(motion, value[:3])
     turned = moved - transform_point(motion, jnp.zeros(3))
@@ -108,4 +121,4 @@ def _transform(motion, value):
     return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
 
 
-move_at_any_distance = Together(_transform, _transform, transform_point, 3)
+move_at_any_distance = JointMotion(_transform, _transform, transform_point, 3)

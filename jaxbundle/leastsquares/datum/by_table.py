@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxbundle.leastsquares.datum import conditions as datum
-from jaxbundle.leastsquares.datum.motions import Together, move_at_once
+from jaxbundle.leastsquares.datum.motions import JointMotion, move_at_once
 from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
@@ -84,7 +84,7 @@ def _move_tables(declared, free, motion, values):
     moved = dict(values)
     for name, act in present(declared.motions).actions:
         by = motion
-        if isinstance(act, Together):
+        if isinstance(act, JointMotion):
             act, by = act.move, _move_at_once(act.transform, motion, act.size)
         of_rows = partial(_move, declared.spaces[name], act, by)
         moved[name] = _of_rows(of_rows, values[name], free[name])

@@ -54,7 +54,7 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Together:
+class JointMotion:
     """`move(motion, value)` of motions whose shift follows rotation and scale, for simultaneous
     motions; `near`: the same to first order, for the directions of the motions;
     `transform(motion, place)` for the shifts, which are the first `size` numbers."""
@@ -87,10 +87,10 @@ def _transform_in_plane(motion, value):
     return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
 
 
-_move_point = Together(transform_point, _displace_point, transform_point, 3)
-move_pose = Together(_transform_pose, _displace_pose, transform_point, 3)
+_move_point = JointMotion(transform_point, _displace_point, transform_point, 3)
+move_pose = JointMotion(_transform_pose, _displace_pose, transform_point, 3)
 """A pose, or a frame, that moves with space."""
-_move_in_plane = Together(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
+_move_in_plane = JointMotion(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
 
 
 def move_at_once(transform, motion, size: int):

@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.equations.normal import (
     total,
 )
 from jaxbundle.leastsquares.equations.reduced import DenseFactor, Reduced, factorise_dense
-from jaxbundle.leastsquares.indexing.plan import Pairs, Plan
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
 from jaxbundle.leastsquares.indexing.rows import look_up
 from jaxbundle.types import present
 
@@ -48,7 +48,7 @@ LIFT = 1e-10
 """Added to unsolvable normal equations, relative to their diagonal."""
 
 
-class Factor(eqx.Module):
+class NormalFactor(eqx.Module):
     """Factorised N, for solving and for blocks of its inverse. `reduced`: the factor of S scaled by
     `scale`."""
 
@@ -83,7 +83,7 @@ def lift(normal: Normal) -> Normal:
 
 def factorise(
     normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = FULL_PRECISION
-) -> Factor:
+) -> NormalFactor:
     """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
     solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates
     the two."""
@@ -95,7 +95,7 @@ def factorise(
         factor = (factorise_band if plan.reduction == "banded" else factorise_dense)(plan, S)
     sound = jnp.all(factor.pivots**2 > PIVOT)
     scale = {g: jnp.where(sound, s, jnp.nan) for g, s in scale.items()}
-    return Factor(plan, factor, scale, lower_inverse, Z)
+    return NormalFactor(plan, factor, scale, lower_inverse, Z)
 
 
 def reduced_system(normal: Normal, regular: Bool[Array, ""] | bool = True):
@@ -142,7 +142,7 @@ def eliminate(normal: Normal):
     return Reduced(own, off), L, Z
 
 
-def solve(factor: Factor, right: Tangent) -> Tangent:
+def solve(factor: NormalFactor, right: Tangent) -> Tangent:
     """N⁻¹·b for one right-hand side, linear and transposable in b."""
     plan, e, Z = factor.plan, factor.plan.eliminated, factor.Z
     kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
@@ -159,7 +159,7 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
     return x
 
 
-def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
+def sum_pairs(pairs: IncidencePairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
     """Σ aᵀb over the pairs of every block: one small matrix product of depth (length × w) per
     chunk, at most a quarter of the time of scattered outer products."""
     a, b = (x.reshape(-1, *x.shape[2:]) for x in (a, b))
@@ -178,7 +178,7 @@ def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
     return sum_over_pairs(pairs, add, jnp.zeros((blocks, m, n)))
 
 
-def sum_over_pairs(pairs: Pairs, add, sums):
+def sum_over_pairs(pairs: IncidencePairs, add, sums):
     """`add(sums, first, second, block)` for all chunks of pairs, some at a time."""
     for chunks in zip(pairs.first, pairs.second, pairs.block):
         number, length = chunks[0].shape

@@ -16,8 +16,8 @@ from jaxbundle.leastsquares.equations.linearise import columns_of, widths_of
 from jaxbundle.leastsquares.equations.normal import Sums
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
     Declared,
-    Laid,
     Residual,
     Values,
     fill_places,
@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.types import present
 
 
-def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
+def exact_equations(declared: Declared, plan: Plan, values: Values, laid: ChunkedData):
     """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`."""
     plan, laid = fill_places(plan, laid)
     prepared, sums = prepare(declared, values), Sums(plan)
@@ -39,7 +39,7 @@ def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
     return sums.total(declared, values)
 
 
-def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
+def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: ChunkedData):
     """½|v|² of every observation of a part, its gradient and Hessian by all directions of its
     slots, with a column of zeros at the end."""
     part = plan.parts[number]

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.leastsquares.indexing.plan import Part, Plan, Touch
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan, TouchedRows
 from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
     Declared,
-    Laid,
     Residual,
     diagonal_of,
     map_blocks,
@@ -29,7 +29,7 @@ ROWS_AT_ONCE = 1 << 16
 """Observations differentiated together, if there are many."""
 
 
-def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
+def widths_of(declared: Declared, plan: Plan, part: ObservationPart) -> tuple[int, ...]:
     """The directions in which every slot of a part is differentiated."""
     of = declared.kinds[part.set_name].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
@@ -42,7 +42,7 @@ def columns_of(widths, slots, start: int, stop: int) -> list[tuple[int, int] | N
     return [place.get(c) for c in range(start, stop)]
 
 
-def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
+def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: ChunkedData):
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
     each, and of its eliminated rows (None without). Columns of held unknowns are zero."""
     part = plan.parts[number]
@@ -72,7 +72,7 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     return jnp.stack(r, -1), tuple(touches), E
 
 
-def zero_held_columns(plan: Plan, touch: Touch, J):
+def zero_held_columns(plan: Plan, touch: TouchedRows, J):
     """The block of a touch with zeros in the columns of held unknowns."""
     group = plan.groups[touch.group]
     if group.all_free:
@@ -80,13 +80,13 @@ def zero_held_columns(plan: Plan, touch: Touch, J):
     return J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
 
 
-def zero_held_columns_of_eliminated(plan: Plan, part: Part, E):
+def zero_held_columns_of_eliminated(plan: Plan, part: ObservationPart, E):
     """The block of the eliminated rows of a part with zeros in the columns of held unknowns."""
     group = plan.groups[present(plan.eliminated)]
     return E if group.all_free else E * group.free[part.eliminated][:, :, None, :]
 
 
-def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
+def differentiate_rows(function, widths, part: ObservationPart, blocks, measured, weight):
     """Residuals [chunks, length, r] of `function(blocks, measured, weight, changes)` of every
     observation, and their derivatives by the changes of every slot [chunks, length, r, width]."""
     rows = _Rows(function, widths, True)
@@ -99,7 +99,7 @@ def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
 
 
 def differentiate_chunks(
-    declared: Declared, plan: Plan, number: int, prepared, laid: Laid, of_chunk
+    declared: Declared, plan: Plan, number: int, prepared, laid: ChunkedData, of_chunk
 ):
     """`of_chunk(part, r, touches, E)` of every chunk of a part, [length, …] each, some chunks at a
     time, so that derivatives of all of it (2 000 000 rows) are never in memory at once. The
@@ -114,7 +114,7 @@ def differentiate_chunks(
     def of(given):
         part, measured, weight = jax.tree.map(lambda x: x[None], given)
         one = dataclasses.replace(plan, parts=(part,))
-        found = differentiate(declared, one, 0, prepared, Laid((measured,), (weight,)))
+        found = differentiate(declared, one, 0, prepared, ChunkedData((measured,), (weight,)))
         return of_chunk(given[0], *jax.tree.map(lambda x: x[0], found))
 
     given = part, laid.measured[number], laid.weight[number]

@@ -25,8 +25,8 @@ from jaxbundle.leastsquares.equations.linearise import (
     zero_held_columns,
     zero_held_columns_of_eliminated,
 )
-from jaxbundle.leastsquares.indexing.plan import Part, Plan
-from jaxbundle.leastsquares.indexing.rows import Declared, Laid, look_up, map_blocks, whiten
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
+from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, look_up, map_blocks, whiten
 from jaxbundle.leastsquares.spaces import Space, Vector
 
 
@@ -43,7 +43,7 @@ class LocalJacobian:
     columns: Int[Array, "chunks length m"]
 
 
-def local_touch(declared: Declared, part: Part) -> int | None:
+def local_touch(declared: Declared, part: ObservationPart) -> int | None:
     """The touch of a part that uses few of many columns; None if there is none."""
     kind = declared.kinds[part.set_name]
     if kind.local is None or not part.large:
@@ -56,7 +56,7 @@ def local_touch(declared: Declared, part: Part) -> int | None:
 
 
 def differentiate_locally(
-    declared: Declared, plan: Plan, number: int, touch: int, prepared, laid: Laid
+    declared: Declared, plan: Plan, number: int, touch: int, prepared, laid: ChunkedData
 ) -> LocalJacobian:
     """As `differentiate`, for a part that has such a touch."""
     part = plan.parts[number]

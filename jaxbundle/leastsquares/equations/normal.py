@@ -27,8 +27,8 @@ from jaxbundle.leastsquares.equations.local import (
     products_of,
     spread,
 )
-from jaxbundle.leastsquares.indexing.plan import Key, Part, Plan
-from jaxbundle.leastsquares.indexing.rows import Declared, Laid, Values, prepare
+from jaxbundle.leastsquares.indexing.plan import Key, ObservationPart, Plan
+from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, Values, prepare
 from jaxbundle.types import AnyArray, present
 
 Tangent = dict[str, Float[Array, "rows width"]]
@@ -158,7 +158,7 @@ def _tall(blocks):
 
 @partial(jax.jit, static_argnums=0, inline=True)
 def normal_equations(
-    declared: Declared, plan: Plan, values: Values, laid: Laid
+    declared: Declared, plan: Plan, values: Values, laid: ChunkedData
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
     """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J).
 
@@ -176,7 +176,7 @@ def normal_equations(
     return sums.total(declared, values)
 
 
-def _products_of(part: Part, r, touches, E):
+def _products_of(part: ObservationPart, r, touches, E):
     """The Gauss–Newton contribution of a part, see `Sums.add_part`: products of the blocks of J."""
     tall = [J.reshape(J.shape[0], -1, J.shape[-1]) for J in touches]
     right, eliminated, W = r.reshape(r.shape[0], -1), None, []
@@ -203,7 +203,7 @@ class Sums:
         self.W = {}
         self.cost = jnp.zeros(())
 
-    def add_part(self, part: Part, cost, own, gradient, couples, eliminated, W):
+    def add_part(self, part: ObservationPart, cost, own, gradient, couples, eliminated, W):
         """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
         `couples` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside the block
         (None without), and `W` [places, w, v] of each of the touches."""
@@ -222,7 +222,7 @@ class Sums:
         for touch, N in zip(part.touches, W):
             self._add_incidences(touch, N)
 
-    def add_local(self, part: Part, found: LocalJacobian):
+    def add_local(self, part: ObservationPart, found: LocalJacobian):
         """What a part with local columns adds (`local.py`)."""
         t, J, at = found.touch, found.touches[found.touch], found.columns
         touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width

@@ -7,17 +7,13 @@ from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.indexing.indices import as_column, as_index
-from jaxbundle.leastsquares.indexing.plan import Group, Member
+from jaxbundle.leastsquares.indexing.plan import Member, UnknownGroup
+from jaxbundle.leastsquares.indexing.settings import PlanningSettings
 from jaxbundle.types import present
-
-MASKED = 100_000
-"""From this number of eliminated rows, whether all of them are free is compiled in. With fewer rows
-some may be held by the same program, as in data snooping: a mask costs little, compiling much.
-"""
 
 
 @dataclasses.dataclass
@@ -28,14 +24,14 @@ class Choices:
     before: dict[Hashable, Any]
     made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
-    def __call__(self, *key, found) -> Any:
+    def __call__(self, *key: Hashable, found: Any) -> Any:
         """The given choice, or an earlier one."""
         self.made[key] = self.before.get(key, found)
         return self.made[key]
 
 
 @dataclasses.dataclass
-class Share:
+class ObservationSubset:
     """The observations that make a part; `slot`: that of the eliminated row."""
 
     set_name: str
@@ -63,10 +59,11 @@ class Grouping:
         observations: Sequence[Observations],
         eliminate: str | None,
         choose: Choices,
+        settings: PlanningSettings,
     ):
         self.tables = {t.name: t for t in tables}
         self.observations = {given.name: given for given in observations}
-        self.eliminate, self.choose = eliminate, choose
+        self.eliminate, self.choose, self.settings = eliminate, choose, settings
         self.moving = choose("moving", found=[t.name for t in tables if t.free.any()])
         self.stays = self._rows_that_stay()
         self.shares = self._share_observations()
@@ -74,7 +71,7 @@ class Grouping:
 
     # ------------------------------------------------------------------ what is eliminated
 
-    def _rows_that_stay(self):
+    def _rows_that_stay(self) -> Bool[np.ndarray, " rows"] | None:
         """Rows of the eliminated table that stay in the reduced system: those tied by an
         observation to another row of their table."""
         if self.eliminate is None:
@@ -87,7 +84,7 @@ class Grouping:
                 stays[given.rows[s]] = True
         return self.choose("stays", found=stays & table.free.any(1))
 
-    def _share_observations(self):
+    def _share_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
         shares = []
         for o, given in self.observations.items():
@@ -99,12 +96,12 @@ class Grouping:
             # A set without observations is an empty share.
             for slot in self.choose("slots", o, found=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
-                shares.append(Share(o, rows, None if slot < 0 else slot))
+                shares.append(ObservationSubset(o, rows, None if slot < 0 else slot))
         return shares
 
     # ------------------------------------------------------------------ groups
 
-    def _form_groups(self):
+    def _form_groups(self) -> None:
         """Kept tables in groups; the eliminated rows are the last group."""
         self.members, self.group_of = {}, {}
         for name in self.moving:
@@ -134,7 +131,7 @@ class Grouping:
         # In the order of JAX's pytrees.
         self.kept = sorted(g for g in self.members if g != name)
 
-    def _meet_always(self, group, name):
+    def _meet_always(self, group: str, name: str) -> bool:
         """Whether the rows of a table occur in exactly the same observations of eliminated rows as
         those of a group."""
         first = self.members[group][0][0]
@@ -156,7 +153,7 @@ class Grouping:
                     return False
         return met
 
-    def group(self, name: str) -> Group:
+    def group(self, name: str) -> UnknownGroup:
         members, free = [], []
         for table, start, rows in self.members[name]:
             given = self.tables[table]
@@ -166,13 +163,13 @@ class Grouping:
         free = np.concatenate(free, 1)
         # A slot of the eliminated table touches its kept rows, or a held one, which is not there.
         partial = any(rows is not None for *_, rows in self.members[name])
-        may_be_held = name == self.eliminate and len(free) < MASKED
+        may_be_held = name == self.eliminate and len(free) < self.settings.masked_below
         may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held
         all_free = self.choose("all free", name, found=all_free)
-        return Group(tuple(members), as_column(free, ("group", name)), all_free)
+        return UnknownGroup(tuple(members), as_column(free, ("group", name)), all_free)
 
-    def touched_groups(self, number: int, share: Share) -> list[TouchedGroup]:
+    def touched_groups(self, number: int, share: ObservationSubset) -> list[TouchedGroup]:
         """The kept groups touched by share `number`, in order.
 
         Slots of one group are one touch if they have the same row in every observation of the

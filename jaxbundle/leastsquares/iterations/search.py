@@ -20,7 +20,7 @@ from jaxbundle.choices import METHODS
 from jaxbundle.leastsquares.equations.damping import times
 from jaxbundle.leastsquares.equations.elimination import (
     FULL_PRECISION,
-    Factor,
+    NormalFactor,
     damp,
     factorise,
     solve,
@@ -46,20 +46,24 @@ class Elimination(lx.AbstractLinearSolver):
     regular: bool | Bool[Array, ""] = True
     tolerance: float = eqx.field(static=True, default=FULL_PRECISION)
 
-    def init(self, operator: Normal, options: dict[str, Any]) -> Factor:
+    def init(self, operator: Normal, options: dict[str, Any]) -> NormalFactor:
         if not isinstance(operator, Normal):
             raise ValueError("Elimination solves with the normal equations of a plan only")
         return factorise(operator, self.regular, self.tolerance)
 
     def compute(
-        self, state: Factor, vector: Tangent, options: dict[str, Any]
+        self, state: NormalFactor, vector: Tangent, options: dict[str, Any]
     ) -> tuple[Tangent, optx.RESULTS, dict[str, Any]]:
         return solve(state, vector), lx.RESULTS.successful, {}
 
-    def transpose(self, state: Factor, options: dict[str, Any]) -> tuple[Factor, dict[str, Any]]:
+    def transpose(
+        self, state: NormalFactor, options: dict[str, Any]
+    ) -> tuple[NormalFactor, dict[str, Any]]:
         return state, options
 
-    def conj(self, state: Factor, options: dict[str, Any]) -> tuple[Factor, dict[str, Any]]:
+    def conj(
+        self, state: NormalFactor, options: dict[str, Any]
+    ) -> tuple[NormalFactor, dict[str, Any]]:
         return state, options
 
     def assume_full_rank(self) -> bool:

@@ -26,9 +26,9 @@ from jaxbundle.leastsquares.equations.normal import (
 )
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
     Data,
     Declared,
-    Laid,
     Values,
     lay_out_data,
     residuals,
@@ -73,7 +73,7 @@ class History(eqx.Module):
         )
 
 
-class Known(eqx.Module):
+class Linearisation(eqx.Module):
     """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the next step."""
 
     cost: Float[Array, ""]
@@ -82,11 +82,11 @@ class Known(eqx.Module):
     damping: Float[Array, ""]
 
 
-class State(eqx.Module):
+class SolverState(eqx.Module):
     """The loop state besides the accepted unknowns: the quantities there, and the step to try."""
 
     first: Bool[Array, ""]
-    known: Known
+    known: Linearisation
     change: Tangent
     trial: Values
     step_size: Float[Array, ""]
@@ -123,19 +123,19 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
 
     def init(
         self,
-        fn: Callable[[Values, Laid], Any],
+        fn: Callable[[Values, ChunkedData], Any],
         y: Values,
-        args: Laid,
+        args: ChunkedData,
         options: dict[str, Any],
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> State:
+    ) -> SolverState:
         struct = eqx.filter_eval_shape(self._linearise, y, args)
         info = eqx.filter_eval_shape(self._info, struct)
         zero, rows = zero_tangent(self.plan), self.rows
         nothing = jnp.full(rows, jnp.nan)
-        return State(
+        return SolverState(
             first=jnp.asarray(True),
             known=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct),
             change=zero,
@@ -151,13 +151,13 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
 
     def step(
         self,
-        fn: Callable[[Values, Laid], Any],
+        fn: Callable[[Values, ChunkedData], Any],
         y: Values,
-        args: Laid,
+        args: ChunkedData,
         options: dict[str, Any],
-        state: State,
+        state: SolverState,
         tags: frozenset[object],
-    ) -> tuple[Values, State, Any]:
+    ) -> tuple[Values, SolverState, Any]:
         before, zero = self._info(state.known), zero_tangent(self.plan)
         residual, aux = fn(state.trial, args)
         trial = optx.FunctionInfo.Eval(half_square(self.plan, residual))
@@ -193,7 +193,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             jax.debug.callback(self.progress, state.steps, trial.f, 1 / state.step_size)
         return (
             y,
-            State(
+            SolverState(
                 first=jnp.asarray(False),
                 known=dataclasses.replace(known, damping=1 / step_size),
                 change=change,
@@ -211,11 +211,11 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
 
     def terminate(
         self,
-        fn: Callable[[Values, Laid], Any],
+        fn: Callable[[Values, ChunkedData], Any],
         y: Values,
-        args: Laid,
+        args: ChunkedData,
         options: dict[str, Any],
-        state: State,
+        state: SolverState,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
@@ -223,12 +223,12 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
 
     def postprocess(
         self,
-        fn: Callable[[Values, Laid], Any],
+        fn: Callable[[Values, ChunkedData], Any],
         y: Values,
         aux: Any,
-        args: Laid,
+        args: ChunkedData,
         options: dict[str, Any],
-        state: State,
+        state: SolverState,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[Values, Any, dict[str, Any]]:
@@ -241,17 +241,17 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         }
         return y, aux, stats
 
-    def _linearise(self, values: Values, laid: Laid) -> Known:
+    def _linearise(self, values: Values, laid: ChunkedData) -> Linearisation:
         equations = normal_equations(self.declared, self.plan, values, laid)
-        return Known(*equations, damping=jnp.asarray(0.0))
+        return Linearisation(*equations, damping=jnp.asarray(0.0))
 
-    def _info(self, known: Known) -> Info:
+    def _info(self, known: Linearisation) -> Info:
         """The information passed to searches and descents."""
         normal, noise = Normal(self.plan, known.normal), self.tolerance.noise(known.cost)
         return Info(known.cost, known.gradient, normal, known.damping, noise)
 
     def _next_change(
-        self, known: Known, step_size: Float[Array, ""], descent_state: Any
+        self, known: Linearisation, step_size: Float[Array, ""], descent_state: Any
     ) -> tuple[Tangent, Bool[Array, ""]]:
         """The descent's step from the accepted point, zero if it cannot be computed."""
         asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)

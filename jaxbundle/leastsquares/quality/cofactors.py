@@ -21,7 +21,7 @@ from jaxbundle.leastsquares.datum.conditions import (
     s_transform_transposed,
     zeros_of_tables,
 )
-from jaxbundle.leastsquares.equations.elimination import Factor, solve, sum_over_pairs
+from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve, sum_over_pairs
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import Reduced
 from jaxbundle.leastsquares.indexing.plan import Plan
@@ -46,7 +46,7 @@ class Cofactors(eqx.Module):
 
 
 def cofactors(
-    declared: Declared, values: Values, factor: Factor, moves: Tangent | None = None
+    declared: Declared, values: Values, factor: NormalFactor, moves: Tangent | None = None
 ) -> Cofactors:
     """All cofactor blocks of a solved problem; `moves`: the generators, if known."""
     plan = factor.plan
@@ -75,7 +75,7 @@ def _without_held(plan: Plan, Q: Reduced) -> Reduced:
     return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
 
 
-def _couplings(factor: Factor, Q: Reduced):
+def _couplings(factor: NormalFactor, Q: Reduced):
     """K of every incidence."""
     plan, Z = factor.plan, factor.Z
     K = {g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()}
@@ -143,7 +143,11 @@ def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
 
 
 def propagate(
-    declared: Declared, values: Values, factor: Factor, rows: Tangent, moves: Tangent | None = None
+    declared: Declared,
+    values: Values,
+    factor: NormalFactor,
+    rows: Tangent,
+    moves: Tangent | None = None,
 ) -> Float[Array, "f f"]:
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve per function."""

@@ -26,7 +26,7 @@ ROUNDING_RESIDUAL = 1e-9
 """Residuals below this fraction of their a priori σ are rounding errors: nothing to estimate."""
 
 
-class Group(NamedTuple):
+class VarianceGroup(NamedTuple):
     """Observations whose σ are estimated together: sets, and which [rows, residuals] of each."""
 
     name: str
@@ -74,7 +74,7 @@ class Component:
 
 
 def variance_components(
-    found: Solution, groups: Sequence[Group], factors: Mapping[str, float]
+    found: Solution, groups: Sequence[VarianceGroup], factors: Mapping[str, float]
 ) -> dict[str, Component]:
     """The components of groups of observations; `factors`: by group, the divisor of the weights (1
     if absent)."""
@@ -101,7 +101,7 @@ def variance_components(
     return components
 
 
-class Estimate(NamedTuple):
+class ComponentEstimate(NamedTuple):
     """Estimated variance components: the solution, the factors of σ by group, and the groups whose
     components have not converged."""
 
@@ -110,7 +110,9 @@ class Estimate(NamedTuple):
     unsettled: list[str]
 
 
-def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estimate:
+def estimate(
+    found: Solution, groups: Sequence[VarianceGroup], again: Callable
+) -> ComponentEstimate:
     """Repeat Förstner's estimate until every component is 1; `again(problem, values)` readjusts."""
     factors: dict[str, float] = {}
     for done in range(ROUNDS + 1):
@@ -119,14 +121,16 @@ def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estim
         factors = {name: c.factor for name, c in usable.items()} | factors
         unsettled = [name for name, c in usable.items() if abs(c.ratio - 1) >= SMALLEST_CHANGE]
         if done == ROUNDS or not unsettled:
-            return Estimate(found, factors, unsettled)
+            return ComponentEstimate(found, factors, unsettled)
         ratios = {name: c.ratio for name, c in usable.items()}
         found = again(rescale(found.problem, groups, ratios), found.values)
         factors |= {name: c.sigma for name, c in usable.items()}
     raise AssertionError("the last round returns")
 
 
-def rescale(problem: Problem, groups: Sequence[Group], factors: Mapping[str, float]) -> Problem:
+def rescale(
+    problem: Problem, groups: Sequence[VarianceGroup], factors: Mapping[str, float]
+) -> Problem:
     """The problem with every group's σ multiplied by its factor."""
     weight = {o: np.array(w) for o, w in problem.data.weight.items()}
     for group in groups:

@@ -99,7 +99,7 @@ def solve(
     return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), found)
 
 
-class Linearised(eqx.Module):
+class LinearisedSolution(eqx.Module):
     """The problem at a solution, as a constant for the derivative rules. `pins`: the penalty on
     changes of the kept unknowns, in units of g (none if nothing is open)."""
 
@@ -107,7 +107,7 @@ class Linearised(eqx.Module):
     plan: Plan
     values: Values
     data: Data
-    factor: elimination.Factor
+    factor: elimination.NormalFactor
     pins: Tangent
 
     def hold_given(self, data: Data) -> Values:
@@ -153,7 +153,7 @@ def attach_derivatives(
 
 def linearise(
     declared: Declared, plan: Plan, values: Values, data: Data, exact: bool
-) -> Linearised:
+) -> LinearisedSolution:
     """With the factor of the exact Hessian, or of JᵀPJ."""
     equations = exact_equations if exact else normal_equations
     laid = lay_out_data(plan, data)
@@ -162,10 +162,10 @@ def linearise(
     datum = plan.datum if plan.reduction in FACTORS else None
     pins, own = {} if datum is None else datum.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
-    return Linearised(declared, plan, values, data, elimination.factorise(normal), pins)
+    return LinearisedSolution(declared, plan, values, data, elimination.factorise(normal), pins)
 
 
-def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change):
@@ -175,7 +175,7 @@ def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
     return jax.grad(penalised)(change)
 
 
-def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
+def _solve_structured(times, at: LinearisedSolution, b: Tangent) -> Tangent:
     """H⁻¹·b by the factor, differentiable as the solution of H·x = b.
 
     Refined once with the residual, computed without N: like the corrected seminormal equations
@@ -196,7 +196,7 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
 
 
 @eqx.filter_custom_jvp
-def _propagate(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
     """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
@@ -219,7 +219,7 @@ def _(primals, tangents):
     return change, jax.tree.map(jnp.add, into, start)
 
 
-def _change_of_start(at: Linearised, data: Data) -> Tangent:
+def _change_of_start(at: LinearisedSolution, data: Data) -> Tangent:
     """The difference of the datum start values from those at the solution."""
     moved = datum.zeros_of_tables(at.declared, at.values)
     for name in () if at.plan.datum is None else at.plan.datum.weight:

@@ -26,11 +26,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.equations.linearise import differentiate_chunks
-from jaxbundle.leastsquares.indexing.plan import Part, Plan
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
 from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
     Data,
     Declared,
-    Laid,
     Values,
     diagonal_of,
     lay_out_data,
@@ -128,7 +128,7 @@ def _invert_lower(W: Float[AnyArray, "n r r"]) -> Float[AnyArray, "n r r"]:
     return jnp.stack(rows, 1)
 
 
-def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
+def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: ChunkedData, Q: Cofactors):
     """Of every part, from the blocks of Q that each observation touches: whitened residuals
     [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal,
     or for correlated observations all of it, [chunks, length, r, r]."""
@@ -141,7 +141,7 @@ def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Co
     return zip(*found) if found else ((), (), ())
 
 
-def _of_chunk(Q: Cofactors, correlated: bool, part: Part, r, touches, E):
+def _of_chunk(Q: Cofactors, correlated: bool, part: ObservationPart, r, touches, E):
     """The same of one chunk, [length, …]."""
     block = lambda a, b: jnp.einsum("lic,ljc->lij", a, b)
     form = block if correlated else lambda a, b: jnp.sum(a * b, -1)
@@ -161,7 +161,7 @@ def _of_chunk(Q: Cofactors, correlated: bool, part: Part, r, touches, E):
     return r, hat, own
 
 
-def _of_kept(part: Part, Q: Cofactors):
+def _of_kept(part: ObservationPart, Q: Cofactors):
     """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
     touches = part.touches
     cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]

@@ -23,12 +23,12 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.datum.conditions import attach_motion
-from jaxbundle.leastsquares.equations.elimination import Factor, solve
+from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
 from jaxbundle.leastsquares.equations.normal import Tangent, dot, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
 from jaxbundle.leastsquares.iterations.solver import half_square
-from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_after
+from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution, gradient_after
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -48,7 +48,7 @@ def follow(found: Solution, changes: Sequence[Change]) -> Iterator[Values]:
     row, [≤ AT_ONCE, rows, …], some changes at a time, exact to first order.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.given
+    declared, plan, values, data = found.arguments
     still = jax.tree.map(np.asarray, values)
     for first in range(0, len(changes), CHANGES_AT_ONCE):
         some = changes[first : first + CHANGES_AT_ONCE]
@@ -79,7 +79,7 @@ def pull_back(
     have one number per residual, the residual is changed.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.given
+    declared, plan, values, data = found.arguments
     problem, number = found.problem, len(next(iter(functions.values())))
     size = {t.name: problem.sizes["table", t.name] for t in problem.tables}
     wide = lambda t, x: np.pad(x, ((0, 0), (0, size[t] - x.shape[1]), (0, 0)))
@@ -115,8 +115,8 @@ def _require(left) -> None:
 
 
 @compile_once
-def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, held):
-    at = Linearised(declared, plan, values, data, factor, {})
+def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, held):
+    at = LinearisedSolution(declared, plan, values, data, factor, {})
     still = zero_tangent(plan)
 
     def one(held):
@@ -128,9 +128,11 @@ def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: 
 
 
 @compile_once
-def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
+def _pull_back(
+    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, rows
+):
     """Derivatives by measurements and by residuals, and the residual of the equations."""
-    at = Linearised(declared, plan, values, data, factor, {})
+    at = LinearisedSolution(declared, plan, values, data, factor, {})
     still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
     def changes(change):
@@ -157,13 +159,15 @@ def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, facto
     return jax.lax.map(one, rows)
 
 
-def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
+def _in_datum(at: LinearisedSolution, change: Tangent, start: Values) -> Values:
     """The tables after a change, in the datum defined by `start`."""
     moved = at.move(change, dataclasses.replace(at.data, start=start))
     return attach_motion(at.declared, at.plan, moved, start)
 
 
-def _solve(at: Linearised, right: Tangent, held: Values) -> tuple[Tangent, Float[Array, ""]]:
+def _solve(
+    at: LinearisedSolution, right: Tangent, held: Values
+) -> tuple[Tangent, Float[Array, ""]]:
     """x of H·x = right − (∂g/∂θ)·held by conjugate gradients, and the relative residual.
 
     The first pass of the loop computes the right-hand side, so that the program contains g once."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.datum.conditions import s_transform, s_transform_transposed
-from jaxbundle.leastsquares.equations.elimination import Factor, factorise, lift, solve
+from jaxbundle.leastsquares.equations.elimination import NormalFactor, factorise, lift, solve
 from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.equations.reduced import flat, split
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -73,18 +73,23 @@ def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
     equations are lifted a little, so that there is a factor."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
-    factor = with_plan(_lifted_factor(*found.given), found.problem.plan)
+    factor = with_plan(_lifted_factor(*found.arguments), found.problem.plan)
     return _weak(found, factor, extents, 1.0)
 
 
 @compile_once
-def _lifted_factor(declared, plan, values, data) -> Factor:
+def _lifted_factor(declared, plan, values, data) -> NormalFactor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     return without_plan(factorise(lift(Normal(plan, blocks))))
 
 
 def _weak(
-    found: Solution, factor: Factor, extents: Extents, sigma0: float, at_hand=False, explained=None
+    found: Solution,
+    factor: NormalFactor,
+    extents: Extents,
+    sigma0: float,
+    at_hand=False,
+    explained=None,
 ) -> Weak:
     problem, plan = found.problem, found.problem.plan
     sigma0 = sigma0 if np.isfinite(sigma0) else 1.0
@@ -114,7 +119,7 @@ def _weak(
     )
 
 
-def _far_rows(problem: Problem, factor: Factor, extents: Extents, sigma0: float):
+def _far_rows(problem: Problem, factor: NormalFactor, extents: Extents, sigma0: float):
     """Eliminated rows with large σ, the worst first, and how many were judged; None where their
     factor is not finite."""
     e = problem.plan.eliminated
@@ -155,14 +160,14 @@ def _of_columns(problem: Problem, by_table: Extents) -> Float[np.ndarray, " redu
     return np.asarray(flat(plan.kept, found))
 
 
-def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
+def _sigma_of_weakest(found: Solution, factor: NormalFactor, per_extent):
     """σ/e (a priori) of the reduced system's columns, as far as the weakest directions give it."""
     directions = np.random.default_rng(0).standard_normal((DIRECTIONS, len(per_extent)))
     directions *= per_extent > 0
     for _ in range(ROUNDS):
         directions = np.linalg.qr(directions.T)[0].T
         previous = directions
-        declared, _, values, _ = found.given
+        declared, _, values, _ = found.arguments
         directions = np.asarray(
             _products(declared, values, factor, found.moves, per_extent, directions)
         )
@@ -171,7 +176,7 @@ def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
 
 
 @compile_once
-def _products(declared, values, factor: Factor, moves, per_extent, directions):
+def _products(declared, values, factor: NormalFactor, moves, per_extent, directions):
     """A times each of the directions [m, reduced]."""
     plan = factor.plan
     still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
