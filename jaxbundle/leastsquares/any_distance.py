@@ -12,9 +12,9 @@ from jaxbundle.leastsquares.spaces import Change, tangent_basis
 from jaxbundle.types import AnyArray, Scalar
 
 LARGEST_DISTANCE = 1e8
-"""Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
-INFINITY_FROM = 0.99
-"""The fraction of it from which a point counts as at infinity."""
+"""Infinity, in units of the length s of a row: rays to it from places a length s apart differ by
+1e-8, a ten-thousandth of a pixel of 10 000 · 10 000. A hundred times less would be seen in images;
+a hundred times more leaves no digits for the direction, since X is s·1e8 to 1e-16·1e8·s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,8 @@ def is_at_infinity(
     X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points at any distance are at infinity."""
-    return (np.linalg.norm(X, axis=1) > INFINITY_FROM * LARGEST_DISTANCE * s) & (s > 0)
+    # 0.99: a point that was moved to infinity is there but for the rounding of later motions.
+    return (np.linalg.norm(X, axis=1) > 0.99 * LARGEST_DISTANCE * s) & (s > 0)
 
 
 def shares(
@@ -117,7 +118,7 @@ def _transform(motion: Float[Array, " 7"], value: Float[Array, " 4"]) -> Float[A
     moved = transform_point(motion, value[:3])
     turned = moved - transform_point(motion, jnp.zeros(3))
     turned = turned * length(value[:3]) / length(turned)
-    far = jnp.sqrt(value[:3] @ value[:3]) > INFINITY_FROM * LARGEST_DISTANCE * value[3]
+    far = jnp.sqrt(value[:3] @ value[:3]) > 0.99 * LARGEST_DISTANCE * value[3]
     return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
 
 

@@ -1,13 +1,16 @@
 """Motions of tables, by one program per table, called on the host.
 
-Tables of one space and size share a program, and so do all small ones, padded to `LEAST_ROWS`. A
+Tables of one space and size share a program, and so do all small ones, padded to one size. A
 program for a whole problem would be compiled again for every other shape.
 """
 
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.datum import conditions as datum
 from jaxbundle.leastsquares.datum.motions import JointMotion, move_at_once
@@ -15,13 +18,12 @@ from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import AnyArray, present
 
 TABLE_ALONE = "table"
 """The name of a table treated alone."""
-LEAST_ROWS = 128
-"""Tables are padded to at least this many rows."""
 
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:
@@ -53,7 +55,7 @@ def move_into_datum(
     curved, free = present(declared.motions).curved, _free(plan, declared, values)
     size = float(datum.largest(pinned.weight, start))
 
-    def further(values):
+    def further(values: Values) -> tuple[Values, float]:
         tables = {name: values[name] for name in pinned.weight}
         moves = directions_of_motions(declared, tables)
         away = {
@@ -76,10 +78,15 @@ def move_into_datum(
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1
-    return values, distance <= datum.AT_DATUM * size
+    return values, distance <= datum.DATUM_MOTION.reached * size
 
 
-def _move_tables(declared, free, motion, values):
+def _move_tables(
+    declared: Declared,
+    free: Mapping[str, AnyArray],
+    motion: Float[AnyArray, " motions"],
+    values: Values,
+) -> Values:
     """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:
@@ -92,20 +99,28 @@ def _move_tables(declared, free, motion, values):
 
 
 @compile_once
-def _difference(space, values, origin):
+def _difference(space: Space, values: Any, origin: Any) -> Float[Array, "rows width"]:
     return jax.vmap(space.difference)(values, origin)
 
 
 @compile_once
-def _move(space, act, motion, values, free):
+def _move(
+    space: Space,
+    act: Callable,
+    motion: Float[AnyArray, " motions"],
+    values: Any,
+    free: Float[Array, "rows width"],
+) -> Any:
     one = lambda value, f: space.hold(act(motion, value), value, f)
     return jax.vmap(one)(values, free)
 
 
-def _of_rows(program, *given):
+def _of_rows(program: Callable, *given: Any) -> Any:
     """A program on the rows of a table, padded and cut again; in NumPy."""
     rows = jax.tree.leaves(given)[0].shape[0]
-    more = max(LEAST_ROWS - rows, 0)
+    # 128 rows: cameras and stations of most networks in one program; half or double only moves
+    # where a second one is compiled.
+    more = max(128 - rows, 0)
     wide = lambda x: np.pad(x, [(0, more), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")
     return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
 

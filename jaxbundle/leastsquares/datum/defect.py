@@ -4,6 +4,7 @@ Computed once at the start values, on the host, from one compiled survey of the 
 table and their effect on observations.
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
@@ -22,10 +23,10 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, p
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
-ROWS = 10_000
-"""Rows of J·G in one factorisation."""
 OPEN = 1e-10
-"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+"""Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
+coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
+observations' own terms is no observation of it. Any value from 1e-12 to 1e-8 finds the same."""
 
 
 class CannotHold(InputError):
@@ -62,7 +63,13 @@ def survey_motions(
 
 
 @compile_once
-def _survey(declared, plan, data, real, moves) -> Survey:
+def _survey(
+    declared: Declared,
+    plan: Plan,
+    data: Data,
+    real: dict[str, Bool[np.ndarray, " rows"]],
+    moves: Tangent,
+) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)
     everywhere = {
@@ -116,14 +123,17 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     return directions[singular < OPEN].T / scale[:, None]
 
 
-def _triangle(parts, scales) -> Float[np.ndarray, "n n"]:
+def _triangle(
+    parts: Sequence[Float[np.ndarray, "rows n"]], scales: Sequence[Float[np.ndarray, " n"]]
+) -> Float[np.ndarray, "n n"]:
     """R of the QR of all rows of the parts, their columns divided by the scales: it has their
     singular values, of which a Gram matrix would lose half of the digits."""
     n = parts[0].shape[1]
     R = np.zeros((n, n))
     for rows, scale in zip(parts, scales):
-        for begin in range(0, len(rows), ROWS):
-            part = rows[begin : begin + ROWS] / scale
+        # 10 000 rows of seven motions at a time: half a megabyte, whatever the problem.
+        for begin in range(0, len(rows), 10_000):
+            part = rows[begin : begin + 10_000] / scale
             R = np.asarray(np.linalg.qr(np.concatenate([R, part]), mode="r"))
     return R
 
@@ -165,7 +175,9 @@ def make_datum(
     return Datum(*jax.device_put((gauge, weight, pins, held)))
 
 
-def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
+def _choose_pins(
+    plan: Plan, G: dict[str, Float[np.ndarray, "rows w defect"]]
+) -> dict[str, np.ndarray]:
     """As many kept unknowns as the defect, chosen well spread; every kind of direction is
     normalised by its size, unless that is rounding."""
     rows, shapes = [], []
@@ -185,7 +197,9 @@ def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
     }
 
 
-def _pick_rows(G, candidates):
+def _pick_rows(
+    G: Float[np.ndarray, "rows defect"], candidates: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " rows"]:
     """1 for as many independent rows of G as it has columns, 0 for the others."""
     q, _ = np.linalg.qr(G)
     rows = q * candidates[:, None]
