@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import (
@@ -44,7 +44,9 @@ class BandFactor(eqx.Module):
     def solve(self, b: Tangent) -> Tangent:
         g, others = _groups(self.plan)
 
-        def forward(less, block):
+        def forward(
+            less: Float[Array, " m"], block: tuple[Array, Array, Array]
+        ) -> tuple[Array, Array]:
             L, C, right = block
             y = solve_triangular(L, right - less, lower=True)
             return C @ y, y
@@ -55,7 +57,9 @@ class BandFactor(eqx.Module):
         rest = cho_solve((self.corner, True), rest) if rest.size else rest
         y = y - jnp.einsum("bmq,q->bm", self.border, rest)
 
-        def backward(x, block):
+        def backward(
+            x: Float[Array, " m"], block: tuple[Array, Array, Array]
+        ) -> tuple[Array, Array]:
             L, C, y = block
             x = solve_triangular(L, y - C.T @ x, lower=True, trans=1)
             return x, x
@@ -68,7 +72,9 @@ class BandFactor(eqx.Module):
         m, q = self.border.shape[1:]
         corner = cho_solve((self.corner, True), jnp.eye(q)) if q else self.corner
 
-        def backward(carry, block):
+        def backward(
+            carry: tuple[Array, Array], block: tuple[Array, Array, Array]
+        ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
             D_next, with_border_next = carry
             L, C, X = block
             divided = lambda b: solve_triangular(L, b, lower=True, trans=1)
@@ -121,7 +127,9 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))
 
-    def step(carry, block):
+    def step(
+        carry: tuple[Array, Array], block: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
         C, X = carry
         D, E, B = block
         L = cholesky_of_lower(D - C @ C.T)
@@ -154,7 +162,13 @@ def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows
     return x.reshape(band.blocks * band.width, w, *x.shape[2:])[band.place]
 
 
-def _blocks(plan: Plan, D, E, row, column) -> Float[Array, "blocks w w"]:
+def _blocks(
+    plan: Plan,
+    D: Float[Array, "blocks m m"],
+    E: Float[Array, "blocks m m"],
+    row: Int[Array, " n"],
+    column: Int[Array, " n"],
+) -> Float[Array, "blocks w w"]:
     """The blocks of two rows each, from the blocks on (D) and above (E) the diagonal."""
     band = present(plan.band)
     w, width = plan.groups[band.group].width, band.width

@@ -12,11 +12,12 @@ iteration to iteration; they are not part of the plan.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.equations.linearise import (
@@ -26,8 +27,17 @@ from jaxbundle.leastsquares.equations.linearise import (
     zero_held_columns_of_eliminated,
 )
 from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
-from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, look_up, map_blocks, whiten
-from jaxbundle.leastsquares.spaces import Space, Vector
+from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
+    Declared,
+    Prepared,
+    Weight,
+    look_up,
+    map_blocks,
+    whiten,
+)
+from jaxbundle.leastsquares.spaces import Block, Change, Space, Vector
+from jaxbundle.types import Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +66,7 @@ def local_touch(declared: Declared, part: ObservationPart) -> int | None:
 
 
 def differentiate_locally(
-    declared: Declared, plan: Plan, number: int, touch: int, prepared, laid: ChunkedData
+    declared: Declared, plan: Plan, number: int, touch: int, prepared: Prepared, laid: ChunkedData
 ) -> LocalJacobian:
     """As `differentiate`, for a part that has such a touch."""
     part = plan.parts[number]
@@ -109,7 +119,9 @@ class _Columns:
 
     kind: Kind
 
-    def __call__(self, blocks, measured, weight):
+    def __call__(
+        self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
+    ) -> tuple:
         assert self.kind.local is not None
         return self.kind.local.columns(*blocks, measured)
 
@@ -121,7 +133,9 @@ class _LocalResidual:
     kind: Kind
     spaces: tuple[Space, ...]
 
-    def __call__(self, blocks, given, weight, changes):
+    def __call__(
+        self, blocks: tuple[Block, ...], given: tuple, weight: Weight, changes: Sequence[Change]
+    ) -> Change:
         local, (measured, columns, values) = self.kind.local, given
         assert local is not None
         values = tuple(v + d for v, d in zip(values, changes[local.slot], strict=True))
@@ -133,11 +147,16 @@ class _LocalResidual:
 
 
 def products_of(
-    like: Float[Array, "rows w w"], row: Int[Array, " chunks"], J, columns
+    like: Float[Array, "rows w w"],
+    row: Int[Array, " chunks"],
+    J: Float[Array, "chunks length r m"],
+    columns: Int[Array, "chunks length m"],
 ) -> Float[Array, "rows w w"]:
     """The products of every observation, added up chunk by chunk in the shape of N."""
 
-    def add(N, chunk):
+    def add(
+        N: Float[Array, "rows w w"], chunk: tuple[Array, Array, Array]
+    ) -> tuple[Float[Array, "rows w w"], None]:
         row, J, at = chunk
         products = jnp.einsum("kri,krj->kij", J, J)
         return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
@@ -146,7 +165,9 @@ def products_of(
     return jax.lax.scan(add, nothing, (row, J, columns))[0]
 
 
-def spread(found: Float[Array, "chunks length m *v"], columns, width: int):
+def spread(
+    found: Float[Array, "chunks length m *v"], columns: Int[Array, "chunks length m"], width: int
+) -> Float[Array, "chunks width *v"]:
     """Rows that belong to columns, summed over the observations of a chunk: [chunks, width, v]."""
     zero = jnp.zeros((found.shape[0], width, *found.shape[3:]))
     chunk = jnp.arange(found.shape[0])[:, None, None]

@@ -8,15 +8,16 @@ every observation (the exact Hessian, `hessian.py`); everything after that is th
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial, reduce
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.equations.damping import measure
 from jaxbundle.leastsquares.equations.linearise import differentiate
@@ -27,7 +28,7 @@ from jaxbundle.leastsquares.equations.local import (
     products_of,
     spread,
 )
-from jaxbundle.leastsquares.indexing.plan import Key, ObservationPart, Plan
+from jaxbundle.leastsquares.indexing.plan import Key, ObservationPart, PairBlock, Plan, TouchedRows
 from jaxbundle.leastsquares.indexing.rows import ChunkedData, Declared, Values, prepare
 from jaxbundle.types import AnyArray, present
 
@@ -35,6 +36,9 @@ Tangent = dict[str, Float[Array, "rows width"]]
 """A small change of all groups, the eliminated rows among them."""
 Rows = Float[AnyArray, "rows width"]
 AnyTangent = Mapping[str, Rows]
+Contribution = tuple[list[Array], list[Array], list[Array], Array | None, list[Array]]
+"""What a part adds: `own`, `gradient`, `couples`, `eliminated` and `W` of `Sums.add_part`."""
+Sum = TypeVar("Sum")
 
 
 class NormalBlocks(eqx.Module):
@@ -104,12 +108,12 @@ for _same in (lx.linearise, lx.materialise, lx.conj):
 lx.diagonal.register(Normal)(lambda operator: operator.diagonal())
 
 
-def total(plan: Plan, parts):
+def total(plan: Plan, parts: Sum) -> Sum:
     """The sum over the devices of the contributions of their eliminated rows."""
     return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
 
 
-def average_over_devices(plan: Plan, value):
+def average_over_devices(plan: Plan, value: Sum) -> Sum:
     """The mean over the devices of values that should be the same on all, to make them identical to
     the last digit: devices that decide differently would deadlock."""
     return value if plan.axis is None else jax.lax.pmean(value, plan.axis)
@@ -151,7 +155,7 @@ def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
     return found
 
 
-def _tall(blocks):
+def _tall(blocks: Float[Array, "chunks length w v"]) -> Float[Array, "chunks length*w v"]:
     """The blocks of a chunk as one matrix."""
     return blocks.reshape(blocks.shape[0], -1, blocks.shape[-1])
 
@@ -176,7 +180,12 @@ def normal_equations(
     return sums.total(declared, values)
 
 
-def _products_of(part: ObservationPart, r, touches, E):
+def _products_of(
+    part: ObservationPart,
+    r: Float[Array, "chunks length r"],
+    touches: Sequence[Float[Array, "chunks length r w"]],
+    E: Float[Array, "chunks length r w"] | None,
+) -> Contribution:
     """The Gauss–Newton contribution of a part, see `Sums.add_part`: products of the blocks of J."""
     tall = [J.reshape(J.shape[0], -1, J.shape[-1]) for J in touches]
     right, eliminated, W = r.reshape(r.shape[0], -1), None, []
@@ -203,7 +212,16 @@ class Sums:
         self.W = {}
         self.cost = jnp.zeros(())
 
-    def add_part(self, part: ObservationPart, cost, own, gradient, couples, eliminated, W):
+    def add_part(
+        self,
+        part: ObservationPart,
+        cost: Float[Array, ""],
+        own: Sequence[Array],
+        gradient: Sequence[Array],
+        couples: Sequence[Array],
+        eliminated: Array | None,
+        W: Sequence[Array],
+    ) -> None:
         """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
         `couples` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside the block
         (None without), and `W` [places, w, v] of each of the touches."""
@@ -222,7 +240,7 @@ class Sums:
         for touch, N in zip(part.touches, W):
             self._add_incidences(touch, N)
 
-    def add_local(self, part: ObservationPart, found: LocalJacobian):
+    def add_local(self, part: ObservationPart, found: LocalJacobian) -> None:
         """What a part with local columns adds (`local.py`)."""
         t, J, at = found.touch, found.touches[found.touch], found.columns
         touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width
@@ -256,7 +274,13 @@ class Sums:
         if E is not None:
             self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
 
-    def _add_local_incidences(self, touch, W, columns, width):
+    def _add_local_incidences(
+        self,
+        touch: TouchedRows,
+        W: Float[Array, "chunks length m e"],
+        columns: Int[Array, "chunks length m"],
+        width: int,
+    ) -> None:
         plan = self.plan.incidences[touch.group]
         n, shape = plan.eliminated.size, W.shape[:2]
         at = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
@@ -265,7 +289,9 @@ class Sums:
             *plan.eliminated.shape, W.shape[-1], width
         )
 
-    def _add_couple(self, part, couple, N):
+    def _add_couple(
+        self, part: ObservationPart, couple: PairBlock, N: Float[Array, "chunks w v"]
+    ) -> None:
         """An off-diagonal block, or a diagonal one if the two rows are the same."""
         first, second = part.touches[couple.first], part.touches[couple.second]
         key = first.group, second.group
@@ -285,7 +311,7 @@ class Sums:
         summed = jax.ops.segment_sum(placed, couple.block, self.plan.blocks[key].row.shape[0])
         self.off[key] = self.off.get(key, 0.0) + summed.at[-1].set(0.0)
 
-    def _add_incidences(self, touch, W):
+    def _add_incidences(self, touch: TouchedRows, W: Float[Array, "places e w"]) -> None:
         """W of every observation, summed for each incidence."""
         plan = self.plan.incidences[touch.group]
         width = self.plan.groups[touch.group].width
@@ -297,7 +323,9 @@ class Sums:
             *plan.eliminated.shape, *W.shape[1:]
         )
 
-    def total(self, declared: Declared, values: Values):
+    def total(
+        self, declared: Declared, values: Values
+    ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
         plan, e = self.plan, self.plan.eliminated
         kept = lambda tree: {name: x for name, x in tree.items() if name != e}
         own, off, cost, gradient = total(
@@ -310,7 +338,7 @@ class Sums:
         return cost, gradient, NormalBlocks(own, off, eliminated, self.W, D)
 
 
-def products(a, b):
+def products(a: Float[Array, "n r w"], b: Float[Array, "n r v"]) -> Float[Array, "n w v"]:
     """aᵀb of every row, written out: a batched product of tiny matrices takes three times as
     long."""
     return reduce(jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1])))

@@ -97,7 +97,7 @@ def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n
 
 
 @cholesky_of_lower.defjvp
-def _(primals, tangents):
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # JAX's derivative rule expects the full symmetric change.
     whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
     factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
@@ -120,7 +120,9 @@ def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
     return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
 
 
-def split(plan: Plan, groups: Groups, vector: Float[Array, "n ..."]):
+def split(
+    plan: Plan, groups: Groups, vector: Float[Array, "n ..."]
+) -> dict[str, Float[Array, "rows w ..."]]:
     """The rows of some groups in one, group by group."""
     ends = np.cumsum([plan.groups[g].free.size for g in groups])
     parts = jnp.split(vector, ends[:-1]) if groups else ()

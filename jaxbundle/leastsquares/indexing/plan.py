@@ -25,6 +25,8 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.leastsquares.indexing.reduction import Band
 
 Key = tuple[str, str]
+Slots = tuple[tuple[int, int], ...]
+"""Slots of a kind, and the first column of each in its group."""
 
 
 class Member(eqx.Module):
@@ -59,7 +61,7 @@ class TouchedRows(eqx.Module):
     are the incidences."""
 
     group: str = eqx.field(static=True)
-    slots: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    slots: Slots = eqx.field(static=True)
     start: int = eqx.field(static=True)
     stop: int = eqx.field(static=True)
     row: Int[Array, " chunks"]

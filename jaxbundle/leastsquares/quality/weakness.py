@@ -21,7 +21,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.datum.conditions import s_transform, s_transform_transposed
-from jaxbundle.leastsquares.equations.elimination import NormalFactor, factorise, lift, solve
+from jaxbundle.leastsquares.equations.elimination import (
+    NormalFactor,
+    factorise,
+    regularise_diagonal,
+    solve,
+)
 from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.equations.reduced import flat, split
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -70,17 +75,17 @@ def find_weak(
 
 def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
     """The weak directions where iterations ended without a solution, by σ a priori: the normal
-    equations are lifted a little, so that there is a factor."""
+    equations get a small ridge, so that there is a factor."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
-    factor = with_plan(_lifted_factor(*found.arguments), found.problem.plan)
+    factor = with_plan(_regularised_factor(*found.arguments), found.problem.plan)
     return _weak(found, factor, extents, 1.0)
 
 
 @compile_once
-def _lifted_factor(declared, plan, values, data) -> NormalFactor:
+def _regularised_factor(declared, plan, values, data) -> NormalFactor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
-    return without_plan(factorise(lift(Normal(plan, blocks))))
+    return without_plan(factorise(regularise_diagonal(Normal(plan, blocks))))
 
 
 def _weak(
