@@ -13,8 +13,8 @@ from jaxbundle.types import AnyArray, Scalar
 
 LARGEST_DISTANCE = 1e8
 """Infinity, in units of the length s of a row: rays to it from places a length s apart differ by
-1e-8, a ten-thousandth of a pixel of 10 000 · 10 000. A hundred times less would be seen in images;
-a hundred times more leaves no digits for the direction, since X is s·1e8 to 1e-16·1e8·s."""
+1e-8, a ten-thousandth of a pixel of an image of 10 000 · 10 000. At a hundredth of it they would
+differ by more than images are measured; a hundred times more changes nothing."""
 
 
 @dataclasses.dataclass(frozen=True)

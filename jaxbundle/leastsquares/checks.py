@@ -66,8 +66,8 @@ def _intersect(
     declared: Declared, plan: Plan, data: Data, steps: int = 20
 ) -> tuple[Values, Float[Array, "rows w w"], Tangent]:
     """The eliminated rows with all others given, by Gauss–Newton steps; V⁻¹, and V⁻¹·Wᵀ of every
-    incidence. The steps converge from neighbours' coordinates in 5 to 10; all are taken, because
-    one compiled loop for all rows waits for the slowest anyway."""
+    incidence. All steps are taken, more than converging rows need: one loop for all rows would
+    wait for the slowest."""
     laid, e = lay_out_data(plan, data), present(plan.eliminated)
     group = plan.groups[e]
     held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)

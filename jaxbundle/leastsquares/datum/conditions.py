@@ -32,7 +32,7 @@ from jaxbundle.types import AnyArray, Scalar, present
 
 HELD = 1e-7
 """Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
-matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has one, at 1e-4 (a datum of
+matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum of
 points along a line, a ten-thousandth of its length wide) eight."""
 
 

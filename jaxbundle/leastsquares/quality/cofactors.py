@@ -13,7 +13,7 @@ problem that may float they refer to the datum by the S-transformation Q ← S·
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.datum.conditions import (
     contract,
@@ -21,10 +21,15 @@ from jaxbundle.leastsquares.datum.conditions import (
     s_transform_transposed,
     zeros_of_tables,
 )
-from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve, sum_over_pairs
+from jaxbundle.leastsquares.equations.elimination import (
+    Incident,
+    NormalFactor,
+    solve,
+    sum_over_pairs,
+)
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import Reduced
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import present
 
@@ -75,7 +80,7 @@ def _without_held(plan: Plan, Q: Reduced) -> Reduced:
     return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
 
 
-def _couplings(factor: NormalFactor, Q: Reduced):
+def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
     """K of every incidence."""
     plan, Z = factor.plan, factor.Z
     K = {g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()}
@@ -96,12 +101,25 @@ def _couplings(factor: NormalFactor, Q: Reduced):
     return {g: flat[g].reshape(k.shape) for g, k in K.items()}
 
 
-def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
+def _spread(
+    pairs: IncidencePairs,
+    a: Float[Array, "places e w"],
+    b: Float[Array, "places e v"],
+    Q: Float[Array, "blocks w v"],
+    to_first: Float[Array, "places e w"],
+    to_second: Float[Array, "places e v"],
+    within: bool,
+) -> tuple[Float[Array, "places e w"], Float[Array, "places e v"]]:
     """Add b·Qᵀ to the first total for every partner b of its row, and a·Q to the second; Q is the
     block of each pair. `within`: the two totals are the same."""
     totals = (to_first,) if within else (to_first, to_second)
 
-    def add(totals, i, j, k):
+    def add(
+        totals: tuple[Array, ...],
+        i: Int[Array, "chunks length"],
+        j: Int[Array, "chunks length"],
+        k: Int[Array, " chunks"],
+    ) -> tuple[Array, ...]:
         forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
         back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
         if within:
@@ -113,7 +131,9 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
     return totals[0], totals[0 if within else 1]
 
 
-def _in_datum(declared, values, factor, own, moves):
+def _in_datum(
+    declared: Declared, values: Values, factor: NormalFactor, own: Tangent, moves: Tangent | None
+) -> Tangent:
     """The diagonal blocks in the datum of the problem: S·Q·Sᵀ."""
     plan = factor.plan
     if plan.datum is None:
@@ -124,14 +144,20 @@ def _in_datum(declared, values, factor, own, moves):
     A = {g: h @ M.T for g, h in H.items()}
     C = M @ contract(plan, B, A)
 
-    def moved(Q, g, a):
+    def moved(
+        Q: Float[Array, "rows w w"],
+        g: Float[Array, "rows w defect"],
+        a: Float[Array, "rows w defect"],
+    ) -> Float[Array, "rows w w"]:
         cross = jnp.einsum("nik,njk->nij", g, a)
         return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
 
     return {name: moved(Q, G[name], A[name]) for name, Q in own.items()}
 
 
-def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
+def blocks_of_tables(
+    declared: Declared, plan: Plan, own: Tangent, values: Values
+) -> dict[str, Float[Array, "rows width width"]]:
     """`Cofactors.own` by table rows; zero for held unknowns."""
     empty = zeros_of_tables(declared, values)
     found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}

@@ -1,4 +1,4 @@
-"""Derivatives of the solution with respect to all data.
+"""The differentiable solution, `solve`: adjusted tables as a function of all data.
 
 At the minimum, g(y, θ) = ∂(½vᵀPv)/∂y = 0. By the implicit function theorem
 
@@ -19,12 +19,14 @@ depend on the order of differentiation and is refused. Weights enter it as in J�
 """
 
 import dataclasses
-from typing import Literal, get_args
+from collections.abc import Callable
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.implicit import derivative_along, differentiable_once, implicit_root
@@ -63,7 +65,7 @@ def solve(
     sensitivity: Sensitivity = "exact",
     max_iterations: int = 100,
     atol: float = 1e-7,
-    **options,
+    **options: Any,
 ) -> Values:
     """Adjusted tables as a differentiable function of the observations and all other data.
 
@@ -118,7 +120,7 @@ class LinearisedSolution(eqx.Module):
             for name, space in self.declared.named_spaces
         }
 
-    def residuals(self, change: Tangent, data: Data):
+    def residuals(self, change: Tangent, data: Data) -> tuple[Float[Array, "chunks length r"], ...]:
         """v/σ after a change of the unknowns."""
         plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
         change = {name: x * plan.groups[name].free for name, x in change.items()}
@@ -168,14 +170,14 @@ def linearise(
 def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
-    def penalised(change):
+    def penalised(change: Tangent) -> Float[Array, ""]:
         penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
         return half_square(at.plan, at.residuals(change, data)) + 0.5 * penalty
 
     return jax.grad(penalised)(change)
 
 
-def _solve_structured(times, at: LinearisedSolution, b: Tangent) -> Tangent:
+def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Tangent:
     """H⁻¹·b by the factor, differentiable as the solution of H·x = b.
 
     Refined once with the residual, computed without N: like the corrected seminormal equations
@@ -187,7 +189,7 @@ def _solve_structured(times, at: LinearisedSolution, b: Tangent) -> Tangent:
     flat = lambda tree: ravel_pytree(tree)[0]
     factor = lambda b: flat(elimination.solve(at.factor, unravel(b)))
 
-    def improved(times, b):
+    def improved(times: Callable, b: Float[Array, " n"]) -> Float[Array, " n"]:
         x = factor(b)
         return x + factor(b - times(x)) if at.plan.reduction in FACTORS else x
 
@@ -202,11 +204,11 @@ def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
 
 
 @_propagate.def_jvp
-def _(primals, tangents):
+def _(primals: tuple, tangents: tuple) -> tuple[Tangent, Tangent]:
     change, at, data = primals
     data, still = differentiable_once(data, FIRST_ORDER_ONLY), zero_tangent(at.plan)
 
-    def right(data):
+    def right(data: Data) -> Tangent:
         # J is constant except for its weights.
         constant = dataclasses.replace(at.data, weight=data.weight)
         transposed = jax.vjp(lambda change: at.residuals(change, constant), still)[1]

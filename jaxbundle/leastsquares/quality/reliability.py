@@ -15,7 +15,7 @@ along n = L⁻¹·eᵢ/|L⁻¹·eᵢ|, so that w = nᵀu/√(1 − h) with h = n
 [0, 1] from uncontrolled to fully controlled, which does not hold for correlated ones.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.leastsquares.equations.linearise import differentiate_chunks
 from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
@@ -42,7 +42,9 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
 UNCONTROLLED = 1e-8
-"""Redundancy numbers below this are rounding: the observation is uncontrolled."""
+"""Redundancy numbers below this are rounding: the observation is uncontrolled. 1 − h of a number h
+near 1 has an error of 1e-16 times the condition of N, 1e4 to 1e6 in common networks; above it w is
+right to some per cent, and the smallest detectable blunder is 4e4 σ."""
 
 
 class Reliability(eqx.Module):
@@ -78,7 +80,12 @@ def reliability(
     return Reliability(**columns)
 
 
-def _uncorrelated(weight, v, hat, own):
+def _uncorrelated(
+    weight: Float[Array, "n r"],
+    v: Float[Array, "n r"],
+    hat: Float[Array, "n r"],
+    own: Float[Array, "n r"],
+) -> dict[str, Float[Array, "n r"]]:
     used = weight > 0
     return {
         "residual": v,
@@ -91,7 +98,12 @@ def _uncorrelated(weight, v, hat, own):
     }
 
 
-def _correlated(weight, u, hat, own):
+def _correlated(
+    weight: Float[Array, "n r r"],
+    u: Float[Array, "n r"],
+    hat: Float[Array, "n r r"],
+    own: Float[Array, "n r r"],
+) -> dict[str, Float[Array, "n r"]]:
     """Of whitening matrices L⁻¹ [n, r, r] and blocks B of the same shape."""
     used = diagonal_of(weight) > 0
     L = _invert_lower(jnp.where(used[..., None], weight, jnp.eye(weight.shape[-1])))
@@ -112,7 +124,9 @@ def _correlated(weight, u, hat, own):
     }
 
 
-def _test(standard, hat, used):
+def _test(
+    standard: Float[Array, "n r"], hat: Float[Array, "n r"], used: Bool[Array, "n r"]
+) -> Float[Array, "n r"]:
     controlled = used & (1 - hat > UNCONTROLLED)
     return jnp.where(controlled, standard / jnp.sqrt(jnp.where(controlled, 1 - hat, 1.0)), jnp.nan)
 
@@ -128,7 +142,9 @@ def _invert_lower(W: Float[AnyArray, "n r r"]) -> Float[AnyArray, "n r r"]:
     return jnp.stack(rows, 1)
 
 
-def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: ChunkedData, Q: Cofactors):
+def hat_blocks(
+    declared: Declared, plan: Plan, values: Values, laid: ChunkedData, Q: Cofactors
+) -> Iterable[tuple[Array, ...]]:
     """Of every part, from the blocks of Q that each observation touches: whitened residuals
     [chunks, length, r], B, and its part E·V⁻¹·Eᵀ of the eliminated row alone; of B the diagonal,
     or for correlated observations all of it, [chunks, length, r, r]."""
@@ -136,19 +152,26 @@ def hat_blocks(declared: Declared, plan: Plan, values: Values, laid: ChunkedData
     found = []
     for number in range(len(plan.parts)):
         correlated = isinstance(laid.weight[number][0], tuple)
-        of_chunk = partial(_of_chunk, Q, correlated)
+        of_chunk = partial(_hat_of_chunk, Q, correlated)
         found.append(differentiate_chunks(declared, plan, number, prepared, laid, of_chunk))
     return zip(*found) if found else ((), (), ())
 
 
-def _of_chunk(Q: Cofactors, correlated: bool, part: ObservationPart, r, touches, E):
-    """The same of one chunk, [length, …]."""
+def _hat_of_chunk(
+    Q: Cofactors,
+    correlated: bool,
+    part: ObservationPart,
+    r: Float[Array, "length r"],
+    touches: tuple[Float[Array, "length r w"], ...],
+    E: Float[Array, "length r e"] | None,
+) -> tuple[Array, Array, Array]:
+    """`hat_blocks` of one chunk, [length, …]."""
     block = lambda a, b: jnp.einsum("lic,ljc->lij", a, b)
     form = block if correlated else lambda a, b: jnp.sum(a * b, -1)
     hat = own = jnp.zeros((*r.shape, r.shape[-1]) if correlated else r.shape)
     if touches:
         J = jnp.concatenate(touches, -1)
-        hat = form(J @ _of_kept(part, Q), J)
+        hat = form(J @ _kept_cofactors(part, Q), J)
     if E is not None:
         root = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
         own = form(root, root)
@@ -161,7 +184,7 @@ def _of_chunk(Q: Cofactors, correlated: bool, part: ObservationPart, r, touches,
     return r, hat, own
 
 
-def _of_kept(part: ObservationPart, Q: Cofactors):
+def _kept_cofactors(part: ObservationPart, Q: Cofactors) -> Float[Array, "n n"]:
     """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
     touches = part.touches
     cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
@@ -184,7 +207,9 @@ def _of_kept(part: ObservationPart, Q: Cofactors):
     return jnp.block(blocks)
 
 
-def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
+def minimal_detectable(
+    sigma: Float[AnyArray, "..."], redundancy: Float[AnyArray, "..."], delta0: float = 4.13
+) -> Float[np.ndarray, "..."]:
     """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %); for
     correlated observations with σ/`gain` and 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)
@@ -193,7 +218,9 @@ def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndar
     )
 
 
-def external_reliability(redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
+def external_reliability(
+    redundancy: Float[AnyArray, "..."], delta0: float = 4.13
+) -> Float[np.ndarray, "..."]:
     """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ; for
     correlated observations with 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)

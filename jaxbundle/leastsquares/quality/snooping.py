@@ -34,12 +34,15 @@ from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quan
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.weights import used, without_residual
+from jaxbundle.types import AnyArray
 
 REMOVED_TOGETHER = 0.5
-"""Observations are removed together with the worst if their test is at least this fraction of
-its."""
+"""Observations are removed together with the worst if their test is at least this fraction of its.
+Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
+others, and must be found again by the last test."""
 STEPPING = 20_000
-"""Problems with at least this many observations take single steps between removals."""
+"""Problems with at least this many observations take single steps between removals: below, the
+iterations of an adjustment (0.5 µs an observation each) take less time than compiling the step."""
 
 Adjust = Callable[[Problem, Values], Solution]
 """The solution of a problem from start values; raises if there is none."""
@@ -143,7 +146,13 @@ def snoop(
     return found, removed
 
 
-def _solve(whole: Problem, removed, excluded: set[int], values, adjust_from: Adjust) -> Solution:
+def _solve(
+    whole: Problem,
+    removed: Sequence[Removed],
+    excluded: set[int],
+    values: Values,
+    adjust_from: Adjust,
+) -> Solution:
     """The solution without removed observations and `excluded` eliminated rows, to which those are
     added that the remaining observations do not determine."""
     while True:
@@ -187,14 +196,18 @@ class _Touched:
         return sum(int((w > 0).sum()) for w in weight)
 
 
-def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> list[Removed]:
+def _worst(
+    found: Solution, touched: _Touched, unit: float, critical: float, apart: float
+) -> list[Removed]:
     """The observations to remove now, the worst first; tests in `unit`.
 
     Observations of a row are separable if the test of the suspect exceeds `apart` without the
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [
-        Removed(o, *_place(tests[o]), float(tests[o].max()))
+        Removed(
+            o, *map(int, np.unravel_index(tests[o].argmax(), tests[o].shape)), float(tests[o].max())
+        )
         for o in touched.single
         if tests[o].size
     ]
@@ -236,13 +249,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     ]
 
 
-def _place(tests):
-    """Row and residual of the largest."""
-    row, residual = np.unravel_index(tests.argmax(), tests.shape)
-    return int(row), int(residual)
-
-
-def _leverage(found: Solution):
+def _leverage(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """h̃/r of every observation, the largest of its residuals: h minus the part of its eliminated
     row alone."""
     tested, tiny = found.reliability, np.finfo(float).tiny
@@ -282,7 +289,9 @@ class _Neighbours:
         return tuple(rows[o][alternatives].tolist())
 
 
-def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
+def _passing(
+    whole: Problem, found: Solution, touched: _Touched, removed: Sequence[Removed], critical: float
+) -> set[tuple[str, int, int | None]]:
     """Sets, rows and residuals of removed observations that agree with the adjustment without
     them."""
     aside = np.zeros(0, bool)
@@ -299,7 +308,7 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
 
 
 def _with_tests(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
-    """The same with the tests of initially doubtful observations."""
+    """What was removed, with the tests of initially doubtful observations."""
     for r, tests in _test_removed(whole, found, removed):
         yield r if np.isfinite(r.test) else dataclasses.replace(r, test=tests[0])
 
@@ -338,7 +347,9 @@ def _remove(weight: Float[np.ndarray, "n ..."], removed: Removed) -> None:
         weight[rows] = [without_residual(weight[row], removed.residual) for row in rows]
 
 
-def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
+def _without_passing(
+    removed: Sequence[Removed], passing: set[tuple[str, int, int | None]]
+) -> Iterable[Removed]:
     """The observations that stay removed. If all inseparable ones pass individually, they still
     contradict each other and all stay removed."""
     for r in removed:
@@ -349,7 +360,7 @@ def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
             yield dataclasses.replace(r, row=stay[0], others=stay[1:])
 
 
-def _finite(tests) -> Float[np.ndarray, "..."]:
+def _finite(tests: Float[AnyArray, "..."]) -> Float[np.ndarray, "..."]:
     """|tests|, 0 if there is none."""
     tests = np.abs(np.asarray(tests))
     return np.where(np.isfinite(tests), tests, 0.0)
