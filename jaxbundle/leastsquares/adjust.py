@@ -160,6 +160,7 @@ class Result:
     def _residuals(self, o: str) -> dict[str, Float[np.ndarray, "n r"]]:
         found, weight = self.solution.reliability, self.problem.weights(o)
         used = weight > 0
+        # The inner `where` keeps 1/0 out of the unused branch.
         sigma = np.where(used, 1 / np.where(used, weight, 1.0), np.inf)
         w, gain = found.w[o], np.where(used, found.gain[o], 1.0)
         free = np.where(used, np.clip(1 - found.hat[o], 0, 1), 0.0)
@@ -273,6 +274,8 @@ def adjust(
             )
         )
         found = Solution(problem, minima[-1].values)
+        # The first solution may fail: the result says so. Later ones start at a solution; if they
+        # fail, the weights left unknowns undetermined, and no result would be true.
         if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
             names = undetermined(problem, minima[-1].values)
             what = ", ".join(names[:8])
@@ -280,6 +283,7 @@ def adjust(
         return found
 
     found, removed, suspects, factors = again(problem, problem.data.start), [], [], {}
+    # Iterations may have gone without a factor; statistics need one.
     problem = with_factor(problem)
     first = Result(problem, minima[-1])
     if not (first.converged and (robust or snooping or estimate_components)):

@@ -1,5 +1,8 @@
 """Points at any distance, up to infinity: their parametrisation in the engine."""
 
+# Arguments that `Space` prescribes:
+# ruff: noqa: ARG002
+
 import dataclasses
 
 import jax.numpy as jnp
@@ -51,6 +54,7 @@ class AnyDistance:
     ) -> Float[Array, " 4"]:
         A, c = _frame(value)
         moved, s = value[:3] + A @ change, value[3]
+        # 1 + c·δ₃ ≤ 0 would put the point behind the origin, through infinity: it stops there.
         least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, LARGEST_DISTANCE * s, 1.0), 0.0)
         return value.at[:3].set(moved / jnp.maximum(1 + c * change[2], least))
 
@@ -109,6 +113,7 @@ def _frame(value: Float[Array, " 4"]) -> tuple[Float[Array, "3 3"], Float[Array,
     r = length(X)
     across = jnp.sqrt(r * r + s * s) * tangent_basis(X / r)
     A = jnp.concatenate([across, -s * X[:, None] / r], 1)
+    # One program for points of both kinds: which a point is, is data.
     far = s > 0
     return jnp.where(far, A, jnp.eye(3)), jnp.where(far, r / jnp.where(far, s, 1.0), 0.0)
 
@@ -116,6 +121,7 @@ def _frame(value: Float[Array, " 4"]) -> tuple[Float[Array, "3 3"], Float[Array,
 def _transform(motion: Float[Array, " 7"], value: Float[Array, " 4"]) -> Float[Array, " 4"]:
     """A point that moves with space; at infinity only its direction rotates."""
     moved = transform_point(motion, value[:3])
+    # A point at infinity does not shift: a direction, kept at its distance.
     turned = moved - transform_point(motion, jnp.zeros(3))
     turned = turned * length(value[:3]) / length(turned)
     far = jnp.sqrt(value[:3] @ value[:3]) > 0.99 * LARGEST_DISTANCE * value[3]

@@ -12,6 +12,9 @@ which is always 0, and additional outputs witness·x, also 0, for all quantities
 their derivative by the witness is x.
 """
 
+# Arguments that the interfaces of lineax and `Space` prescribe:
+# ruff: noqa: ARG002
+
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -83,6 +86,7 @@ def stock_problem(
         data = pad_data(problem, data)
         values, laid = _values(problem, data, scale, change), lay_out_data(plan, data)
         places, measured = fill_places(plan, laid)
+        # ∂(witness·x)/∂witness = x: how the linear solver gets the values at which N is formed.
         seen = jax.tree.map(lambda x: witness * x, (values, laid))
         return {"residuals": residuals(declared, places, values, measured), "seen": seen}
 
@@ -132,6 +136,7 @@ class EliminationOfJacobian(lx.AbstractLinearSolver):
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[NormalFactor, lx.AbstractLinearOperator]:
         found, damping = operator.mv((zero_tangent(self.plan), jnp.ones(()))), jnp.zeros(())
+        # Stock damping stacks √λ·1 below J: its product with the witness column is √λ.
         if isinstance(found, tuple):
             found, (_, root) = found
             damping = root**2

@@ -47,6 +47,8 @@ def determine(
             tables.pop(e)
             functions.append(blank | {t: np.asarray(x)[: len(blank[t])] for t, x in tables.items()})
         rows = {t: np.stack([f[t] for f in functions]) for t in blank}
+        # V⁻¹ is the intersection with images given; V⁻¹WᵀQWV⁻¹ what their own uncertainty adds, in
+        # the datum of the adjustment, by propagation of three linear functions for each point.
         cofactors.append(np.asarray(inverse[row]) + found.propagate_rows(rows))
     return without_filling(problem, values), np.array(cofactors)
 

@@ -299,6 +299,8 @@ def _whitening(
             f"{list(covariance.shape)}"
         )
     size = np.sqrt(np.einsum("nii,njj->nij", covariance, covariance))
+    # 1e-9: rounding of a covariance that was computed, or printed with nine digits; Cholesky reads
+    # one triangle alone and would not see the other.
     if not (np.abs(covariance - covariance.mT) <= 1e-9 * size).all():
         raise InputError(f"{name}: a covariance is not symmetric or not finite")
     try:

@@ -82,6 +82,7 @@ class Problem:
     def reduced_size(self) -> int:
         """Unknowns of the reduced system, including held ones."""
         e = self.plan.eliminated
+        # With held columns: the matrix has them, with ones on its diagonal.
         kept = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
         return kept if e is None else kept + self.kept_rows.sum() * self.table(e).space.width
 
@@ -140,8 +141,9 @@ def make_problem(
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple((o.name, o.kind) for o in observations), spaces, motions)
     ways = REDUCTIONS if reduction is None else (reduction,)
+    # The plan depends on which rows meet and what is free, not on values.
     planned = _make_plan(tables, observations, eliminate, ways, planning)
-    data = make_data(declared, tables, observations)
+    data = make_data(tables, observations)
     problem = Problem(
         tables,
         observations,
@@ -177,7 +179,7 @@ def choose_rounding(
 ) -> Callable[[Hashable, int], int]:
     """The rounding of plan sizes for this number of observations."""
     large = is_large(observations, settings)
-    return lambda key, n: n if large else round_up(n)
+    return lambda _key, n: n if large else round_up(n)
 
 
 def is_large(observations: Sequence[Observations], settings: PlanningSettings) -> bool:
@@ -228,6 +230,7 @@ def with_motions_at(problem: Problem, values: Values) -> Problem:
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
     floating = dataclasses.replace(problem.plan, datum=None)  # As in `make_problem`.
     gauge = find_open_motions(survey_motions(problem.declared, floating, data, real))
+    # The defect is that of the start values, whatever it is by chance elsewhere.
     if gauge.shape != datum.gauge.shape:
         return problem
     datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
@@ -261,6 +264,7 @@ def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"
             if m.table == table:
                 part = wide if m.rows is None else wide[np.asarray(m.rows)]
                 now = np.array(group.free)
+                # `all_free` off: the mask takes part from now on, in another program.
                 now[:, m.start : m.start + m.width] = part[: len(now)]
                 group = dataclasses.replace(group, free=jax.device_put(now), all_free=False)
         groups[name] = group
@@ -333,6 +337,7 @@ def check_numbers(
         for rows in jax.tree.leaves(given.measured):
             bad = ~np.isfinite(rows).reshape(given.number, math.prod(np.shape(rows)[1:]))
             counts = used(weight)
+            # Measured values without weight may be anything: excluded observations keep their rows.
             bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
             if bad.any():
                 row = int(np.argwhere(bad)[0][0])
@@ -342,9 +347,7 @@ def check_numbers(
                 )
 
 
-def make_data(
-    declared: Declared, tables: Sequence[Table], observations: Sequence[Observations]
-) -> Data:
+def make_data(tables: Sequence[Table], observations: Sequence[Observations]) -> Data:
     """The data of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = weights_of(tables, observations)
@@ -375,6 +378,7 @@ def _evaluate(
 ) -> tuple[Scalar, ...]:
     """The residuals of one observation."""
     blocks = [space.move(space.prepare(v), ()) for space, v in zip(spaces, values)]
+    # Only shapes are computed (`eval_shape`): how many residuals a kind has is nowhere declared.
     first = scalars(jax.tree.map(lambda x: x[None], measured))
     return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], first))
 
@@ -463,6 +467,8 @@ def _measured_squares(
     """The sum of the squares of measured values divided by their σ, which gives the rounding of the
     residuals. Of several arrays the largest of those with one number for each residual counts; if
     there is none, the largest number of each observation."""
+    # Of correlated observations 1/σ given the others of its row: an estimate of rounding needs no
+    # more.
     w = diagonal(np.asarray(weight))
     size = lambda m: (len(w), math.prod(np.shape(m)[1:]))
     arrays = [np.asarray(m).reshape(size(m)) for m in jax.tree.leaves(measured)]

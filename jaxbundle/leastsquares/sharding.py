@@ -71,6 +71,8 @@ def sharing_devices() -> list:
 def distribute(problem: Problem, devices: Sequence[jax.Device] | None = None) -> Shards:
     """Cut a problem with an eliminated table into a part for every device."""
     devices = sharing_devices() if devices is None else devices
+    # Every part is planned as a problem of its own, with the choices of the whole: chunk lengths,
+    # groups and blocks are the same on all devices, which run one program.
     rows, seen = _cut(problem, len(devices))
     planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
     sizes = common(
@@ -108,6 +110,7 @@ def find_minimum_of_shards(
         raise NotSolvedError(
             f"not solved: one of {number} processes ended, or cannot be reached ({why})"
         ) from None
+    # Kept rows come from all devices, identical: the first one counts.
     _, back = np.unique(np.concatenate(shards.rows), return_index=True)
     own = lambda x: np.concatenate([x[d, : len(rows)] for d, rows in enumerate(shards.rows)])[back]
     values = minimum.values | {e: jax.tree.map(own, minimum.values[e])}
@@ -117,6 +120,7 @@ def find_minimum_of_shards(
 @compile_once
 def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
     """The results of all devices; eliminated rows [devices, rows, …]."""
+    # The device axis is the first of every array; on a device it is 1 and is taken off.
     arrays, static = eqx.partition((solver.plan, data, start), eqx.is_array)
 
     def on_device(arrays: PyTree) -> Minimum[Values]:
@@ -136,6 +140,7 @@ def _place(mesh: Mesh, parts: Sequence[PyTree]) -> Any:
     spread = NamedSharding(mesh, PartitionSpec(AXIS))
 
     def make(*x: np.ndarray) -> jax.Array:
+        # Every process makes the parts of its own devices only.
         own = lambda at: x[0 if at is None else at[0].start or 0][None]
         return jax.make_array_from_callback((len(x), *x[0].shape), spread, own)
 
@@ -158,6 +163,8 @@ def _cut(
     # An observation costs as much as three pairs of incidences: BAL 16, one core, 24 ms for the
     # derivatives, sums and residuals of 83 718 observations, 14 ms for 170 046 pairs.
     work = np.where(tied, 0.0, met * (met - 1) / 2 + 3.0 * met)
+    # A row belongs to the device in whose equal share of the work its middle lies: contiguous rows,
+    # whose observations were laid out together.
     middle = (np.cumsum(work) - work / 2) / max(work.sum(), 1.0)
     owner = np.where(tied, 0, np.minimum((parts * middle).astype(int), parts - 1))
     owners = {o.name: owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)}
@@ -170,6 +177,8 @@ def _plan_part(
 ) -> tuple[Plan, Sizes]:
     """The plan of some eliminated rows and observations, on the host, and its sizes."""
     e, groups = present(problem.plan.eliminated), problem.plan.groups.items()
+    # The masks of the whole problem, too: a part in which all rows happen to be free would be
+    # another program.
     free = {("all free", name): group.all_free for name, group in groups}
     choices: dict[Hashable, Any] = {**problem.choices, **free}
     choices["stays",] = choices["stays",][rows]

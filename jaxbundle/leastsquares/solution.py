@@ -83,6 +83,7 @@ def find_minimum(
     for _ in range(10):
         there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
+        # No weighted points: motions change no observation at all, and the minimum stays one.
         if there is problem or not bool(converged(minimum.termination)):
             break
         # Open combinations need not form a group (one open height of a point, say): the motion to
@@ -138,6 +139,8 @@ def _worth_sharing(problem: Problem, start: Values, min_observations: int = 10_0
 def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
     if problem.plan.datum is None:
         return values
+    # By programs per table, compiled once for all problems; the rare deformation that needs Newton
+    # steps compiles a program for its own.
     moved, there = move_into_datum(problem.declared, problem.plan, values, start)
     if not there:
         moved, _ = _move_by_newton(problem.declared, problem.plan, values, start)
@@ -187,6 +190,7 @@ class Solution:
     @functools.cached_property
     def residuals(self) -> Rows:
         """All residuals divided by their σ."""
+        # Residuals do not depend on the datum, whose motions at these values need not be surveyed.
         declared, plan = self._as_given.declared, self._as_given.plan
         return self._rows(_residuals(declared, plan, self._values, self._data))
 
@@ -209,6 +213,7 @@ class Solution:
     @property
     def determined(self) -> bool:
         """Whether no unknown is so weak that its σ is rounding noise."""
+        # NaN pivots, of a matrix that is not positive definite, are no better than small ones.
         pivots = np.abs(np.asarray(self.factor.reduced.pivots))
         return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > PIVOT)
 
@@ -246,6 +251,8 @@ class Solution:
         the adjustment and from the other residuals of their row."""
         given = (*self.arguments[:3], pad_data(self.problem, data))
         found = reliability(*given, self.cofactors)  # a program that is there already
+        # v/σ of an observation that was not used has the variance 1 + h, not 1 − h: h from the
+        # unknowns, 1 from itself.
         v, h = self._rows(found.standard), self._rows(found.hat)
         return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
@@ -303,6 +310,7 @@ def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Norma
 
 def without_plan(factor: NormalFactor) -> NormalFactor:
     """A factor without its plan, which a compiled function would copy."""
+    # Results of compiled functions are copies, also of arguments passed through.
     is_plan = lambda x: isinstance(x, Plan)
     return jax.tree.map(lambda x: PLAN_PLACEHOLDER if is_plan(x) else x, factor, is_leaf=is_plan)
 

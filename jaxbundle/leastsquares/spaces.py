@@ -13,6 +13,9 @@ and XLA compiles the observation equations to plain loops over the observations 
 of small matrix products).
 """
 
+# Arguments that `Space` prescribes:
+# ruff: noqa: ARG002
+
 import dataclasses
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -90,6 +93,7 @@ class Vector:
             return block
         block = list(block)
         for column, k in zip(*self.moves):
+            # Tied columns change with theirs, as fy with fx.
             block[column] = block[column] + change[k]
         return tuple(block)
 
@@ -116,6 +120,7 @@ class Vector:
         if not self.size:
             return jnp.where(free[0] > 0, value, given) if self.width else given
         columns, of = (jnp.array(x, int) for x in self.moves)
+        # A tied column is held with the one it follows.
         moves = jnp.zeros(self.size).at[columns].set(free[of])
         return jnp.where(moves > 0, value, given)
 
@@ -135,6 +140,7 @@ class Turned(NamedTuple):
         ray = tuple(m[3 * i] * X[0] + m[3 * i + 1] * X[1] + m[3 * i + 2] * X[2] for i in range(3))
         if self.turn is None:
             return ray
+        # exp([θ]×) ≈ 1 + [θ]× + ½[θ]×²: to second order, since Hessians are taken at θ = 0.
         first = cross(self.turn, ray)
         second = cross(self.turn, first)
         return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first, second))
@@ -147,6 +153,7 @@ class Turned(NamedTuple):
     def apply_inverse(self, x: Triple) -> Triple:
         """Mᵀ·x."""
         if self.turn is not None:
+            # The inverse rotation: θ → −θ, by the order of the product.
             first = cross(x, self.turn)
             second = cross(first, self.turn)
             x = tuple(a + b + 0.5 * c for a, b, c in zip(x, first, second))
@@ -283,6 +290,7 @@ class Frame:
 
     def retract(self, value: PoseValue, change: Float[AnyArray, " width"]) -> PoseValue:
         every = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)
+        # The shift is along the axes of the frame as it is, not as it will be.
         shift = matrix_from_quaternion(value.rotation).T @ every[:3]
         return PoseValue(value.position + shift, retract_quaternion(value.rotation, every[3:]))
 
@@ -319,6 +327,7 @@ class Direction:
             return value
         square = sum(d * d for d in change)
         return tuple(
+            # cos|δ| and sin|δ|/|δ| to second order.
             v * (1 - 0.5 * square) + sum(b * d for b, d in zip(row, change))
             for v, row in zip(value, basis)
         )
@@ -349,6 +358,7 @@ class Direction:
 def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
     """Columns orthogonal to a unit vector: those of a reflection that takes it to ∓ its last axis,
     without the last."""
+    # The sign that adds: the axis of the reflection is then never zero, wherever the vector points.
     sign = jnp.where(value[-1] < 0, -1.0, 1.0)
     axis = value.at[-1].add(sign)
     reflection = jnp.eye(len(value)) - 2 * jnp.outer(axis, axis) / (axis @ axis)

@@ -35,6 +35,8 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
             rows = len(jax.tree.leaves(value)[0])
             found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
             continue
+        # A declaration of this table alone, equal for all of its kind: the key of the shared
+        # program.
         motions = Motions(given.names, action)
         one = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
         of_rows = lambda rows, one=one: _generators(one, {TABLE_ALONE: rows})[TABLE_ALONE]
@@ -70,6 +72,7 @@ def move_into_datum(
         }
         return moved, float(datum.largest(pinned.weight, change))
 
+    # Larger than any step, so that the first one is taken.
     distance, before, count = 1e300, np.inf, 0
     with np.errstate(all="ignore"):
         while datum.moves_on(size, distance, before, count):

@@ -69,6 +69,8 @@ def generators(declared: Declared, values: Values) -> Tangent:
         if act is None:
             rows = jax.tree.leaves(values[name])[0].shape[0]
             return jnp.zeros((rows, space.width, motions))
+        # Only first derivatives at motion 0 are needed; there motions in sequence equal
+        # simultaneous ones, whose quadrature would be compiled for nothing.
         act = getattr(act, "near", act)
         difference = getattr(space, "small_difference", space.difference)
         change = lambda value, m: difference(act(m, value), value)
@@ -116,6 +118,8 @@ def leave_held(
     rows = jnp.concatenate(
         [(moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()]
     )
+    # The combination of motions c that leaves held unknowns, R·(g − c) = 0, with the smallest c: c
+    # = (RᵀR)⁺RᵀR·g, columns scaled, since radians stand beside metres.
     A = rows.T @ rows
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
@@ -132,6 +136,7 @@ def s_transform(
     if plan.datum is None:
         return change
     G, B = datum_directions(declared, plan, values, moves)
+    # BᵀG is as small as the defect: at most 7 × 7.
     gram = contract(plan, B, G)
     along = jnp.linalg.solve(gram, contract(plan, B, change))
     return {name: d - G[name] @ along for name, d in change.items()}
@@ -204,6 +209,8 @@ def moves_on(
 ) -> Bool[AnyArray, ""]:
     """Whether a motion to the datum continues after a step of `distance` and a previous one of
     `before`."""
+    # Far from its end a motion may overshoot for some steps; near it, one that does not halve is
+    # rounding.
     falling = (distance > settings.small * size) | (distance < 0.5 * before)
     return (distance > settings.reached * size) & falling & (count < settings.max_steps)
 
@@ -280,6 +287,8 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     # First remove the remaining motion, so that derivatives are taken at zero motion.
     known = jax.lax.stop_gradient((values, start))
     slope = jax.jacfwd(_missing)(still, fixed, known)
+    # `values` are in the datum to 1e-12 already: one Newton step of rounding size, but with it the
+    # root below is exactly zero, where its equation is differentiated.
     values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
     tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
     return along(tau, values, values)
@@ -320,5 +329,6 @@ def contract(plan: Plan, B: Tangent, x: Tangent) -> Float[Array, "defect ..."]:
     """Bᵀx over all rows; x may have an additional last axis."""
     parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
     e = plan.eliminated
+    # Kept rows are on all devices, eliminated ones on one each.
     kept = sum(part for name, part in parts.items() if name != e)
     return kept if e is None else kept + total(plan, parts[e])

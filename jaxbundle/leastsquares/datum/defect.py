@@ -91,6 +91,7 @@ def _survey(
             blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
         if not blocks:  # Held tables only: it determines nothing.
             continue
+        # |J|·|G|: the size of the terms that cancel, for the scale of what remains.
         total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
         product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
         # Non-finite values at the start are ignored here; the solver will report them.
@@ -116,9 +117,12 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
     held = held / scale
+    # A held unknown that moves at all holds: every row counts the same.
     size = np.linalg.norm(held, axis=1, keepdims=True)
     rows = [held / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
     scales = [np.ones_like(scale), *[scale] * len(survey.products)]
+    # Directions with J·G = 0. Of the Gram matrix (JG)ᵀJG eigenvalues below 1e-16 of the largest are
+    # noise: open and weak (1e-8) would look alike; hence the triangle of a QR.
     _, singular, directions = np.linalg.svd(_triangle(rows, scales))
     return directions[singular < OPEN].T / scale[:, None]
 
@@ -181,6 +185,8 @@ def _choose_pins(
     """As many kept unknowns as the defect, chosen well spread; every kind of direction is
     normalised by its size, unless that is rounding."""
     rows, shapes = [], []
+    # Coordinates of a large block move by kilometres in a rotation, its angles by radians: without
+    # this all pins would be coordinates.
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
     least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
@@ -201,6 +207,8 @@ def _pick_rows(
     G: Float[np.ndarray, "rows defect"], candidates: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, " rows"]:
     """1 for as many independent rows of G as it has columns, 0 for the others."""
+    # Pivoting by the largest row, of an orthonormal basis: the unknowns that hold the datum best
+    # (D-optimal step by step), e.g. points far apart.
     q, _ = np.linalg.qr(G)
     rows = q * candidates[:, None]
     chosen = np.zeros(len(rows))

@@ -105,6 +105,7 @@ def move_at_once(
     """The motion with shift after rotation and scale that equals a simultaneous one: ∫₀¹ A(u)·t du,
     A(u) the rotation and scale after the time u (Gauss–Legendre, to rounding up to two turns and a
     scale of e⁵)."""
+    # A shift per unit of time, rotated and scaled by what has happened until then.
     still = motion.at[:size].set(0.0)
     moved = jax.vmap(lambda u: transform(u * still, motion[:size]))((NODES + 1) / 2)
     return still.at[:size].set(WEIGHTS / 2 @ moved)

@@ -40,6 +40,7 @@ def _measure_group(
     if all(chart is None for chart in charts):
         diagonal = jnp.diagonal(blocks, axis1=1, axis2=2)
         return jnp.where(diagonal > 0, diagonal, 1.0)
+    # A group may hold several tables (a pose and its camera): each with its own chart, or none.
     T = inverse = jnp.broadcast_to(jnp.eye(blocks.shape[1]), blocks.shape)
     for member, chart in zip(group.members, charts):
         at = slice(member.start, member.start + member.width)
@@ -52,6 +53,7 @@ def _measure_group(
         N: Float[Array, "w w"],
         free: Float[Array, " w"],
     ) -> Float[Array, "w w"]:
+        # Tᵀ·diag(M)·T with M = T⁻ᵀ·N·T⁻¹, N in the unknowns of the chart.
         D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
         D = D * free * free[:, None]  # Held unknowns are decoupled from free ones.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))

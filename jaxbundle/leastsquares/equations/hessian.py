@@ -51,7 +51,7 @@ def _derivatives(
     """½|v|² of every observation of a part, its gradient and Hessian by all directions of its
     slots, with a column of zeros at the end."""
     part = plan.parts[number]
-    kind, widths = declared.kinds[part.set_name], widths_of(declared, plan, part)
+    kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     one = _HalfSquare(residual_of(declared, part), widths)
     return map_observations(part, kind, prepared, laid, number, one)
 
@@ -66,6 +66,8 @@ class _HalfSquare:
     def __call__(
         self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
     ) -> tuple[Array, Array, Array]:
+        # One vector of all directions of all slots: H has the mixed second derivatives of slots,
+        # too.
         ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
 
         def half_square(x: Float[Array, " n"]) -> Scalar:
@@ -76,7 +78,10 @@ class _HalfSquare:
             cost, g = jax.value_and_grad(half_square)(x)
             return g, (cost, g)
 
+        # Forward over reverse: as many forward passes as directions over one reverse pass, instead
+        # of reverse over reverse, which would keep every intermediate value twice.
         hessian, (cost, g) = jax.jacfwd(gradient, has_aux=True)(jnp.zeros(ends[-1]))
+        # The zero at the end is column −1, for directions that a touch lacks.
         return cost, jnp.pad(g, (0, 1)), jnp.pad(hessian, (0, 1))
 
 
@@ -88,7 +93,7 @@ def _blocks(
     H: Float[Array, "chunks length n n"],
 ) -> Contribution:
     """The contribution of a part, see `Sums.add_part`."""
-    widths = widths_of(declared, plan, part)
+    widths = widths_of(declared, part)
 
     def columns(slots: Slots, start: int, stop: int) -> Int[np.ndarray, " w"]:
         at = columns_of(widths, slots, start, stop)
@@ -108,6 +113,7 @@ def _blocks(
     summed, right, eliminated, W = H.sum(1), g.sum(1), None, []
     if part.slot is not None:
         e = columns(((part.slot, 0),), 0, widths[part.slot])
+        # V and W of observations, as in Gauss–Newton, from H instead of JᵀJ.
         own = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
         flat = lambda x: x.reshape(-1, *x.shape[2:])
         beside = (g[..., e] * own[1])[..., None]

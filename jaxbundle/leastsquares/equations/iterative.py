@@ -57,6 +57,8 @@ class ConjugateGradients(eqx.Module):
         times = lambda indices, x: {
             g: jnp.einsum(indices, M, x[g]) for g, M in self.lower_inverse.items()
         }
+        # One preconditioner on both sides keeps the operator symmetric. The residual is then in
+        # units of σ with all else given, radians beside metres: one norm, one tolerance.
         divided, back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
         right, tag = divided(b), lx.positive_semidefinite_tag
         product = lambda y: divided(self._times(back(y)))
@@ -73,11 +75,14 @@ class ConjugateGradients(eqx.Module):
             change = lx.linear_solve(operator, left, method, throw=False).value
             better = jax.tree.map(jnp.add, y, change)
             after = jax.tree.map(jnp.subtract, right, product(better))
+            # Near the limit of rounding a run may end worse than it began.
             less = optx.two_norm(after) < optx.two_norm(left)
             return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
 
         nothing = jax.tree.map(jnp.zeros_like, right)
         reached = max(self.tolerance, self.reachable)
+        # Iterative refinement: the second run solves for the error of the first, whose residual is
+        # computed from scratch. One run to the full tolerance would iterate on rounding.
         y, left = improved(nothing, right, reached, self.max_steps)
         if self.tolerance < self.reachable:
             more = self.tolerance / self.reachable
@@ -127,6 +132,7 @@ def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
     """
     w = B.shape[1]
 
+    # Gauss–Jordan without pivoting, which a positive definite matrix does not need.
     def eliminate(k: Int[Array, ""], both: Float[Array, "rows w v"]) -> Float[Array, "rows w v"]:
         row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
         below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)

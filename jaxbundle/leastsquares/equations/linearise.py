@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.spaces import Block, Change
 from jaxbundle.types import Scalar, present
 
 
-def widths_of(declared: Declared, plan: Plan, part: ObservationPart) -> tuple[int, ...]:
+def widths_of(declared: Declared, part: ObservationPart) -> tuple[int, ...]:
     """The directions in which every slot of a part is differentiated."""
     of = declared.kinds[part.set_name].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
@@ -52,7 +52,7 @@ def differentiate(
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
     each, and of its eliminated rows (None without). Columns of held unknowns are zero."""
     part = plan.parts[number]
-    kind, widths = declared.kinds[part.set_name], widths_of(declared, plan, part)
+    kind, widths = declared.kinds[part.set_name], widths_of(declared, part)
     rows = _Rows(residual_of(declared, part), widths, part.large)
     r, found = map_observations(part, kind, prepared, laid, number, rows)
     # Computed once, not again in every loop that uses some of its columns.
@@ -63,6 +63,7 @@ def differentiate(
         columns = columns_of(widths, slots, start, stop)
         used = [starts[at[0]] + at[1] if at else starts[-1] for at in columns]
         if part.large:
+            # Columns that no slot of this part has, as those of another table of the group.
             nil = jnp.zeros(shape)
             parts = [[*columns, nil][c] for columns in found for c in used]
             return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
@@ -110,6 +111,7 @@ def differentiate_rows(
     r, found = map_blocks(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
     none = jnp.zeros((*r[0].shape, 0))
+    # A held slot has no derivatives: a block without columns.
     of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
     blocks = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
     return jnp.stack(r, -1), blocks
@@ -145,6 +147,7 @@ def differentiate_chunks(
 
     given = part, laid.measured[number], laid.weight[number]
     at_once = max(at_once // max(length, 1), 1)
+    # One chunk at a time would be a loop of tiny operations; all at once 1 kB an observation.
     if chunks > at_once:
         return jax.lax.map(of, given, batch_size=at_once)
     return jax.vmap(of)(given)
@@ -166,6 +169,9 @@ def _reverse(
     residual: Callable, widths: tuple[int, ...], row: tuple
 ) -> tuple[Change, list[list[Scalar]]]:
     """Residuals and the derivatives of each: tuples of scalars."""
+    # Scalars throughout: for as many residuals as an image point has, two passes of plain loops
+    # over all observations, which XLA fuses. Forward mode would need one pass per direction: 12 for
+    # a pose, a camera and a point (29 ms instead of 5 to 7 on BAL 16).
     weight = row[2]
     nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
     still = tuple((nil,) * w for w in widths)
@@ -199,5 +205,7 @@ def _forward(
 
 def _where_weighted(weight: Weight, i: int, columns: PyTree[Array]) -> Any:
     """Zero for an observation without weight, even if its derivative is not finite."""
+    # `where`, not a product with 0: the derivative of an unused observation may be infinite, as
+    # that of a distance between two equal points, and 0·∞ is NaN.
     w = diagonal_of(weight)[i]
     return jax.tree.map(lambda x: jnp.where(w > 0, x, 0.0), columns)

@@ -61,6 +61,8 @@ def local_touch(declared: Declared, part: ObservationPart) -> int | None:
     space = declared.spaces[kind.of[kind.local.slot]]
     if not isinstance(space, Vector) or space.tied or space.width < 2 * kind.local.number:
         return None
+    # Only a touch of this slot alone: beside other tables of its group the columns would not be
+    # those of the vector.
     alone = [[s for s, _ in touch.slots] == [kind.local.slot] for touch in part.touches]
     return alone.index(True) if any(alone) else None
 
@@ -78,13 +80,15 @@ def differentiate_locally(
     table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]
     values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in at)
     spaces = tuple(declared.spaces[name] for name in kind.of)
-    widths = list(widths_of(declared, plan, part))
+    widths = list(widths_of(declared, part))
     widths[local.slot] = local.number
     residual = _LocalResidual(kind, spaces)
     r, blocks = differentiate_rows(
         residual, tuple(widths), part, blocks, (measured, at, values), weight
     )
     group = plan.groups[part.touches[touch].group]
+    # From elements of the vector to columns of the group; held elements to a column beyond its
+    # width, where `mode="drop"` leaves them out.
     to = jnp.full(len(prepared[kind.of[local.slot]]), group.width)
     space = spaces[local.slot]
     assert isinstance(space, Vector)
@@ -122,7 +126,7 @@ class _Columns:
     def __call__(
         self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
     ) -> tuple:
-        assert self.kind.local is not None
+        assert self.kind.local is not None  # `weight` is passed to all functions of observations
         return self.kind.local.columns(*blocks, measured)
 
 
@@ -161,6 +165,8 @@ def products_of(
         products = jnp.einsum("kri,krj->kij", J, J)
         return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
 
+    # A loop over chunks, not one scatter: products of all observations would be m² numbers each,
+    # 16² instead of 2 · 16.
     nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # varying over the devices like J
     return jax.lax.scan(add, nothing, (row, J, columns))[0]
 
@@ -170,5 +176,6 @@ def spread(
 ) -> Float[Array, "chunks width *v"]:
     """Rows that belong to columns, summed over the observations of a chunk: [chunks, width, v]."""
     zero = jnp.zeros((found.shape[0], width, *found.shape[3:]))
+    # Two observations of a chunk may share columns: they add up.
     chunk = jnp.arange(found.shape[0])[:, None, None]
     return zero.at[chunk, columns].add(found, mode="drop")

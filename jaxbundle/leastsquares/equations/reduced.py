@@ -42,6 +42,7 @@ class Reduced(eqx.Module):
 
     def matrix(self, plan: Plan, groups: Groups) -> Float[Array, "n n"]:
         """The matrix of some groups; only its lower triangle is right."""
+        # The factorisation reads the lower triangle alone, so that the upper one is not assembled.
         size = lambda g: plan.groups[g].free.size
         rows = [
             [
@@ -60,6 +61,7 @@ class Reduced(eqx.Module):
         matrix = jnp.zeros((n, m, w, v))
         if (a, b) in self.off:
             at = plan.blocks[a, b]
+            # Of one group with itself the blocks are those below the diagonal.
             matrix = matrix.at[at.row, at.column].add(self.off[a, b])
         if a == b:
             matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.own[a])
@@ -106,6 +108,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
 
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     """The blocks of a symmetric matrix of some groups where S has blocks."""
+    # Cut by rows, then by columns: `parts[b][a]` is [row of a, column of a, row of b, column of b].
     cut = lambda x: split(plan, groups, x)
     parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
     index = {g: jnp.arange(plan.groups[g].rows) for g in groups}

@@ -75,10 +75,15 @@ def find_alternatives(
     - `min_redundancy`: directions of the residuals with a smaller redundancy number carry no
       information: a hundredth of an error appears in them.
     """
+    # R = I − A·A⁺: the redundancy matrix if everything else were known, which makes the residuals
+    # of this eliminated row as independent as they can be. With the other unknowns free they
+    # separate less well: the alternatives found here remain alternatives.
     R = np.eye(len(design)) - design @ np.linalg.pinv(design)
 
     def explained(*which: int) -> float:
         rows = np.concatenate([observations[i] for i in which])
+        # (R_AA)⁺ by its eigenvalues: for the two rays of a point R has rank one, and the test of
+        # both together is that of either.
         size, axes = np.linalg.eigh(R[np.ix_(rows, rows)])
         seen = size > min_redundancy
         along = axes[:, seen].T @ residual[rows]

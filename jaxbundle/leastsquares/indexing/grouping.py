@@ -80,6 +80,8 @@ class Grouping:
         stays = np.zeros(table.rows, bool)
         for given in self.observations.values():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            # Two rows of the eliminated table in one observation (a distance between points): V
+            # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
         return self.choose("stays", found=stays & table.free.any(1))
@@ -89,6 +91,7 @@ class Grouping:
         shares = []
         for o, given in self.observations.items():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            # −1: the observation touches no eliminated row; it adds to the reduced system directly.
             slot_of = np.full(given.number, -1)
             for s in slots:
                 slot_of[~present(self.stays)[given.rows[s]]] = s
@@ -108,6 +111,8 @@ class Grouping:
             table = self.tables[name]
             if name == self.eliminate:
                 continue
+            # A pose and the camera that took only this image, one block of 9 instead of blocks of 6
+            # and 3: one list of pairs instead of three.
             host = next((g for g in self.members if self._meet_always(g, name)), None)
             host = self.choose("host", name, found=host)
             if host is None:
@@ -120,6 +125,7 @@ class Grouping:
         self.row_in, name = {}, self.eliminate
         if name is not None:
             stays = present(self.stays)
+            # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if stays.any():
                 kept = f"{name} (kept)"
@@ -145,6 +151,7 @@ class Grouping:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
             b = [s for s, t in enumerate(of) if t == name]
+            # Touched by one kind without the other: their blocks have different incidences.
             if len(a) != len(b) or len(a) > 1:
                 return False
             if a:

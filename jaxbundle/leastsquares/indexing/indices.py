@@ -88,11 +88,15 @@ def finish(plan: PyTree, sizes: Sizes) -> Any:
     def one(leaf: Any) -> Any:
         if not is_leaf(leaf):
             return leaf
+        # Padding points to the empty last row: it may be read and added to, but means nothing. No
+        # mask is needed in the loops.
         nothing = -1 if isinstance(leaf, PlanIndex) else leaf.fill
         rows = np.asarray(leaf.rows)
         more = np.full((sizes[leaf.along] - len(rows), *rows.shape[1:]), nothing, rows.dtype)
         rows = np.concatenate([rows, more])
         if isinstance(leaf, PlanIndex):
+            # `times`: an item of the list is a chunk; the last row of the last chunk is the empty
+            # one.
             rows = np.where(rows < 0, sizes[leaf.into] * leaf.times - 1, rows).astype(np.int32)
         return rows
 

@@ -28,12 +28,14 @@ def lay_out(
 ) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Rows sorted by (major, minor) in chunks of one major: the row at every position (a short
     chunk repeats its last), and whether the position is used."""
+    # Within a major the minor ascends: eliminated rows are then read forwards in memory.
     order = np.lexsort((minor, major))
     if not len(order):
         return order, np.zeros(0, bool)
     _, first, number = np.unique(major[order], return_index=True, return_counts=True)
     room = -(-number // length) * length
     within = np.arange(room.sum()) - np.repeat(np.cumsum(room) - room, room)
+    # Unused positions repeat a row that exists: what is computed there is finite, and weighted 0.
     last = np.repeat(number, room) - 1
     return order[np.repeat(first, room) + np.minimum(within, last)], within <= last
 
@@ -72,6 +74,7 @@ def chunk_pairs(
     i, j = i[order], j[order]
     blocks, start, left = np.unique(block[order], return_index=True, return_counts=True)
     first, second, of = [], [], []
+    # Blocks with many pairs take long chunks first, what is left shorter ones; the last is padded.
     for length in lengths:
         number = -(-left // length) if length == lengths[-1] else left // length
         chunk = np.repeat(np.arange(len(blocks)), number)
@@ -79,6 +82,7 @@ def chunk_pairs(
         at = start[chunk][:, None] + within[:, None] * length + np.arange(length)
         valid = at < (start + left)[chunk][:, None]
         at = np.where(valid, at, 0)
+        # −1 at unused positions: the empty incidence, whose product is 0.
         own = ("pairs", *key, length)
         first.append(as_index(np.where(valid, i[at], -1), own, *into[0]))
         second.append(as_index(np.where(valid, j[at], -1), own, *into[1]))

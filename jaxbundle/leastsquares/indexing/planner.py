@@ -121,6 +121,7 @@ class _Planner:
     ) -> tuple[dict[Key, Blocks], str | None, Band | None]:
         """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
+        # m incidences of an eliminated row are m(m − 1)/2 pairs: counted before they are listed.
         met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
         if len(ways) > 1 and (met * (met - 1)).sum() / 2 > self.settings.max_pairs:
             ways = ("iterative",)
@@ -139,6 +140,7 @@ class _Planner:
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
         slots = self.by.touched_groups(k, share)
+        # One number for every combination of kept rows that occurs; `unique` keeps it small.
         major = np.zeros(len(share.source), np.int64)
         for _, touched in slots:
             slot = touched[0][0]
@@ -155,6 +157,8 @@ class _Planner:
         first[major] = np.arange(len(major))  # An observation of every major.
         for s, name in enumerate(of):
             at = chunk(rows[s])
+            # A slot whose row is the same in a chunk is looked up once for it, the others for each
+            # observation.
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
             one = self.choose("by chunk", k, s, found=one and s != share.slot)
             by_row.append(not one)
@@ -208,8 +212,11 @@ class _Planner:
             row.append(np.repeat(p.part.touches[t].row.rows, p.length))
             used.append(p.used)
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
+        # An incidence is a combination of both rows; several observations may share it (an image
+        # point and a distance to the same camera).
         keys = row[used].astype(np.int64) * number + eliminated[used]
         keys, of = np.unique(keys, return_inverse=True)
+        # Observations that are incidences themselves, the usual case: W needs no sum by incidence.
         apart = len(at) == 1 and len(keys) == used.sum()
         if self.choose("incidences apart", group, found=apart):
             p = parts[at[0][0]]
@@ -246,6 +253,7 @@ class _Planner:
         for k, p in enumerate(parts):
             self._couples(k, p, direct)
         blocks = {}
+        # Blocks below the diagonal of the reduced matrix, groups in the order of JAX's pytrees.
         for place, later in enumerate(self.by.kept):
             for earlier in self.by.kept[: place + 1]:
                 key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
@@ -285,6 +293,7 @@ class _Planner:
             empty = np.zeros(0, np.int64)
             return _PairList(empty, empty, empty, empty, ())
         i, j = pairs_between(later.eliminated, earlier.eliminated)
+        # Touched rows may be held, or eliminated themselves: no block.
         there = (later.row[i] >= 0) & (earlier.row[j] >= 0)
         if within:  # below the diagonal; an incidence paired with itself is summed by chunks
             there &= later.row[i] > earlier.row[j]
@@ -299,6 +308,8 @@ class _Planner:
         i, j, row, column, into = pairs
         columns = np.int64(self.by.rows(key[1]))
         number = lambda r, c: r.astype(np.int64) * columns + c
+        # The blocks that occur, in the order of row and column: by the fill of S, not of a dense
+        # matrix.
         keys = [number(row, column), *(number(r[r >= 0], c[r >= 0]) for *_, r, c in direct)]
         keys = self.choose("blocks", *key, found=np.unique(np.concatenate(keys)))
         if not len(keys):

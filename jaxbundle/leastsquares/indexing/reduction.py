@@ -70,9 +70,11 @@ def find_band(
     from scipy import sparse  # imported here: a tenth of a second
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+    # Ordered by rows of the group, not by unknowns: a row keeps its unknowns together.
     links = sparse.coo_matrix((np.ones(len(row)), (row, column)), (rows, rows))
     place = np.empty(rows, np.int32)
     place[reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)] = np.arange(rows)
+    # The band is as wide as its widest block: one long link, as of a closed loop, widens all of it.
     width = max(
         int(np.abs(place[row] - place[column]).max(initial=0)), -(-settings.min_super_block // w)
     )
@@ -96,6 +98,8 @@ def choose_reduction(
     if band is not None:
         place: Any = band.place  # not an array yet (`as_column`)
         m, rows = float(band.width * w), len(place.rows) * w
+        # Super-blocks: L (m³/3), C and X by substitution (m³ each), C·Cᵀ (m³), in all 10/3·m³; the
+        # border of q unknowns with its products.
         q = n - rows
         border = 2 * rows * m * q + rows * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q

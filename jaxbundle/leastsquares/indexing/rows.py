@@ -120,6 +120,8 @@ class Residual:
         changes: Sequence[Change] | None = None,
     ) -> Change:
         changes = ((),) * len(self.spaces) if changes is None else changes
+        # Derivatives are taken at zero changes; the changed block is the one place where the chart
+        # of a space enters the residual.
         moved = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
         return whiten(evaluate(self.kind, moved, measured), weight)
 
@@ -180,6 +182,7 @@ def _stack(block: Block) -> Any:
 def whiten(v: Change, weight: Weight) -> Change:
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
+        # L⁻¹ is lower triangular, but its zeros cost less than a loop that knows them.
         rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
         return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
@@ -200,6 +203,7 @@ def fill_places(plan: Plan, laid: ChunkedData) -> tuple[Plan, ChunkedData]:
     for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
         shape = part.source.shape
         live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
+        # `argmax`: the first position with weight, or 0.
         place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
         every = lambda at, shape=shape: jnp.broadcast_to(at if at.ndim == 2 else at[:, None], shape)
         seen = lambda x, place=place: x.ravel()[place]
@@ -232,6 +236,8 @@ def map_blocks(
     weight: PyTree[Float[Array, "chunks length"]],
 ) -> Any:
     """`map_observations` of blocks that are looked up."""
+    # Outer axis: chunks; inner: observations of a chunk, over which a row looked up by chunk is
+    # constant. Traced once for all parts of equal kinds and shapes.
     axes = tuple(0 if one else None for one in by_row)
     return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
 
@@ -240,6 +246,8 @@ def look_up(
     columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]
 ) -> PyTree[Float[Array, "..."]]:
     """The elements of every column at these (non-negative) indices of a plan."""
+    # Indices of a plan are in bounds by construction. Without the promise XLA compares and clamps
+    # each, and negative ones are counted from the end.
     there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
     return jax.tree.map(lambda column: column.at[at].get(**there), columns)
 
@@ -263,6 +271,7 @@ def restore_order(
     order."""
     found: dict[str, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
+        # Observations of other parts of the set have the empty position, whose value is 0.
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]
         known = found.get(part.set_name)
         found[part.set_name] = flat if known is None else known + flat

@@ -68,11 +68,15 @@ def iterate(
     """
 
     def body(loop: Loop) -> Loop:
+        # The start is "tried" in the first pass, too, and accepted: the program contains the
+        # linearisation once.
         first = loop.steps == 0
         trial_equations, trial_cost = linearise(loop.trial)
         noise = tolerance(loop.equations).noise(loop.cost)
         ratio = gain_ratio(loop.predicted, loop.cost - trial_cost, noise)
         accept, region = loop.region.after(first, ratio)
+        # Both are computed in every pass: under `vmap` a condition would be no saving, and N of
+        # small problems costs as much as their residuals.
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
             (loop.trial, trial_equations, trial_cost),
@@ -83,6 +87,7 @@ def iterate(
         )
         damping = 1 / step_size
         change, decrement, damped = step(equations, damping)
+        # A step that cannot be computed is no step; `judge` decides what it means.
         finite = jnp.isfinite(decrement)
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
         termination, approach = approach.judge(

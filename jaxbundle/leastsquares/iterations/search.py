@@ -6,6 +6,9 @@ gradient, and N as a linear operator (`normal.Normal`). Unknowns are on manifold
 passed in the tangent space of the accepted one: `y` is zero, `y_eval` the step tried.
 """
 
+# Arguments that the interfaces of optimistix and lineax prescribe:
+# ruff: noqa: ARG002
+
 import dataclasses
 from typing import Any
 
@@ -141,6 +144,7 @@ class RegionState(eqx.Module):
         rules (Marquardt's factors 10) make the radius oscillate."""
         rules = self.settings
         accept = first | (gain_ratio > rules.sufficient_decrease)
+        # Radii of 1e16 and more, after many good steps, are all the same: λ·D is rounding of N.
         finite = jnp.minimum(self.radius, rules.largest)
         growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
         wider = jnp.minimum(finite * growth, rules.largest)
@@ -202,6 +206,8 @@ def predicted_decrease(info: Info, change: Tangent) -> Float[Array, ""]:
     """The decrease of ½vᵀPv that the linearised residuals predict for a damped step,
     ½(−gᵀδ + λ·δᵀDδ)."""
     plan, D = info.hessian.plan, info.hessian.blocks.damping_matrix
+    # ½(vᵀPv − v̂ᵀPv̂) of the linearised residuals v̂ = v + J·δ: with (N + λD)·δ = −g the terms in N
+    # cancel, so that no product with N is needed.
     damped = info.damping * dot(plan, change, times(D, change))
     return 0.5 * (damped - dot(plan, info.grad, change))
 
@@ -215,6 +221,8 @@ def gain_ratio(
     """
     # Without the last rule the final steps, whose decrease rounding makes negative as often as
     # positive, are rejected by chance: λ grows until the problem is stuck at its minimum.
+    # A residual that is not finite, as of a point behind a camera, makes the ratio −1: rejected,
+    # and the radius shrinks until the step stays in the domain.
     ratio = jnp.where(predicted > 0, decrease / predicted, -1.0)
     ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
     below_rounding = (predicted > 0) & (predicted < noise) & (decrease > -noise)

@@ -76,6 +76,7 @@ def minimise(
 
     def linearise(x: PyTree[Float[Array, "..."]]) -> tuple[tuple, Float[Array, ""]]:
         N, g, v = _linearise(residuals, retract, x, data, unknowns)
+        # NaN as cost lets the trust region reject the step.
         there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
         return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
 
@@ -84,6 +85,7 @@ def minimise(
     ) -> tuple[Float[Array, " u"], Float[Array, ""], Float[Array, ""]]:
         N, g, _ = equations
         D = jnp.diag(N)
+        # An unknown without observations: any damping will do.
         D = jnp.where(D > 0, D, 1.0)
         change = -_solve(N + damping * jnp.diag(D), g)
         return change, -g @ change, D @ change**2
@@ -113,6 +115,7 @@ def finish(
     scaled = N * scale * scale[:, None]
     weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
     determined = weakest > SMALLEST_EIGENVALUE
+    # The inverse of a singular N is NaN, and so would be its derivatives, selected or not.
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
@@ -122,6 +125,7 @@ def finish(
     x = retract(x, jnp.where(good, step, 0))
     still = jnp.zeros(unknowns, step.dtype)
     fixed = (residuals, retract, x)
+    # The step here is zero; it carries the derivatives of the minimum by the data.
     x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
     N, _ = normal_equations(residuals, retract, x, data, unknowns)
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
@@ -155,6 +159,7 @@ def _linearise(
 ) -> tuple[Float[Array, "u u"], Float[Array, " u"], Float[Array, " n"]]:
     """N = JᵀJ, Jᵀv and v at x."""
 
+    # `has_aux` returns v beside J: one evaluation instead of two.
     def twice(delta: Float[Array, " u"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         v = residuals(retract(x, delta), *data)
         return v, v

@@ -5,6 +5,9 @@ descent computes the next one, and `stopping` decides. Residuals, Jacobian and n
 formed once per accepted point; a rejected step costs a factorisation and the residuals.
 """
 
+# Arguments that the interfaces of optimistix prescribe:
+# ruff: noqa: ARG002
+
 import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, Generic, TypeVar
@@ -160,6 +163,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Values, SolverState, Any]:
         before, zero = self._info(state.known), zero_tangent(self.plan)
         residual, aux = fn(state.trial, args)
+        # The residuals of the trial point alone: its Jacobian only if it is accepted.
         trial = optx.FunctionInfo.Eval(half_square(self.plan, residual))
         step_size, accept, _, search = self.search.step(
             state.first, zero, state.change, before, trial, state.search
@@ -176,6 +180,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             step_size, state.step_size, state.first, accept, predicted, ratio, known.cost
         )
         change, finite = self._next_change(known, step_size, state.descent)
+        # d² = −gᵀδ; for an undamped step δᵀNδ.
         termination, approach = approach.judge(
             self.tolerance,
             step_size,
@@ -188,6 +193,8 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             trial.f,
         )
         following = self.retract(self.plan, y, change)
+        # A settled step is taken without being tried: it moves nothing by more than `atol` σ, and
+        # its error is the square of that.
         y = jax.tree.map(lambda a, b: jnp.where(termination == SETTLED, b, a), y, following)
         if self.progress is not None:
             jax.debug.callback(self.progress, state.steps, trial.f, 1 / state.step_size)
@@ -256,6 +263,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         """The descent's step from the accepted point, zero if it cannot be computed."""
         asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
         change, _ = self.descent.step(step_size, asked)
+        # All devices must agree, or they take different branches and wait for each other forever.
         finite = total(self.plan, 1 - _all_finite(change).astype(int)) == 0
         return jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change), finite
 
@@ -266,6 +274,7 @@ class NoAdjoint(optx.AbstractAdjoint):
     def apply(
         self, primal_fn: Callable, rewrite_fn: Callable, inputs: tuple, tags: frozenset[object]
     ) -> Any:
+        # optimistix passes its own loop, which is bounded so that it can be differentiated.
         loop = lambda cond, body, init, max_steps: jax.lax.while_loop(cond, body, init)
         return primal_fn((*inputs, loop))
 

@@ -55,11 +55,14 @@ def cofactors(
 ) -> Cofactors:
     """All cofactor blocks of a solved problem; `moves`: the generators, if known."""
     plan = factor.plan
+    # Takahashi's blocks, or all of them where S is dense; the full Q of eliminated rows (3 × 22 106
+    # on BAL 16) is never formed.
     Q = _without_held(plan, factor.inverse())
     eliminated, coupled = None, {}
     own = dict(Q.own)
     if plan.eliminated is not None:
         K, L = _couplings(factor, Q), present(factor.lower_inverse)
+        # L⁻ᵀ·(1 + K·Zᵀ)·L⁻¹: V⁻¹, and what the uncertainty of the kept rows adds.
         inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():
             at = plan.incidences[g].eliminated.ravel()
@@ -120,6 +123,7 @@ def _spread(
         j: Int[Array, "chunks length"],
         k: Int[Array, " chunks"],
     ) -> tuple[Array, ...]:
+        # Both incidences of a pair get the other's share: K_i gains Z_j·Qᵀ, K_j Z_i·Q.
         forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
         back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
         if within:
@@ -138,6 +142,8 @@ def _in_datum(
     plan = factor.plan
     if plan.datum is None:
         return own
+    # S·Q·Sᵀ = Q − G·(M·BᵀQ) − (Q·B·Mᵀ)·Gᵀ + G·M·BᵀQB·Mᵀ·Gᵀ, M = (BᵀG)⁻¹: d solutions with the
+    # factor instead of the whole Q.
     G, B = datum_directions(declared, plan, values, moves)
     H = jax.vmap(lambda b: solve(factor, b), -1, -1)(B)
     M = jnp.linalg.inv(contract(plan, B, G))

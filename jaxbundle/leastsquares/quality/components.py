@@ -130,6 +130,7 @@ def estimate(
         if done == ROUNDS or not unsettled:
             return ComponentEstimate(found, factors, unsettled)
         ratios = {name: c.ratio for name, c in usable.items()}
+        # From the last values: weights change little from round to round.
         found = again(rescale(found.problem, groups, ratios), found.values)
         factors |= {name: c.sigma for name, c in usable.items()}
     raise AssertionError("the last round returns")

@@ -123,6 +123,7 @@ class LinearisedSolution(eqx.Module):
     def residuals(self, change: Tangent, data: Data) -> tuple[Float[Array, "chunks length r"], ...]:
         """v/σ after a change of the unknowns."""
         plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
+        # Changes of held unknowns have no effect, so that their gradients are zero, not undefined.
         change = {name: x * plan.groups[name].free for name, x in change.items()}
         return residuals(self.declared, plan, self.move(change, data), laid)
 
@@ -171,6 +172,8 @@ def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tange
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change: Tangent) -> Float[Array, ""]:
+        # As many unknowns as the defect cannot change: H is regular; the motion into the datum
+        # follows.
         penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
         return half_square(at.plan, at.residuals(change, data)) + 0.5 * penalty
 

@@ -69,9 +69,11 @@ def undetermined(problem: Problem, values: Values, threshold: float = INDETERMIN
         return rows
     if G.shape[1]:  # The datum is fixed separately.
         q, _ = np.linalg.qr(G)
+        # A one along every open motion: singular only in what the observations should determine.
         S = S + q @ q.T
     eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
     null = vectors[:, eigenvalues < threshold * max(1.0, eigenvalues[-1:].sum())]
+    # Squared components: the part of each unknown in the null space, whatever basis eigh chose.
     share, names = (null**2).sum(1), kept_unknowns(problem)
     order = np.argsort(-share, kind="stable")
     # Squared components add up to 1 in every direction: one of 0.05 or less belongs to a

@@ -171,8 +171,11 @@ def _hat_of_chunk(
     hat = own = jnp.zeros((*r.shape, r.shape[-1]) if correlated else r.shape)
     if touches:
         J = jnp.concatenate(touches, -1)
+        # h = J·Q·Jᵀ from the blocks of Q that the observation touches, 9 × 9 and 3 × 3: kept,
+        # eliminated, and the coupling of both.
         hat = form(J @ _kept_cofactors(part, Q), J)
     if E is not None:
+        # E·V⁻¹·Eᵀ: h if everything else were known.
         root = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
         own = form(root, root)
         hat = hat + form(E @ present(Q.eliminated)[part.eliminated], E)
@@ -195,6 +198,7 @@ def _kept_cofactors(part: ObservationPart, Q: Cofactors) -> Float[Array, "n n"]:
         first, second = touches[couple.first], touches[couple.second]
         found: Any = 0.0
         if couple.block is not None:
+            # Stored below the diagonal; `turned` where this chunk has the later row second.
             B = Q.kept.off[first.group, second.group][couple.block]
             found = cut(B, first, second)
             if couple.turned is not None:

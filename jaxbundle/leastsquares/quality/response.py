@@ -195,6 +195,7 @@ def _solve(
 
     def further(state: tuple) -> tuple:
         x, left, direction, size, begin, count = state
+        # Pass 0 has x = 0 and direction 0: its product is (∂g/∂θ)·held, the right-hand side.
         first = count == 0
         times = product(direction, jnp.where(first, 1.0, 0.0))
         curvature = dot(plan, direction, times)

@@ -123,6 +123,8 @@ def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) 
     for o, t in lengths.items():
         weight = problem.weights(o)
         used = (weight > 0).any(1)
+        # Lengths of one, two or three residuals have different medians, √χ²₀.₅(k): divided by them
+        # they are comparable.
         normal.append(t[used] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
     counts = problem.counts
     share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
@@ -151,6 +153,8 @@ def reweight(
     t = residual_lengths(Solution(problem, values))
     weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}
     move = lambda problem, values, adjust_from: adjust_from(problem, values)
+    # Redescending estimators (Cauchy, Tukey) have many solutions: from Huber's, which is unique,
+    # and with its scale, they find the one of the majority.
     for name in dict.fromkeys(("huber", estimator)):
         small = settings.converged_change if name == estimator else settings.starting_change
         for _ in range(settings.max_rounds):
@@ -169,5 +173,6 @@ def reweight(
             # The first start values may be far from a solution.
             values = move(weighted, values, adjust_from).values
             move, t = readjust, residual_lengths(Solution(problem, values))
+    # Single steps on the way; the last solution is iterated to the end.
     found = adjust_from(weighted, values)
     return Reweighted(found, w, scale, rests, {o: x / scale for o, x in t.items()})

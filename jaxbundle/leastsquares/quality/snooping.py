@@ -119,6 +119,7 @@ def snoop(
     touched, excluded = _Touched(whole), set()
     if removed:
         found = _solve(whole, removed, excluded, found.values, adjust_from)
+    # τ has f − 1 degrees of freedom.
     while found.problem.counts.redundancy >= 2:
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
@@ -131,6 +132,8 @@ def snoop(
         if worst:
             removed += worst
         else:
+            # What was restored once is not again: two that exclude each other would alternate
+            # forever.
             passing = _passing(whole, found, touched, removed, critical) - returned
             kept = list(_without_passing(removed, passing))
             if kept == removed:
@@ -223,6 +226,7 @@ def _worst(
     row = row.astype(int)
     worst = max(alone, key=lambda r: r.test, default=None)
     other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
+    # Observations without an eliminated row (control, distances) influence everything: alone.
     if worst and other > max(critical, largest):
         return [worst]
     at = np.flatnonzero(together > max(critical, other, REMOVED_TOGETHER * largest))
@@ -242,6 +246,7 @@ def _worst(
     others = {
         k: rays.alternatives(str(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
     }
+    # Those beyond doubt first: without them, some of the others may become separable.
     certain = [k for k in others if not others[k]]
     return [
         Removed(str(of[k]), int(row[k]), None, float(together[k]), others[k])

@@ -185,6 +185,8 @@ def _sigma_of_weakest(
         directions = np.asarray(
             _products(declared, values, factor, found.moves, per_extent, directions)
         )
+    # Rayleigh and Ritz: A restricted to the subspace has the largest eigenvalues μ, and the σ² of
+    # an unknown are Σ μ·(component)².
     mu, turn = np.linalg.eigh(previous @ directions.T)
     return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
 
