@@ -25,6 +25,7 @@ from jaxbundle.cameras import brown
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
+# Not published: fitted by least squares to the eight printed tables (see the module).
 S25 = 0.3737850724543663
 S26 = 0.304789700626975
 
@@ -42,7 +43,7 @@ def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     return brown.reduce(p, x * factor, y * factor)
 
 
-def _radius(x, y):
+def _radius(x: Scalar, y: Scalar) -> Scalar:
     # √ has no derivative at 0; what is multiplied by x or y there needs none
     square = x * x + y * y
     inside = square > 0

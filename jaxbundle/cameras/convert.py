@@ -14,9 +14,11 @@ from jaxbundle.cameras.convert_exact import (
     CORRECTIONS,
     DISTORTIONS,
     NotExact,
+    Sizes,
     exact_parameters,
 )
 from jaxbundle.cameras.convert_fit import (
+    come_back,
     fit_parameters,
     image_grid,
     images_of,
@@ -31,10 +33,6 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
-MEASURABLE = 0.5
-"""Minimum part of the image with rays for a meaningful fit."""
-SAME_POINT = 1e-9
-"""Displacement of a point by rounding along the ray and back, relative to the image size."""
 
 
 @print_anywhere
@@ -100,9 +98,10 @@ def convert_camera(
     shift, step = between_frames(source, target, *sizes)
     xy = image_grid(*(area or image_area(source, *sizes)))
     rays = rays_of(source, values, xy)
-    # beyond the radius where a correction turns back, its rays belong to other points
-    there = np.abs(images_of(source, values, rays) - xy).max(1) < SAME_POINT * np.ptp(xy)
-    if there.mean() < MEASURABLE:
+    there = come_back(source, values, xy, rays)
+    # Of less than half of the image a fit says nothing about the rest; such a distortion is rather
+    # a mistake in the parameters.
+    if there.mean() < 0.5:
         raise ValueError(
             f"only {100 * there.mean():.0f} % of the image has a ray in model {source.name!r}: its "
             "distortion turns back inside the image"
@@ -144,7 +143,7 @@ def convert_camera(
     )
 
 
-def _check_defaults(found, target, free) -> None:
+def _check_defaults(found: Mapping[str, float], target: CameraModel, free: Sequence[str]) -> None:
     """**Raises:** `NotExact` if a parameter that is not free has another value than its default."""
     default = default_parameters(target)
     more = [n for n, v in default.items() if free and n not in free and found[n] != v]
@@ -152,7 +151,9 @@ def _check_defaults(found, target, free) -> None:
         raise NotExact(f"{', '.join(more)} must keep the default")
 
 
-def _exact(source, values, target, sizes, r0) -> dict[str, float]:
+def _exact(
+    source: CameraModel, values: Mapping[str, float], target: CameraModel, sizes: Sizes, r0: float
+) -> dict[str, float]:
     """Exact conversion by the formulas of narrow cameras, or those of wide ones.
 
     **Raises:** `NotExact`.

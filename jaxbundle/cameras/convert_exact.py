@@ -41,7 +41,8 @@ from jaxbundle.types import Numbers
 CORRECTIONS = ("brown", "usgs")
 DISTORTIONS = ("brown-projected", "opencv", "snavely")
 EQUAL = 1e-12
-"""Two numbers this close, relatively, are the same."""
+"""Two numbers this close, relatively, are the same: some thousand roundings, and a hundred times
+less than the last digit of any file of camera parameters."""
 
 Values = Mapping[str, float]
 Sizes = tuple[Numbers | None, Numbers | None]
@@ -169,7 +170,9 @@ def with_distortion(
 
 
 def _balance(k: Numbers, rho: float) -> float:
-    """s with s = 1 − Σk_i·s^(2i+1)·ρ^2i, by Newton's method from 1."""
+    """s with s = 1 − Σk_i·s^(2i+1)·ρ^2i.
+
+    By Newton's method from 1 (quadratic: a few steps reach rounding, the rest stay there)."""
     terms = [k[i - 1] * rho ** (2 * i) for i in (1, 2, 3)]
     s = 1.0
     for _ in range(50):

@@ -12,7 +12,7 @@ behind it is projected all the same, through the projection centre: the caller l
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -242,7 +242,9 @@ def _to_the_ideal_image(unproject: ToRay, ideal: OfRay) -> Formula:
     return lambda p, x, y: ideal(p, *unproject(p, x, y))
 
 
-def _magnify(function, columns, magnification) -> Any:
+def _magnify(
+    function: Callable, columns: Sequence[int], magnification: Callable[[Parameters], Scalar]
+) -> Any:
     """An ideal image, or its rays, at the scale that the image has on the axis."""
     return lambda p, *at: function({c: p[c] * magnification(p) for c in columns}, *at)
 

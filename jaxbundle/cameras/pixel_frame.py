@@ -43,7 +43,10 @@ def pixel_frame(
 
 
 def in_model_units(
-    uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+    uv: Float[np.ndarray, "*any 2"],
+    model: CameraModel,
+    image_size: Numbers | None,
+    pixel_size: Numbers | None = None,
 ) -> Float[np.ndarray, "*any 2"]:
     """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
     origin, step = pixel_frame(model, image_size, pixel_size)
@@ -51,7 +54,10 @@ def in_model_units(
 
 
 def in_pixels(
-    xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+    xy: Float[np.ndarray, "*any 2"],
+    model: CameraModel,
+    image_size: Numbers | None,
+    pixel_size: Numbers | None = None,
 ) -> Float[np.ndarray, "*any 2"]:
     """The inverse of `in_model_units`."""
     origin, step = pixel_frame(model, image_size, pixel_size)

@@ -83,7 +83,7 @@ def quaternion_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array
 
     The product of those of the elementary rotations, (cos ½α, −sin ½α·e)."""
 
-    def about(axis, angle):
+    def about(axis: int, angle: Float[Array, ""]) -> Float[Array, "4"]:
         c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
         return jnp.stack([c, *(-s if i == axis else jnp.zeros_like(s) for i in range(3))])
 

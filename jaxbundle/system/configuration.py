@@ -8,18 +8,11 @@ import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 from jaxbundle.system.xla_flags import jaxlib_version
-
-SHORTEST_KEPT = 0.02
-"""Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
-them."""
-
-LONGEST_WRITING = 60.0
-"""Seconds within which another process has written the file of a program, some megabytes."""
 
 THREADS = "NPROC"
 """XLA's environment variable of the number of threads of its pool; default: one for each core."""
@@ -91,7 +84,9 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     watch_cache(folder)
     _remove_damaged_programs(Path(os.path.abspath(folder)))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
+        # Seconds. JAX's 1 s keeps none of the dozen programs of a small network; reading a file
+        # takes some milliseconds, so that below 0.02 keeping saves nothing.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.02)
     return True
 
 
@@ -102,10 +97,11 @@ def _remove_damaged_programs(folder: Path) -> None:
     left by a full disk; one that is just being written by another process is not touched."""
     show, about = warnings.showwarning, "Error (reading|writing) persistent compilation cache entry"
 
-    def handle(message, *where, **options):
+    def handle(message: Warning | str, *where: Any, **options: Any) -> None:
         if not re.match(about, str(message)):
             return show(message, *where, **options)
-        name, latest = re.search(r"'(\w+)", str(message)), time.time() - LONGEST_WRITING
+        # Within a minute another process has written the file of a program, some megabytes.
+        name, latest = re.search(r"'(\w+)", str(message)), time.time() - 60.0
         for file in folder.glob(f"{name[1]}-*-cache") if name else ():
             with suppress(OSError):
                 if file.stat().st_mtime < latest:

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 GRACE = 0.3
-"""Seconds for the main thread to handle a signal."""
+"""Seconds for the main thread to handle a signal. It takes milliseconds unless it is in C++;
+short enough that nobody presses Ctrl-C again."""
 
 LONGEST_DEFERRAL = 10.0
-"""Seconds to finish a block of `defer_interrupts`; a hanging disk delays the exit no longer."""
+"""Seconds to finish a block of `defer_interrupts`, the renaming of finished files: milliseconds,
+unless the disk hangs, which delays the exit no longer than this."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":

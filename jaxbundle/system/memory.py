@@ -22,7 +22,8 @@ SMALLEST_ADDRESS_SPACE = {"": 1.7e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
 programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX 0.10,
 two cores)."""
 NO_LIMIT = 2**60
-"""Bytes: larger limits of version 1 of control groups mean none."""
+"""Bytes: larger limits of version 1 of control groups mean none. The kernel writes 2⁶³ − 1 rounded
+down to pages, whose size differs (Documentation/admin-guide/cgroup-v1/memory.rst)."""
 
 
 def free_memory() -> float:
