@@ -33,6 +33,7 @@ S26 = 0.304789700626975
 def relative_distortion(p: Parameters, R: Scalar) -> Scalar:
     """dr/R, without unit, at the radius R from the image origin, in the image unit."""
     _, _, _, p25, p26, F = p
+    # R·F/100 = 1: the zero of dr that the format factor places in the image.
     rho = R * F / 100
     return F / 100 * (1 - rho**2) * (p25 * S25 + p26 * S26 * (rho - 0.4))
 

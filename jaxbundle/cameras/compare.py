@@ -119,6 +119,7 @@ def compare_cameras(
     seen = come_back(source, values, xy, rays) & _are_one_to_one(other, others, rays)
     if seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
+    # Beyond the measurements a calibration extrapolates: differences there would turn the frame.
     near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
     if rotate and near.sum() < 3:
         raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
@@ -127,17 +128,28 @@ def compare_cameras(
     target = (xy - shift) / step
     with local_x64():
         if rotate:
+            # In the unit of the first calibration, whatever that of the second is.
             weight = near[:, None] * np.abs(step)
             rotation = np.array(_best_turn(other, p, rays, target, weight))
         there = np.array(_turn(other, p, rotation, rays))
     difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
+    return _as_comparison(source.unit, xy, difference, rotation)
+
+
+def _as_comparison(
+    unit: str,
+    xy: Float[np.ndarray, "points 2"],
+    difference: Float[np.ndarray, "points 2"],
+    rotation: Float[np.ndarray, "3"],
+) -> Comparison:
+    """The map of differences at the points of `image_grid`."""
     length = np.linalg.norm(difference, axis=1)
     known = np.isfinite(length)
     worst = int(np.nanargmax(length))
     columns, rows = GRID
     grid = xy.reshape(rows, columns, 2)
     return Comparison(
-        source.unit,
+        unit,
         grid[0, :, 0],
         grid[:, 0, 1],
         difference.reshape(rows, columns, 2),
@@ -165,6 +177,7 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     known = np.isfinite(d).all(1)
     r, d, x, y = r[known], d[known], x.ravel()[known], y.ravel()[known]
     ring = np.floor(r / step).astype(int)
+    # At the centre itself no direction is outward: 0.
     out = np.stack([x, y], 1) / np.maximum(r, 1e-300)[:, None]
     radial, tangential = (d * out).sum(1), out[:, 0] * d[:, 1] - out[:, 1] * d[:, 0]
     rings = np.unique(ring)
@@ -223,6 +236,7 @@ def _best_turn(
         weight: Float[AnyArray, "points 2"],
     ) -> Float[Array, " equations"]:
         d = weight * (_turn(model, p, rotation, rays) - xy)
+        # `where`: NaN · 0 is NaN.
         return jnp.where((weight > 0) & jnp.isfinite(xy), d, 0.0).ravel()
 
     return minimise(misclosures, jnp.add, jnp.zeros(3), (rays, xy, weight), 3)[0]

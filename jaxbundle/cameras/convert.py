@@ -123,7 +123,21 @@ def convert_camera(
             held = {name: v for name, v in default.items() if name not in free}
             starts = [{**start, **held} for start in starts]
         found = fit_parameters(target, rays, wanted, starts, free)
-    length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
+    # Measured in any case: a formula is no proof that the two programs mean the same camera.
+    difference = images_of(target, found, rays) - wanted
+    return _as_conversion(target, found, reason, wanted, difference, float(there.mean()))
+
+
+def _as_conversion(
+    target: CameraModel,
+    found: Mapping[str, float],
+    reason: str,
+    xy: Float[np.ndarray, "points 2"],
+    difference: Float[np.ndarray, "points 2"],
+    covered: float,
+) -> Conversion:
+    """A conversion with its differences at points xy of the target."""
+    length = np.linalg.norm(difference, axis=1)
     if not np.isfinite(length).all():
         raise ValueError(
             f"model {target.name!r} has no image of {100 * np.isnan(length).mean():.0f} % of the "
@@ -137,8 +151,8 @@ def convert_camera(
         float(length[worst]),
         float(np.sqrt(np.mean(length**2))),
         target.unit,
-        (float(wanted[worst, 0]), float(wanted[worst, 1])),
-        float(there.mean()),
+        (float(xy[worst, 0]), float(xy[worst, 1])),
+        covered,
         reason,
     )
 

@@ -101,7 +101,9 @@ def fit_parameters(
     chosen = [model.parameters.index(name) for name in free or fitted_parameters(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with local_x64():
-        start = min((_order(model, values) for values in starts), key=lambda p: _finite(cost(p)))
+        # `fmin`: a start without an image of every ray costs NaN, more than any other.
+        least = lambda p: np.fmin(cost(p), np.inf)
+        start = min((_order(model, values) for values in starts), key=least)
         if not np.isfinite(cost(start)):
             raise ValueError("no start of the fit has an image of the whole area")
 
@@ -113,6 +115,7 @@ def fit_parameters(
         low, high = _bounds(model, chosen)
         start[chosen] = np.clip(start[chosen], low, high)
         residuals = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
+        # All columns are computed: one program for any choice of free parameters.
         slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
         try:
             found = least_squares(
@@ -159,6 +162,8 @@ def start_values(
     plain |= {n: v for n, v in conventions.items() if v and n in target.never_free}
     distances = target.principal_distance
     both = focal if len(distances) == 2 else [focal.mean()] * 2
+    # A fisheye's polynomial in tan θ has no image at 90°; the stereographic camera has one
+    # everywhere.
     wide: dict[str, float] = dict(zip(("fx", "fy"), both))
     wide |= dict(zip(("cx", "cy"), point))
     focal = focal / magnification(target, plain)
@@ -166,6 +171,7 @@ def start_values(
     plain |= dict(zip(target.principal_point, point))
     plain = {name: plain[name] for name in target.parameters}
     k, p1, p2 = _first_orders(source, values)
+    # A correction maps measured to ideal, a distortion ideal to measured: inverse series.
     backward = (source.name in CORRECTIONS) != (target.name in CORRECTIONS)
     if backward:
         k, p1, p2 = invert_radial(k), -p1, -p2

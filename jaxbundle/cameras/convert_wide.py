@@ -136,6 +136,7 @@ def _by_division(
 
 def _need(values: Values, model: str, **expected: float) -> None:
     for name, value in expected.items():
+        # Exactly: a value close to it is another camera, which a fit can represent.
         if values[name] != value:
             _refuse(f"as a {model} its {name} is {value:g}, and it is {values[name]:.6g}")
 
@@ -164,6 +165,7 @@ def _as_sphere(source: CameraModel, name: str, values: Values, sizes: Sizes) -> 
     need = {"eucm": ("beta", 1.0), "double-sphere": ("xi", 0.0), "division": ("k", 0.0)}.get(name)
     if need and values[need[0]] != need[1]:
         raise NotExact(f"{name} is another function unless {need[0]} is {need[1]:g}")
+    # ξ = α/(1 − α), see the module.
     if xi is None:
         xi = values["alpha"] / (1 - values["alpha"])
     core = {name: values[name] * (1 + xi if name[0] == "f" else 1) for name in CORE}
@@ -182,6 +184,7 @@ def _from_sphere(
             _refuse(f"{name} is a perspective camera, and xi is {xi:.6g}")
         zero = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2")
         return with_distortion(target, {**mei, **dict.fromkeys(zero, 0.0)}, sizes, r0)
+    # Only `mei` itself has a distortion beside its sphere.
     for term in ("k1", "k2", "p1", "p2"):
         if mei[term] != 0:
             _refuse(f"{target.name} has no {term}, which is {mei[term]:.6g}")

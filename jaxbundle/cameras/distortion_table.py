@@ -54,6 +54,8 @@ def distortion_table(
         ideal = np.asarray(_to_ideal(model, p, xy.reshape(-1, 2))).reshape(xy.shape)
     d = xy - begin - (ideal if about == "principal point" else ideal + point)
     radial = (d * out).sum(2).mean(1)
+    # Decentring P turns tangential displacement through one period around the circle; its mean over
+    # the circle, a rotation, is no distortion.
     tangential = d[..., 1] * out[:, 0] - d[..., 0] * out[:, 1]
     decentring = 2 * np.abs((tangential * np.exp(-1j * azimuth)).mean(1))
     # Below 1e-13 of a coordinate distortion is noise of the arithmetic.

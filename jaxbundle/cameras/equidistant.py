@@ -45,6 +45,8 @@ _NEAR = 1e-3
 
 def angle_over_sine(square: Scalar, q: Scalar) -> Scalar:
     """θ/ρ with ρ² = `square` = r² + s² and θ = atan2(ρ, −q)."""
+    # Not near θ = 180°, where the ray has no azimuth and the image none: there the quotient is
+    # right, infinite.
     near = (square < _NEAR * q * q) & (q < 0)
     t2 = jnp.where(near, square / jnp.where(near, q * q, 1.0), 0.0)
     series = (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) / jnp.where(near, -q, 1.0)

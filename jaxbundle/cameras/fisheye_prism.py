@@ -79,6 +79,7 @@ def _fisheye(
 
     def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         a, b = _angle(one, r, s, q)
+        # Before decentring, which may move a point across the turn, but not turn the image back.
         there = is_increasing(coefficients(p), a * a + b * b)
         a, b = distort(p, a, b)
         u, v = p[2] + p[0] * a, p[3] + p[1] * b

@@ -132,14 +132,19 @@ class CameraModel:
         columns = [self.parameters.index(name) for name in self.principal_distance]
         ideal, ray = IMAGES[self.image](columns, self.axes == "up")
         if self.magnification is not None:
+            # Distortion formulas near the identity need an ideal image of the same scale on the
+            # axis.
             ideal, ray = (_magnify(of, columns, self.magnification) for of in (ideal, ray))
         formula, back = self.correct or self.distort, self.inverse
         if self.project is not None:
+            # `project` as a distortion of the ideal image, so that every model has the same two
+            # domains.
             formula = _of_the_ideal_image(self.project, ray)
         if self.unproject is not None:
             corrected = _to_the_ideal_image(self.unproject, ideal)
             formula, back = (corrected, back) if formula is None else (formula, corrected)
         assert formula is not None, "checked by _complete"
+        # The formula stated is exact; the other direction is its inverse, to rounding.
         back = back or implicit_inverse(
             formula, self.start or _less_its_origin(formula), self.iterations
         )
@@ -207,6 +212,7 @@ def _complete(model: CameraModel) -> dict:
             raise ValueError(f"{where}{name} is one of {known}, not {getattr(model, name)!r:.60}.")
     if not isinstance(model.iterations, int) or model.iterations < 1:
         raise ValueError(f"{where}iterations must be a number above 0, not {model.iterations!r}.")
+    # The first of the usual names that are among the parameters.
     known = lambda sets: next((names for names in sets if {*names} <= {*parameters}), ())
     kept = {
         "parameters": parameters,

@@ -58,6 +58,7 @@ def _check_form(model: CameraModel) -> None:
     number_of, results = (3, "three") if name == "unproject" else (2, "two")
     number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
     p = (number,) * len(model.parameters)
+    # Numbers and arrays: a formula with an `if` works for one of them only.
     for given in (number, array):
         expected = (
             f"Camera model {model.name!r}: {name}(p, {arguments[0]}) must take the parameters "
@@ -87,6 +88,7 @@ def _near_the_axis(model: CameraModel, p: AnyArray) -> tuple[Array, tuple[Array,
     size = p[model.parameters.index(model.principal_distance[0])]
     at = zero, zero
     if model.own_formula == "to_ideal":
+        # `to_ideal` is tested where the axis is imaged: at the measured point whose ideal one is 0.
         near = [-x for x in formula(p, *at)]  # where there is no inverse, something is wrong there
         at = [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(model.from_ideal(p, *at), near)]
     value, derivative = value_and_derivative(formula, p, *at)

@@ -56,6 +56,7 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
 
 def _is_finite_number(value: Any) -> bool:
     try:
+        # True would be 1, and a masked value whatever lies under the mask.
         return not (isinstance(value, bool) or np.ma.is_masked(value)) and math.isfinite(value)
     except (TypeError, OverflowError):
         return False

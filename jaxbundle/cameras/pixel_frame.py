@@ -34,6 +34,7 @@ def pixel_frame(
         return np.zeros(2), np.ones(2)
     if image_size is None:
         raise ValueError("image_size is needed to relate its coordinates to pixels")
+    # (0, 0) is the centre of the first pixel, so the centre of the image is at (w − 1)/2.
     centre = (np.asarray(image_size, float) - 1) / 2
     if model.unit == "px":
         return centre, np.array([1.0, -1.0])

@@ -20,6 +20,7 @@ for every point of the image."""
 
 def radial(k: Sequence[Scalar], square: Scalar) -> Scalar:
     """1 + k1·r² + k2·r⁴ + … of r²."""
+    # Horner: of the highest coefficient first.
     value = jnp.zeros_like(square)
     for coefficient in reversed(k):
         value = square * (coefficient + value)

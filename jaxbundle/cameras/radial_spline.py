@@ -56,6 +56,7 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
     def radial(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
         _, _, cx, cy, *values = p
         t2 = jnp.asarray(square(p, xi, yi))
+        # The spline is a function of θ², even in θ, hence smooth on the axis.
         weights = basis(t2 * (number / last), -1, number + 3) @ of_values.astype(t2.dtype)
         factor = 1 + sum(weights[..., i] * s for i, s in enumerate(values))
         return cx + xi * factor, cy + yi * factor

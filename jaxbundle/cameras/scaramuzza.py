@@ -34,6 +34,7 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
     # √ has no derivative at 0; ρ³ has
     rho = jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1.0)), 0.0)
     Z = a0 + r2 * (a2 + rho * (a3 + rho * a4))
+    # The angle grows while Z − ρ·Z' > 0, at samples as in `radial.is_increasing`.
     growing = jnp.ones_like(r2, bool)
     for i in range(1, SAMPLES + 1):
         t = rho * (i / SAMPLES)

@@ -44,8 +44,11 @@ def turning_radius(
         radii = radius_max * t
     else:
         # an ideal point of the image may lie far outside it
+        # Up to 200 times the half diagonal, dense near it: a barrel distortion brings far points
+        # into the image.
         radii = radius_max * t / (1.005 - t)
     determinant, measured = map(np.asarray, _along(model, p, azimuth[:, None], radii[None, :]))
+    # NaN, beyond the range of a formula, counts as turned.
     turned = ~(determinant > 0)
     first = (turned | (measured > radius_max)).argmax(1)
     turns = turned[np.arange(len(turned)), first]
@@ -109,6 +112,7 @@ def _along(
     def determinant_at(azimuth: Scalar, radius: Scalar) -> tuple[Scalar, Scalar]:
         x, y = radius * jnp.cos(azimuth), radius * jnp.sin(azimuth)
         if to_ideal:
+            # Measured coordinates count from the image of the axis.
             x, y = x + centre[0], y + centre[1]
         image, (a, b, c, d) = value_and_derivative(formula, p, x, y)
         if not to_ideal:

@@ -136,6 +136,7 @@ def _foot(ellipsoid: Ellipsoid, X: Vector) -> tuple[tuple[Scalar, Scalar], Scala
     k = c / a
     E, P, Z = 1 - k * k, p / a, k * z / a
     S, C = Z, k * P
+    # Halley's method, S and C up to a common factor: every step triples the correct digits.
     for _ in range(2):
         A = jnp.sqrt(S * S + C * C)
         D, F = Z * A**3 + E * S**3, P * A**3 - E * C**3

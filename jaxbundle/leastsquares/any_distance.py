@@ -1,8 +1,5 @@
 """Points at any distance, up to infinity: their parametrisation in the engine."""
 
-# Arguments that `Space` prescribes:
-# ruff: noqa: ARG002
-
 import dataclasses
 
 import jax.numpy as jnp
@@ -11,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.geometry import transform_point
 from jaxbundle.leastsquares.datum.motions import JointMotion
-from jaxbundle.leastsquares.spaces import Change, tangent_basis
+from jaxbundle.leastsquares.spaces import Change, WithoutChart, hold_by_retraction, tangent_basis
 from jaxbundle.types import AnyArray, Scalar
 
 LARGEST_DISTANCE = 1e8
@@ -21,7 +18,7 @@ differ by more than images are measured; a hundred times more changes nothing.""
 
 
 @dataclasses.dataclass(frozen=True)
-class AnyDistance:
+class AnyDistance(WithoutChart):
     """Places X of space with a length s each, [4]; where s is 0 the coordinates move, as those of
     `Vector(3)` do; where it is not, the homogeneous vector (X, s) on its sphere: two directions
     across the ray from the origin, and one along it in which s/|X| moves,
@@ -71,11 +68,7 @@ class AnyDistance:
     def hold(
         self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " 3"]
     ) -> Float[Array, " 4"]:
-        held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
-        return jnp.where(free.min() > 0, value, held)
-
-    def chart(self, value: Float[Array, " 4"]) -> None:
-        return None
+        return hold_by_retraction(self, value, given, free)
 
 
 def derivative(value: Float[Array, " 4"]) -> Float[Array, "3 3"]:

@@ -12,7 +12,7 @@ which is always 0, and additional outputs witness·x, also 0, for all quantities
 their derivative by the witness is x.
 """
 
-# Arguments that the interfaces of lineax and `Space` prescribe:
+# Arguments that the interface of lineax prescribes:
 # ruff: noqa: ARG002
 
 import dataclasses
@@ -39,11 +39,11 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, without_filling
-from jaxbundle.leastsquares.spaces import Block, Change, Space
+from jaxbundle.leastsquares.spaces import Block, Change, Space, WithoutChart
 
 
 @dataclasses.dataclass(frozen=True)
-class Chart:
+class Chart(WithoutChart):
     """A space in which changes add: a value is (start, scale, y) and represents the start changed
     by scale·y."""
 
@@ -66,9 +66,6 @@ class Chart:
         here, slope = block
         moves = tuple(sum(a * d for a, d in zip(row, change)) for row in slope) if change else ()
         return self.space.move(here, moves)
-
-    def chart(self, value: tuple) -> None:
-        return None
 
 
 def stock_problem(

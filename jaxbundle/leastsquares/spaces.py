@@ -13,11 +13,8 @@ and XLA compiles the observation equations to plain loops over the observations 
 of small matrix products).
 """
 
-# Arguments that `Space` prescribes:
-# ruff: noqa: ARG002
-
 import dataclasses
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +34,7 @@ Triple = tuple[Scalar, ...]
 Block = PyTree[Scalar]
 """What an observation receives of a row: scalars, or objects of scalars such as `Posed`."""
 Matrix = Float[Array, "width width"]
+Value = TypeVar("Value")
 
 
 @runtime_checkable
@@ -59,8 +57,24 @@ class Space(Protocol):
     def chart(self, value: Any) -> tuple[Matrix, Matrix] | None: ...
 
 
+class WithoutChart:
+    """A space that is damped in its own directions."""
+
+    def chart(self, value: Any) -> None:  # noqa: ARG002 (other spaces need it)
+        return None
+
+
+def hold_by_retraction(
+    space: Space, value: Value, given: Value, free: Float[Array, " width"]
+) -> Value:
+    """`Space.hold` where directions are no numbers of the value: the change from `given` to it,
+    without that along held directions."""
+    held = space.retract(given, jnp.where(free > 0, space.difference(value, given), 0.0))
+    return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
+
+
 @dataclasses.dataclass(frozen=True)
-class Vector:
+class Vector(WithoutChart):
     """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: the free
     ones (None: all); `tied`: further ones that change with one of these, (column, index in
     `columns`) each."""
@@ -124,9 +138,6 @@ class Vector:
         moves = jnp.zeros(self.size).at[columns].set(free[of])
         return jnp.where(moves > 0, value, given)
 
-    def chart(self, value: Float[Array, " *size"]) -> None:
-        return None
-
 
 class Turned(NamedTuple):
     """A rotation M for observations: `rows`, 9 scalars, and a small additional rotation."""
@@ -177,7 +188,7 @@ class Posed(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Rotation:
+class Rotation(WithoutChart):
     """Unit quaternions (w, x, y, z); a change is a rotation vector, M ← exp([δ]×)·M."""
 
     width = 3
@@ -202,9 +213,6 @@ class Rotation:
         self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " width"]
     ) -> Float[Array, " 4"]:
         return jnp.where(free.max() > 0, value, given)
-
-    def chart(self, value: Float[Array, " 4"]) -> None:
-        return None
 
 
 class PoseValue(NamedTuple):
@@ -266,7 +274,7 @@ class Pose:
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class Frame(WithoutChart):
     """A pose, `PoseValue`, that moves along and about its own axes, δ = (shift along x, y, z,
     rotation about x, y, z), restricted to `columns`: for a figure invariant to the other shifts and
     rotations (a plane along itself, a cylinder about its axis)."""
@@ -300,15 +308,11 @@ class Frame:
         return jnp.concatenate([shift, turn])[jnp.array(self.columns, int)]
 
     def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
-        held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
-        return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
-
-    def chart(self, value: PoseValue) -> None:
-        return None
+        return hold_by_retraction(self, value, given, free)
 
 
 @dataclasses.dataclass(frozen=True)
-class Direction:
+class Direction(WithoutChart):
     """Unit vectors of `size` numbers; a change is one in the tangent plane, in an orthonormal basis
     of it (of the Householder reflection that takes the vector to an axis)."""
 
@@ -350,9 +354,6 @@ class Direction:
         free: Float[Array, " width"],
     ) -> Float[Array, " size"]:
         return jnp.where(free.max() > 0, value, given)
-
-    def chart(self, value: Float[Array, " size"]) -> None:
-        return None
 
 
 def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:

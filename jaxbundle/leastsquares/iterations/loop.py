@@ -114,22 +114,27 @@ def iterate(
             steps=loop.steps + 1,
         )
 
-    equations, zero = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linearise, start)
-    )
     return jax.lax.while_loop(
         lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
         body,
-        Loop(
-            at=start,
-            trial=start,
-            equations=equations,
-            cost=zero,
-            predicted=zero,
-            step_size=jnp.full_like(zero, jnp.inf),
-            region=RegionState.begin(TRUST_REGION),
-            approach=Approach.begin(stopping),
-            termination=jnp.asarray(LIMIT),
-            steps=jnp.asarray(0),
-        ),
+        _begin(linearise, start, stopping),
+    )
+
+
+def _begin(linearise: Callable, start: PyTree, stopping: StoppingSettings) -> Loop:
+    """The state before the first pass, which accepts the start values."""
+    equations, zero = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linearise, start)
+    )
+    return Loop(
+        at=start,
+        trial=start,
+        equations=equations,
+        cost=zero,
+        predicted=zero,
+        step_size=jnp.full_like(zero, jnp.inf),
+        region=RegionState.begin(TRUST_REGION),
+        approach=Approach.begin(stopping),
+        termination=jnp.asarray(LIMIT),
+        steps=jnp.asarray(0),
     )
