@@ -139,9 +139,11 @@ class CameraModel:
         if self.project is not None:
             # `project` as a distortion of the ideal image, so that every model has the same two
             # domains.
-            formula = _of_the_ideal_image(self.project, ray)
+            project = self.project
+            formula = lambda p, xi, yi: project(p, *ray(p, xi, yi))
         if self.unproject is not None:
-            corrected = _to_the_ideal_image(self.unproject, ideal)
+            unproject = self.unproject
+            corrected = lambda p, x, y: ideal(p, *unproject(p, x, y))
             formula, back = (corrected, back) if formula is None else (formula, corrected)
         assert formula is not None, "checked by _complete"
         # The formula stated is exact; the other direction is its inverse, to rounding.
@@ -236,16 +238,6 @@ def _complete(model: CameraModel) -> dict:
             "principal_point two or none; c, fx and fy, f, x0 and y0, cx and cy need no naming."
         )
     return kept
-
-
-def _of_the_ideal_image(project: OfRay, ray: ToRay) -> Formula:
-    """The image of the ray of an ideal coordinate."""
-    return lambda p, xi, yi: project(p, *ray(p, xi, yi))
-
-
-def _to_the_ideal_image(unproject: ToRay, ideal: OfRay) -> Formula:
-    """The ideal coordinate of the ray of an image."""
-    return lambda p, x, y: ideal(p, *unproject(p, x, y))
 
 
 def _magnify(

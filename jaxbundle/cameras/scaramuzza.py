@@ -49,17 +49,13 @@ def _straight(p: Parameters, u: Scalar, v: Scalar) -> Pair:
     return (x - d * y) / det, (c * y - e * x) / det
 
 
-def _start(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
-    return X + p[1], Y + p[2]
-
-
 SCARAMUZZA = CameraModel(
     "scaramuzza",
     ("a0", "cx", "cy", "a2", "a3", "a4", "c", "d", "e"),
     unproject=unproject,
     unit="px",
     image="equidistant",
-    start=_start,
+    start=lambda p, X, Y: (X + p[1], Y + p[2]),
     iterations=14,
     principal_distance=("a0",),
     defaults={"c": 1.0},

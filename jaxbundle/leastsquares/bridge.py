@@ -76,7 +76,9 @@ def stock_problem(
     **Raises:** `ValueError` if the datum is open: the stock loop has no datum."""
     if problem.counts.datum:
         raise ValueError("the stock solvers have no datum: fix it by held values or observations")
-    declared, plan, scale = _chart(problem.declared), problem.plan, _scale(problem)
+    charts = tuple((name, Chart(space)) for name, space in problem.declared.named_spaces)
+    declared = dataclasses.replace(problem.declared, named_spaces=charts)
+    plan, scale = problem.plan, _scale(problem)
 
     def fn(y: tuple[Tangent, Float[Array, ""]], data: Data) -> dict[str, PyTree]:
         change, witness = y
@@ -95,11 +97,6 @@ def values_of(problem: Problem, y: tuple[Tangent, Float[Array, ""]]) -> Values:
     values = _values(problem, pad_data(problem, problem.data), _scale(problem), y[0])
     charts = {name: Chart(space) for name, space in problem.declared.named_spaces}
     return without_filling(problem, {n: jax.vmap(charts[n].value)(*v) for n, v in values.items()})
-
-
-def _chart(declared: Declared) -> Declared:
-    charts = tuple((name, Chart(space)) for name, space in declared.named_spaces)
-    return dataclasses.replace(declared, named_spaces=charts)
 
 
 def _values(

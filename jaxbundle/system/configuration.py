@@ -139,24 +139,7 @@ def join_processes(
     """
     import jax
 
-    from jaxbundle.arguments import integer
-
-    expected = (
-        "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
-        "none of them under SLURM"
-    )
-    for name, value in (("processes", processes), ("process", process)):
-        if value is not None:
-            integer(name, value, least=0)
-    integer("lost_after_seconds", lost_after_seconds)
-    integer("wait_seconds", wait_seconds)
-    if address is not None:
-        parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
-        if not parts or not 0 < int(parts[2]) < 65536:
-            raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
-        if processes is not None and process is not None and not 0 <= process < processes:
-            raise InputError(f"process {process} of {processes} cannot be joined; {expected}")
-        _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
+    _check_joining(address, processes, process, lost_after_seconds, wait_seconds)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     # The service would intercept SIGTERM, and the process would continue.
     jax.config.update("jax_enable_preemption_service", False)
@@ -172,8 +155,39 @@ def join_processes(
         why = " ".join(str(error).split())[:300]
         if address is None and not any(name.startswith("SLURM_") for name in os.environ):
             why = "no SLURM variables were found"
-        raise InputError(f"the processes cannot be joined: {why}; {expected}") from None
+        raise InputError(f"the processes cannot be joined: {why}; {HOW_TO_JOIN}") from None
     return jax.process_index() == 0
+
+
+HOW_TO_JOIN = (
+    "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
+    "none of them under SLURM"
+)
+
+
+def _check_joining(
+    address: str | None,
+    processes: int | None,
+    process: int | None,
+    lost_after_seconds: int,
+    wait_seconds: int,
+) -> None:
+    """Check the arguments of `join_processes`, and that the address can be reached."""
+    from jaxbundle.arguments import integer
+
+    for name, value in (("processes", processes), ("process", process)):
+        if value is not None:
+            integer(name, value, least=0)
+    integer("lost_after_seconds", lost_after_seconds)
+    integer("wait_seconds", wait_seconds)
+    if address is None:
+        return
+    parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
+    if not parts or not 0 < int(parts[2]) < 65536:
+        raise InputError(f"the processes cannot be joined at {address!r}; {HOW_TO_JOIN}")
+    if processes is not None and process is not None and not 0 <= process < processes:
+        raise InputError(f"process {process} of {processes} cannot be joined; {HOW_TO_JOIN}")
+    _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
 
 
 def _check_address(host: str, port: int, process: int | None, wait_seconds: int) -> None:

@@ -61,22 +61,17 @@ def iterate(
     - `linearise(x)`: the normal equations at x, a tree of arrays, and ½vᵀPv, not finite where it
       cannot be computed.
     - `step(equations, λ)`: the change δ = −(N + λ·D)⁻¹·g, and the numbers −gᵀδ and δᵀ·D·δ.
-    - `retract(x, δ)`: applies the change.
-    - `tolerance(equations)`: the tolerances.
-    - `go`: if false, nothing is done.
-    - `stopping`: when the damping is dropped.
+    - `retract(x, δ)`: applies the change; `tolerance(equations)`: the tolerances.
+    - `go`: if false, nothing is done; `stopping`: when the damping is dropped.
     """
 
     def body(loop: Loop) -> Loop:
-        # The start is "tried" in the first pass, too, and accepted: the program contains the
-        # linearisation once.
-        first = loop.steps == 0
-        trial_equations, trial_cost = linearise(loop.trial)
+        # The start is tried in the first pass: the program contains the linearisation once.
+        first, (trial_equations, trial_cost) = loop.steps == 0, linearise(loop.trial)
         noise = tolerance(loop.equations).noise(loop.cost)
         ratio = gain_ratio(loop.predicted, loop.cost - trial_cost, noise)
         accept, region = loop.region.after(first, ratio)
-        # Both are computed in every pass: under `vmap` a condition would be no saving, and N of
-        # small problems costs as much as their residuals.
+        # N in every pass: under `vmap` a condition would compute both branches, too.
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
             (loop.trial, trial_equations, trial_cost),
@@ -90,16 +85,9 @@ def iterate(
         # A step that cannot be computed is no step; `judge` decides what it means.
         finite = jnp.isfinite(decrement)
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
+        costs = loop.cost, cost, trial_cost
         termination, approach = approach.judge(
-            tolerance(equations),
-            step_size,
-            finite,
-            decrement,
-            first,
-            accept,
-            loop.cost,
-            cost,
-            trial_cost,
+            tolerance(equations), step_size, finite, decrement, first, accept, *costs
         )
         return Loop(
             at=at,
@@ -114,11 +102,8 @@ def iterate(
             steps=loop.steps + 1,
         )
 
-    return jax.lax.while_loop(
-        lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
-        body,
-        _begin(linearise, start, stopping),
-    )
+    goes_on = lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go
+    return jax.lax.while_loop(goes_on, body, _begin(linearise, start, stopping))
 
 
 def _begin(linearise: Callable, start: PyTree, stopping: StoppingSettings) -> Loop:

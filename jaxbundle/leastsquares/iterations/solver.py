@@ -181,16 +181,10 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         )
         change, finite = self._next_change(known, step_size, state.descent)
         # d² = −gᵀδ; for an undamped step δᵀNδ.
+        costs = before.f, known.cost, trial.f
+        decrement = -dot(self.plan, known.gradient, change)
         termination, approach = approach.judge(
-            self.tolerance,
-            step_size,
-            finite,
-            -dot(self.plan, known.gradient, change),
-            state.first,
-            accept,
-            before.f,
-            known.cost,
-            trial.f,
+            self.tolerance, step_size, finite, decrement, state.first, accept, *costs
         )
         following = self.retract(self.plan, y, change)
         # A settled step is taken without being tried: it moves nothing by more than `atol` σ, and

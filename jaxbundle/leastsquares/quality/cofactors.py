@@ -57,7 +57,10 @@ def cofactors(
     plan = factor.plan
     # Takahashi's blocks, or all of them where S is dense; the full Q of eliminated rows (3 × 22 106
     # on BAL 16) is never formed.
-    Q = _without_held(plan, factor.inverse())
+    Q = factor.inverse()
+    # Held unknowns had ones in S.
+    mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
+    Q = Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
     eliminated, coupled = None, {}
     own = dict(Q.own)
     if plan.eliminated is not None:
@@ -75,12 +78,6 @@ def cofactors(
         own[plan.eliminated] = eliminated
     own = _in_datum(declared, values, factor, own, moves)
     return Cofactors(own, Q, eliminated, coupled, factor.lower_inverse)
-
-
-def _without_held(plan: Plan, Q: Reduced) -> Reduced:
-    """The inverse of S, with zeros for held unknowns, where S had ones."""
-    mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
-    return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
 
 
 def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
