@@ -33,6 +33,9 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
+MEASURABLE = 0.5
+"""Minimum part of the image with rays. Of less a fit says nothing about the rest, and such a
+distortion is rather a mistake in the parameters."""
 
 
 @print_anywhere
@@ -99,9 +102,7 @@ def convert_camera(
     xy = image_grid(*(area or image_area(source, *sizes)))
     rays = rays_of(source, values, xy)
     there = come_back(source, values, xy, rays)
-    # Of less than half of the image a fit says nothing about the rest; such a distortion is rather
-    # a mistake in the parameters.
-    if there.mean() < 0.5:
+    if there.mean() < MEASURABLE:
         raise ValueError(
             f"only {100 * there.mean():.0f} % of the image has a ray in model {source.name!r}: its "
             "distortion turns back inside the image"

@@ -53,6 +53,10 @@ from jaxbundle.types import AnyArray
 PLAN_PLACEHOLDER = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
 
+MIN_SHARED_OBSERVATIONS = 10_000
+"""Problems with at least so many observations are distributed over several devices; of smaller ones
+(5 ms an iteration) the devices would wait for each other longer than they compute."""
+
 Rows = dict[str, Float[np.ndarray, "n r"]]
 """By the name of the set, rows in the given order."""
 
@@ -126,12 +130,11 @@ def _on_all_devices(problem: Problem, solver: LeastSquares) -> Callable[[Values]
     return minimise_from
 
 
-def _worth_sharing(problem: Problem, start: Values, min_observations: int = 10_000) -> bool:
-    """Whether there are several devices, and rows to distribute over them. With fewer observations
-    (5 ms an iteration) the devices wait for each other longer than they compute."""
+def _worth_sharing(problem: Problem, start: Values) -> bool:
+    """Whether there are several devices, and rows to distribute over them."""
     if len(sharing_devices()) == 1 or problem.plan.eliminated is None:
         return False
-    if sum(o.number for o in problem.observations) < min_observations:
+    if sum(o.number for o in problem.observations) < MIN_SHARED_OBSERVATIONS:
         return False
     return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 

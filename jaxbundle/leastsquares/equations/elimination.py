@@ -43,7 +43,7 @@ PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined.
 
 Measured on 1260 normal matrices of 5 to 200 unknowns with one exactly dependent column: rounding
-leaves a last pivot of 2e-16 (median) to 1.4e-15 (largest), of either sign. Half or double decide
+leaves a last pivot of 2e-16 (median) to 1.6e-15 (largest), of either sign. Half or double decide
 none of them. A pivot at the limit has lost a hundredth of itself to rounding: the σ of a determined
 unknown is still right to half a per cent."""
 
