@@ -145,8 +145,8 @@ class Approach(eqx.Module):
         # A rejected undamped step was tried too early.
         near = jnp.where(jnp.isinf(last_size) & ~accept, rules.narrowing * self.near, self.near)
         quadratic = accept & (gain_ratio > rules.quadratic_gain) & ~self.singular & ~first
-        quadratic &= predicted < near * cost
-        quadratic &= predicted < rules.quadratic_decrease * self.predicted
+        decrease = rules.quadratic_decrease
+        quadratic &= (predicted < near * cost) & (predicted < decrease * self.predicted)
         approach = dataclasses.replace(
             self,
             near=near,
