@@ -154,7 +154,7 @@ def _cut(
     in order. Kept rows, and rows that share an observation, belong to the first device."""
     e, given = problem.plan.eliminated, problem.observations
     touched = [[r for name, r in zip(o.kind.of, o.rows) if name == e] for o in given]
-    stays = problem.choices["stays",]
+    stays = problem.choices["coupled rows",]
     met, tied = np.zeros(len(stays)), stays.copy()
     for slots in touched:
         for rows in slots:
@@ -181,7 +181,7 @@ def _plan_part(
     # another program.
     free = {("all free", name): group.all_free for name, group in groups}
     choices: dict[Hashable, Any] = {**problem.choices, **free}
-    choices["stays",] = choices["stays",][rows]
+    choices["coupled rows",] = choices["coupled rows",][rows]
     row = np.full(problem.table(e).rows, -1)
     row[rows] = np.arange(len(rows))
     cut = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])

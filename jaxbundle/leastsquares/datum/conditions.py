@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import AnyArray, Scalar, present
 
-HELD = 1e-7
+MIN_RELATIVE_MOTION = 1e-7
 """Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
 matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum of
 points along a line, a ten-thousandth of its length wide) eight."""
@@ -124,7 +124,7 @@ def leave_held(
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
     A = A * scale * scale[:, None]
-    moved = jnp.linalg.pinv(A, HELD, hermitian=True) @ (A @ (gauge / scale[:, None]))
+    moved = jnp.linalg.pinv(A, MIN_RELATIVE_MOTION, hermitian=True) @ (A @ (gauge / scale[:, None]))
     moved = dataclasses.replace(datum, gauge=gauge - scale[:, None] * moved)
     return dataclasses.replace(plan, datum=moved)
 

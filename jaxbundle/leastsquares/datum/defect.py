@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions
-from jaxbundle.leastsquares.datum.conditions import HELD, free_of_tables, of_groups
+from jaxbundle.leastsquares.datum.conditions import MIN_RELATIVE_MOTION, free_of_tables, of_groups
 from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
@@ -23,7 +23,7 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, p
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
-OPEN = 1e-10
+MAX_OPEN_EFFECT = 1e-10
 """Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
 coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
 observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8."""
@@ -124,7 +124,7 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     # Directions with J·G = 0. Of the Gram matrix (JG)ᵀJG eigenvalues below 1e-16 of the largest are
     # noise: open and weak (1e-8) would look alike; hence the triangle of a QR.
     _, singular, directions = np.linalg.svd(_triangle(rows, scales))
-    return directions[singular < OPEN].T / scale[:, None]
+    return directions[singular < MAX_OPEN_EFFECT].T / scale[:, None]
 
 
 def _triangle(
@@ -165,7 +165,7 @@ def make_datum(
     R = _triangle(chosen, [size] * len(chosen))
     if np.isfinite(R).all():  # otherwise the solver will report it
         singular = np.linalg.svd(R, compute_uv=False)
-        if singular[-1] <= HELD * singular[0]:
+        if singular[-1] <= MIN_RELATIVE_MOTION * singular[0]:
             raise CannotHold(defect)
     if minimal:
         picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
@@ -188,7 +188,7 @@ def _choose_pins(
     # Coordinates of a large block move by kilometres in a rotation, its angles by radians: without
     # this all pins would be coordinates.
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
-    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
+    least = max(1e-300, MAX_OPEN_EFFECT * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
         sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))

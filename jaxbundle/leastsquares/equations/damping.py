@@ -47,7 +47,7 @@ def _measure_group(
         if chart is not None:
             T, inverse = T.at[:, at, at].set(chart[0]), inverse.at[:, at, at].set(chart[1])
 
-    def one(
+    def measure_row(
         T: Float[Array, "w w"],
         inverse: Float[Array, "w w"],
         N: Float[Array, "w w"],
@@ -58,7 +58,7 @@ def _measure_group(
         D = D * free * free[:, None]  # Held unknowns are decoupled from free ones.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
-    return jax.vmap(one)(T, inverse, blocks, group.free)
+    return jax.vmap(measure_row)(T, inverse, blocks, group.free)
 
 
 def times(D: DampingMatrix, change: Tangent) -> Tangent:

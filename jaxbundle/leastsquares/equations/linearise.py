@@ -139,7 +139,7 @@ def differentiate_chunks(
     touches = tuple(map(counted, part.touches))
     part = dataclasses.replace(part, touches=touches, place=in_order)
 
-    def of(given: tuple) -> Any:
+    def differentiate_one(given: tuple) -> Any:
         part, measured, weight = jax.tree.map(lambda x: x[None], given)
         one = dataclasses.replace(plan, parts=(part,))
         found = differentiate(declared, one, 0, prepared, ChunkedData((measured,), (weight,)))
@@ -149,8 +149,8 @@ def differentiate_chunks(
     at_once = max(at_once // max(length, 1), 1)
     # One chunk at a time would be a loop of tiny operations; all at once 1 kB an observation.
     if chunks > at_once:
-        return jax.lax.map(of, given, batch_size=at_once)
-    return jax.vmap(of)(given)
+        return jax.lax.map(differentiate_one, given, batch_size=at_once)
+    return jax.vmap(differentiate_one)(given)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -64,14 +64,14 @@ class Grouping:
         self.tables = {t.name: t for t in tables}
         self.observations = {given.name: given for given in observations}
         self.eliminate, self.choose, self.settings = eliminate, choose, settings
-        self.moving = choose("moving", found=[t.name for t in tables if t.free.any()])
-        self.stays = self._rows_that_stay()
+        self.estimated = choose("estimated", found=[t.name for t in tables if t.free.any()])
+        self.coupled_rows = self._find_coupled_rows()
         self.shares = self._share_observations()
         self._form_groups()
 
     # ------------------------------------------------------------------ what is eliminated
 
-    def _rows_that_stay(self) -> Bool[np.ndarray, " rows"] | None:
+    def _find_coupled_rows(self) -> Bool[np.ndarray, " rows"] | None:
         """Rows of the eliminated table that stay in the reduced system: those tied by an
         observation to another row of their table."""
         if self.eliminate is None:
@@ -84,7 +84,7 @@ class Grouping:
             # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
-        return self.choose("stays", found=stays & table.free.any(1))
+        return self.choose("coupled rows", found=stays & table.free.any(1))
 
     def _share_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
@@ -94,7 +94,7 @@ class Grouping:
             # −1: the observation touches no eliminated row; it adds to the reduced system directly.
             slot_of = np.full(given.number, -1)
             for s in slots:
-                slot_of[~present(self.stays)[given.rows[s]]] = s
+                slot_of[~present(self.coupled_rows)[given.rows[s]]] = s
             # Two held rows of the table may meet: the last counts as eliminated.
             # A set without observations is an empty share.
             for slot in self.choose("slots", o, found=np.unique(slot_of).tolist() or [-1]):
@@ -107,7 +107,7 @@ class Grouping:
     def _form_groups(self) -> None:
         """Kept tables in groups; the eliminated rows are the last group."""
         self.members, self.group_of = {}, {}
-        for name in self.moving:
+        for name in self.estimated:
             table = self.tables[name]
             if name == self.eliminate:
                 continue
@@ -124,7 +124,7 @@ class Grouping:
                 self.group_of[name] = host, start, np.arange(table.rows)
         self.row_in, name = {}, self.eliminate
         if name is not None:
-            stays = present(self.stays)
+            stays = present(self.coupled_rows)
             # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if stays.any():

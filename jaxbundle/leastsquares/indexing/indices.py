@@ -85,7 +85,7 @@ def round_up(number: int, steps: int = 8) -> int:
 def finish(plan: PyTree, sizes: Sizes) -> Any:
     """The plan in arrays of these sizes, −1 replaced by the last row of its list."""
 
-    def one(leaf: Any) -> Any:
+    def finish_leaf(leaf: Any) -> Any:
         if not is_leaf(leaf):
             return leaf
         # Padding points to the empty last row: it may be read and added to, but means nothing. No
@@ -100,4 +100,4 @@ def finish(plan: PyTree, sizes: Sizes) -> Any:
             rows = np.where(rows < 0, sizes[leaf.into] * leaf.times - 1, rows).astype(np.int32)
         return rows
 
-    return jax.tree.map(one, plan, is_leaf=is_leaf)
+    return jax.tree.map(finish_leaf, plan, is_leaf=is_leaf)

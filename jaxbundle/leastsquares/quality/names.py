@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
-INDETERMINATE = 1e-12
+SINGULAR_EIGENVALUE = 1e-12
 """Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions. Ten
 times `elimination.PIVOT`: an eigenvalue is at most the smallest pivot, and a problem that failed on
 a pivot is to have at least one name."""
@@ -60,7 +60,9 @@ def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
     ]
 
 
-def undetermined(problem: Problem, values: Values, threshold: float = INDETERMINATE) -> list[str]:
+def undetermined(
+    problem: Problem, values: Values, threshold: float = SINGULAR_EIGENVALUE
+) -> list[str]:
     """The unknowns that the observations do not determine, most affected first. `threshold`: of the
     scaled eigenvalues; a larger one also finds unknowns that are hardly separated."""
     S, V, G = scaled_system(problem, values)
@@ -149,7 +151,7 @@ def _name_singular(problem: Problem, V: Float[np.ndarray, "rows w w"]) -> list[s
     diagonal = np.diagonal(V, axis1=1, axis2=2)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
-    weak = np.flatnonzero(finite & (smallest < INDETERMINATE))
+    weak = np.flatnonzero(finite & (smallest < SINGULAR_EIGENVALUE))
     rows = group.members[0].rows
     rows = weak if rows is None else np.asarray(rows)[weak]
     all_of = ", ".join(table.parameter(j) for j in range(table.space.width))

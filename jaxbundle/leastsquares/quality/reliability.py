@@ -41,7 +41,7 @@ from jaxbundle.leastsquares.quality.cofactors import Cofactors
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
-UNCONTROLLED = 1e-8
+MIN_REDUNDANCY = 1e-8
 """Redundancy numbers below this are rounding: the observation is uncontrolled. 1 − h of a number h
 near 1 has an error of 1e-16 times the condition of N, 1e4 to 1e6 in common networks; above it w is
 right to some per cent, and the smallest detectable blunder is 4e4 σ."""
@@ -127,7 +127,7 @@ def _correlated(
 def _test(
     standard: Float[Array, "n r"], hat: Float[Array, "n r"], used: Bool[Array, "n r"]
 ) -> Float[Array, "n r"]:
-    controlled = used & (1 - hat > UNCONTROLLED)
+    controlled = used & (1 - hat > MIN_REDUNDANCY)
     return jnp.where(controlled, standard / jnp.sqrt(jnp.where(controlled, 1 - hat, 1.0)), jnp.nan)
 
 
@@ -218,7 +218,9 @@ def minimal_detectable(
     correlated observations with σ/`gain` and 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)
     return np.where(
-        r > UNCONTROLLED, np.asarray(sigma) * delta0 / np.sqrt(np.maximum(r, UNCONTROLLED)), np.inf
+        r > MIN_REDUNDANCY,
+        np.asarray(sigma) * delta0 / np.sqrt(np.maximum(r, MIN_REDUNDANCY)),
+        np.inf,
     )
 
 
@@ -228,5 +230,5 @@ def external_reliability(
     """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ; for
     correlated observations with 1 − `hat` of their `Reliability`."""
     r = np.asarray(redundancy)
-    bounded = np.maximum(r, UNCONTROLLED)
-    return np.where(r > UNCONTROLLED, delta0 * np.sqrt((1 - bounded) / bounded), np.inf)
+    bounded = np.maximum(r, MIN_REDUNDANCY)
+    return np.where(r > MIN_REDUNDANCY, delta0 * np.sqrt((1 - bounded) / bounded), np.inf)

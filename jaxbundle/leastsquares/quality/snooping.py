@@ -40,7 +40,7 @@ REMOVED_TOGETHER = 0.5
 """Observations are removed together with the worst if their test is at least this fraction of its.
 Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
 others, and must be found again by the last test."""
-STEPPING = 20_000
+SINGLE_STEPS_FROM = 20_000
 """Problems with at least this many observations take single steps between removals: below, the
 iterations of an adjustment (0.5 µs an observation each) take less time than compiling the step."""
 
@@ -79,7 +79,7 @@ def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
     """The solution of a problem with slightly changed weights. A large one takes a single
     Gauss–Newton step if this decreases vᵀPv, with an error of the square of the change; for a small
     one compiling the step would take longer. A final result must be adjusted once more."""
-    if sum(given.number for given in problem.observations) >= STEPPING:
+    if sum(given.number for given in problem.observations) >= SINGLE_STEPS_FROM:
         before = Solution(problem, values)
         after = Solution(problem, take_step(problem, values))
         if after.vtpv <= before.vtpv:

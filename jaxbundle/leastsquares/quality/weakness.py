@@ -57,12 +57,12 @@ Extents = dict[str, Float[np.ndarray, "rows *width"]]
 class Weak:
     """`names` of kept unknowns with a σ above 1/`VAGUE_RATIO` of their extent, the weakest first;
     `worst`: the largest of these ratios. `rows`: eliminated ones with a σ above 1/`NONLINEAR_RATIO`
-    of theirs, of so many judged."""
+    of theirs, of so many `judged`."""
 
     names: tuple[str, ...] = ()
     worst: float = 0.0
     rows: tuple[int, ...] = ()
-    of: int = 0
+    judged: int = 0
 
 
 def find_weak(
