@@ -110,8 +110,12 @@ class RegionSettings:
     - `largest`: radius beyond which damping is rounding.
     """
 
+    # The radius of Ceres' Levenberg–Marquardt (`initial_trust_region_radius`): λ = 1e-4 of the
+    # diagonal, nearly undamped. Nielsen's rule changes it threefold a step.
     initial: float = 1e4
+    # Ceres' `min_relative_decrease`, too: any step that decreases vᵀPv more than by accident.
     sufficient_decrease: float = 1e-3
+    # λ·D is then 1e-16 of N, below its rounding.
     largest: float = 1e16
 
 
