@@ -98,8 +98,8 @@ def choose_reduction(
     if band is not None:
         place: Any = band.place  # not an array yet (`as_column`)
         m, rows = float(band.width * w), len(place.rows) * w
-        # Super-blocks: L (m³/3), C and X by substitution (m³ each), C·Cᵀ (m³), in all 10/3·m³; the
-        # border of q unknowns with its products.
+        # Super-blocks: L (m³/3), C by substitution (m³), C·Cᵀ (2·m³); then X and the corner of the
+        # border of q unknowns.
         q = n - rows
         border = 2 * rows * m * q + rows * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
