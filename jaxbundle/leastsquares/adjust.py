@@ -39,6 +39,7 @@ from jaxbundle.leastsquares.quality.reliability import external_reliability, min
 from jaxbundle.leastsquares.quality.robust import Suspect, reweight
 from jaxbundle.leastsquares.quality.snooping import Removed, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.types import AnyArray
 
 DATUMS = ("given", "inner", "minimal")
 
@@ -157,7 +158,7 @@ class Result:
         one = columns["v"].shape[1] == 1
         return {c: x[:, 0] if one else x for c, x in columns.items()}
 
-    def _residuals(self, o: str) -> dict[str, Float[np.ndarray, "n r"]]:
+    def _residuals(self, o: str) -> dict[str, Float[AnyArray, "n r"]]:
         found, weight = self.solution.reliability, self.problem.weights(o)
         used = weight > 0
         # The inner `where` keeps 1/0 out of the unused branch.

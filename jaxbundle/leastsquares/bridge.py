@@ -40,6 +40,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, without_filling
 from jaxbundle.leastsquares.spaces import Block, Change, Space, WithoutChart
+from jaxbundle.types import AnyArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +101,7 @@ def values_of(problem: Problem, y: tuple[Tangent, Float[Array, ""]]) -> Values:
 
 
 def _values(
-    problem: Problem, data: Data, scale: dict[str, Array], change: Tangent
+    problem: Problem, data: Data, scale: dict[str, AnyArray], change: Tangent
 ) -> dict[str, tuple]:
     """The tables as values of charts."""
     y = zeros_of_tables(problem.declared, data.start)
@@ -108,13 +109,13 @@ def _values(
     return {name: (start, scale[name], y[name]) for name, start in data.start.items()}
 
 
-def _scale(problem: Problem) -> dict[str, Array]:
+def _scale(problem: Problem) -> dict[str, AnyArray]:
     """By table, the unit change of each unknown."""
     return _columns(problem.declared, problem.plan, pad_data(problem, problem.data))
 
 
 @eqx.filter_jit
-def _columns(declared: Declared, plan: Plan, data: Data) -> dict[str, Array]:
+def _columns(declared: Declared, plan: Plan, data: Data) -> dict[str, AnyArray]:
     *_, blocks = normal_equations(declared, plan, data.start, lay_out_data(plan, data))
     size = {g: jnp.where(d > 0, d, 1.0) ** -0.5 for g, d in Normal(plan, blocks).diagonal().items()}
     return zeros_of_tables(declared, data.start) | changes_of_tables(plan, data.start, size)

@@ -68,7 +68,7 @@ def sharing_devices() -> list:
     return jax.local_devices() if _ALONE.get() else jax.devices()
 
 
-def distribute(problem: Problem, devices: Sequence[jax.Device] | None = None) -> Shards:
+def distribute(problem: Problem, devices: list | None = None) -> Shards:
     """Cut a problem with an eliminated table into a part for every device."""
     devices = sharing_devices() if devices is None else devices
     # Every part is planned as a problem of its own, with the choices of the whole: chunk lengths,

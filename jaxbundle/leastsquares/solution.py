@@ -48,7 +48,7 @@ from jaxbundle.leastsquares.quality.cofactors import (
 from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 PLAN_PLACEHOLDER = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
@@ -332,7 +332,7 @@ def _by_eliminated(
     declared: Declared, plan: Plan, values: Values, data: Data
 ) -> dict[str, Float[Array, "n r w"]]:
     laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
-    width = plan.groups[plan.eliminated].width
+    width = plan.groups[present(plan.eliminated)].width
     for number in range(len(plan.parts)):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)

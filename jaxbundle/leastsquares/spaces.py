@@ -176,7 +176,7 @@ class Posed(NamedTuple):
     """A pose for observations: rotation M and projection centre X0."""
 
     rotation: Turned
-    centre: tuple[Scalar, Scalar, Scalar]
+    centre: Triple
 
     def ray(self, X: Triple) -> Triple:
         """M·(X − X0): a point of object space in the frame of the pose."""
@@ -291,10 +291,10 @@ class Frame(WithoutChart):
     def move(self, block: Posed, change: Change) -> Posed:
         if not change:
             return block
-        every = [0.0] * 6
+        every: list[Scalar] = [0.0] * 6
         for column, d in zip(self.columns, change):
             every[column] = d
-        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(every[:3]))
+        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(tuple(every[:3])))
 
     def retract(self, value: PoseValue, change: Float[AnyArray, " width"]) -> PoseValue:
         every = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)

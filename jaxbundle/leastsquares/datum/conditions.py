@@ -179,7 +179,7 @@ def move_to_datum(
     still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
     size = largest(datum.weight, start)
 
-    def moving(state: tuple) -> Bool[Array, ""]:
+    def moving(state: tuple) -> bool | Bool[AnyArray, ""]:
         _, *progress = state
         return moves_on(size, *progress)
 
@@ -206,7 +206,7 @@ def moves_on(
     before: Scalar,
     count: int | Int[Array, ""],
     settings: MotionSettings = DATUM_MOTION,
-) -> Bool[AnyArray, ""]:
+) -> bool | Bool[AnyArray, ""]:
     """Whether a motion to the datum continues after a step of `distance` and a previous one of
     `before`."""
     # Far from its end a motion may overshoot for some steps; near it, one that does not halve is
@@ -239,7 +239,8 @@ def equations(
     datum: Datum, moves: Tangent, away: Tangent
 ) -> tuple[Float[AnyArray, " defect"], Float[AnyArray, "defect defect"]]:
     """Bᵀ(x − x_start) and BᵀG, over the datum tables; `away`: x − x_start."""
-    missing, gram = 0.0, 0.0
+    missing: Any = 0.0
+    gram: Any = 0.0
     for name, weight in datum.weight.items():
         G = moves[name] @ datum.gauge
         B = (G * weight[..., None]).reshape(-1, G.shape[-1])
@@ -263,7 +264,7 @@ def _datum_equations(
 
 def _missing(
     tau: Float[Array, " defect"], fixed: tuple[Declared, Plan], given: tuple[Values, Values]
-) -> Float[Array, " defect"]:
+) -> Float[AnyArray, " defect"]:
     """Bᵀ(x − x_start) after a motion along the open directions."""
     (declared, plan), (values, start) = fixed, given
     plan = leave_held(declared, plan, values)
@@ -295,11 +296,11 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
 
 
 def _move(
-    declared: Declared, plan: Plan, motion: Float[Array, " motions"], values: Values
+    declared: Declared, plan: Plan, motion: Float[AnyArray, " motions"], values: Values
 ) -> Values:
     """All tables moved, except held values."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
-    for name, act in declared.motions.actions:
+    for name, act in present(declared.motions).actions:
         if name not in values:
             continue
         space = declared.spaces[name]
@@ -330,5 +331,5 @@ def contract(plan: Plan, B: Tangent, x: Tangent) -> Float[Array, "defect ..."]:
     parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
     e = plan.eliminated
     # Kept rows are on all devices, eliminated ones on one each.
-    kept = sum(part for name, part in parts.items() if name != e)
+    kept: Any = sum(part for name, part in parts.items() if name != e)
     return kept if e is None else kept + total(plan, parts[e])

@@ -113,8 +113,8 @@ def differentiate_rows(
     none = jnp.zeros((*r[0].shape, 0))
     # A held slot has no derivatives: a block without columns.
     of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
-    blocks = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
-    return jnp.stack(r, -1), blocks
+    slots = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
+    return jnp.stack(r, -1), slots
 
 
 def differentiate_chunks(

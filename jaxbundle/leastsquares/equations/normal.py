@@ -347,7 +347,7 @@ class Sums:
         eliminated = None
         if e is not None:
             eliminated, gradient[e] = self.own[e], self.gradient[e]
-        D = measure(declared, plan, values, own | ({e: eliminated} if e else {}))
+        D = measure(declared, plan, values, own | ({e: self.own[e]} if e else {}))
         return cost, gradient, NormalBlocks(own, off, eliminated, self.W, D)
 
 

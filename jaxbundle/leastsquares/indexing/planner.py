@@ -26,7 +26,6 @@ from jaxbundle.leastsquares.indexing.plan import (
     PairBlock,
     Plan,
     TouchedRows,
-    UnknownGroup,
 )
 from jaxbundle.leastsquares.indexing.reduction import FACTORS, Band, plan_reduction
 from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
@@ -117,7 +116,7 @@ class _Planner:
         self,
         parts: list[_PartInChunks],
         incidences: dict[str, _IncidencesInChunks],
-        groups: dict[str, UnknownGroup],
+        groups: dict[str, Any],
     ) -> tuple[dict[Key, Blocks], str | None, Band | None]:
         """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
@@ -127,7 +126,7 @@ class _Planner:
             ways = ("iterative",)
         blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
-        place = lambda at: (at.row.rows, at.column.rows) if at else np.zeros((2, 0), np.int64)
+        place = lambda at: (at.row.rows, at.column.rows) if at else (np.zeros(0, np.int64),) * 2
         ties = lambda g: place(blocks.get((g, g)))
         number = sum(given.number for given in self.by.observations.values())
         way, band = plan_reduction(shapes, ties, number, ways, self.settings)

@@ -26,8 +26,8 @@ differentiated as arrays. Scalar by scalar XLA compiles them for minutes: the pr
 residuals × columns, 64² statements at this limit. Not critical: kinds of the package have a few
 residuals, or hundreds."""
 
-Weight = tuple[Scalar, ...] | tuple[tuple[Scalar, ...], ...]
-"""Of one observation: 1/σ of every residual, or the rows of L⁻¹."""
+Weight = tuple[Any, ...]
+"""Of one observation: 1/σ of every residual, or the rows of L⁻¹ as tuples."""
 
 Prepared = dict[str, PyTree[Float[Array, " rows"]]]
 """By table, the prepared blocks of its rows, one array for each scalar."""

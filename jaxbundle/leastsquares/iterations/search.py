@@ -30,6 +30,9 @@ from jaxbundle.leastsquares.equations.elimination import (
 )
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, dot
 
+Evaluation = Any
+"""`optimistix.FunctionInfo.Eval` of the point tried, which is no class to a type checker."""
+
 
 class Info(optx.FunctionInfo.EvalGradHessian):
     """Quantities at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step under
@@ -92,7 +95,7 @@ class MarquardtDescent(optx.AbstractDescent):
     def query(self, y: Tangent, f_info: Info, state: None) -> Info:
         return f_info
 
-    def step(self, step_size: Float[Array, ""], state: Info) -> tuple[Tangent, optx.RESULTS]:
+    def step(self, step_size: Float[Array, ""], state: Info) -> tuple[Tangent, Any]:
         damped = damp(state.hessian, 1 / step_size)
         # Pins in damped steps too would hold single unknowns of the datum and bend the steps: 15
         # evaluations on BAL 16 instead of 10.
@@ -173,9 +176,9 @@ class NielsenTrustRegion(optx.AbstractSearch):
         y: Tangent,
         y_eval: Tangent,
         f_info: Info,
-        f_eval_info: optx.FunctionInfo.Eval,
+        f_eval_info: Evaluation,
         state: RegionState,
-    ) -> tuple[Float[Array, ""], Bool[Array, ""], optx.RESULTS, RegionState]:
+    ) -> tuple[Float[Array, ""], Bool[Array, ""], Any, RegionState]:
         change = jax.tree.map(jnp.subtract, y_eval, y)
         predicted = predicted_decrease(f_info, change)
         decrease = f_info.as_min() - f_eval_info.as_min()
@@ -195,9 +198,9 @@ class FullStep(optx.AbstractSearch):
         y: Tangent,
         y_eval: Tangent,
         f_info: Info,
-        f_eval_info: optx.FunctionInfo.Eval,
+        f_eval_info: Evaluation,
         state: None,
-    ) -> tuple[Float[Array, ""], Bool[Array, ""], optx.RESULTS, None]:
+    ) -> tuple[Float[Array, ""], Bool[Array, ""], Any, None]:
         return jnp.asarray(jnp.inf), jnp.asarray(True), optx.RESULTS.successful, None
 
 

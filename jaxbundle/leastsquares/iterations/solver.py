@@ -218,7 +218,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         options: dict[str, Any],
         state: SolverState,
         tags: frozenset[object],
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    ) -> tuple[Bool[Array, ""], Any]:
         ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
         return ended, optx.RESULTS.successful
 

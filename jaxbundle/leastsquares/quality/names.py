@@ -144,7 +144,7 @@ def _name_singular(problem: Problem, V: Float[np.ndarray, "rows w w"]) -> list[s
     """The unknowns of eliminated rows with a singular block V."""
     e = present(problem.plan.eliminated)
     group, table = problem.plan.groups[e], problem.table(e)
-    finite = np.isfinite(V).all((1, 2))
+    finite = np.asarray(np.isfinite(V).all((1, 2)))
     V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))
     held = 1.0 - np.asarray(group.free)
     V = V + held[:, :, None] * np.eye(V.shape[1])

@@ -81,7 +81,7 @@ def reliability(
 
 
 def _uncorrelated(
-    weight: Float[Array, "n r"],
+    weight: Float[AnyArray, "n r"],
     v: Float[Array, "n r"],
     hat: Float[Array, "n r"],
     own: Float[Array, "n r"],
@@ -99,7 +99,7 @@ def _uncorrelated(
 
 
 def _correlated(
-    weight: Float[Array, "n r r"],
+    weight: Float[AnyArray, "n r r"],
     u: Float[Array, "n r"],
     hat: Float[Array, "n r r"],
     own: Float[Array, "n r r"],

@@ -208,11 +208,9 @@ def _worst(
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [
-        Removed(
-            o, *map(int, np.unravel_index(tests[o].argmax(), tests[o].shape)), float(tests[o].max())
-        )
-        for o in touched.single
-        if tests[o].size
+        Removed(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
+        for o, t in ((o, tests[o]) for o in touched.single)
+        if t.size
     ]
     together, of, row = [], [], []
     for o in filter(lambda o: len(tests[o]), touched.whole):

@@ -204,7 +204,7 @@ def _products(
     plan = factor.plan
     still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
 
-    def product(direction: Float[Array, " reduced"]) -> Float[Array, " reduced"]:
+    def product(direction: Float[AnyArray, " reduced"]) -> Float[Array, " reduced"]:
         right = still | split(plan, plan.kept, direction * per_extent)
         right = s_transform_transposed(declared, plan, values, right, moves)
         change = s_transform(declared, plan, values, solve(factor, right), moves)
