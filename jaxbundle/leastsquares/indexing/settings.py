@@ -47,8 +47,8 @@ class PlanningSettings:
     # BAL 16: sums by image in one long `segment_sum` took 66 ms an iteration, in chunks 45.
     chunk_lengths: tuple[int, ...] = (256, 64, 16)
     max_padding: float = 0.1
-    # Below, the program without chunks compiles in a tenth of the time, which no number of
-    # iterations wins back.
+    # Below, the program without chunks compiles in a tenth of the time, which saves more than
+    # chunks do.
     small_part: int = 2000
     masked_below: int = 100_000
     # Rounding pads by up to an eighth: less than the compilation that it saves a small problem; of

@@ -151,7 +151,6 @@ class RegionState(eqx.Module):
         rules (Marquardt's factors 10) make the radius oscillate."""
         rules = self.settings
         accept = first | (gain_ratio > rules.sufficient_decrease)
-        # Radii of 1e16 and more, after many good steps, are all the same: λ·D is rounding of N.
         finite = jnp.minimum(self.radius, rules.largest)
         growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
         wider = jnp.minimum(finite * growth, rules.largest)
