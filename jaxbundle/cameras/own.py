@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jaxbundle.cameras.inverse import value_and_derivative
 from jaxbundle.cameras.model import FORMULAS, CameraModel
 from jaxbundle.float64 import local_x64
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import Scalar
 
 
 def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> None:
@@ -80,7 +81,7 @@ def _check_form(model: CameraModel) -> None:
 
 
 @partial(compile_once, static=0)
-def _near_the_axis(model: CameraModel, p: AnyArray) -> tuple[Array, tuple[Array, ...], Array]:
+def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...], Array]:
     """Image of the axis, derivative of the formula there, and the error of a point near it after
     formula and inverse."""
     p = tuple(p)

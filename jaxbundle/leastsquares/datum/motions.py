@@ -18,6 +18,7 @@ from jaxbundle.geometry.quaternions import turn_object_slightly
 from jaxbundle.geometry.similarity import displacement
 from jaxbundle.leastsquares.declarations import Motions, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
+from jaxbundle.types import AnyArray
 
 SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
 
