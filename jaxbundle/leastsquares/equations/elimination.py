@@ -226,7 +226,8 @@ def sum_over_pairs(
 ) -> PyTree[Array]:
     """`add(sums, first, second, block)` for all chunks of pairs, some at a time.
 
-    `at_once`: pairs whose factors are in memory at the same time."""
+    `at_once`: pairs whose factors are in memory at the same time; half and double take the same
+    time within 5 % (BAL 16)."""
     for chunks in zip(pairs.first, pairs.second, pairs.block):
         # A loop over some thousand pairs: their gathered factors stay in the cache. All at once
         # they would be 73 MB for the 170 046 pairs of BAL 16 (two blocks of 3 × 9 each).

@@ -44,12 +44,16 @@ class PlanningSettings:
     # A program for each length is compiled: one length takes a third of the time.
     few_pairs: int = 50_000
     few_pairs_chunk_length: int = 8
-    # BAL 16: sums by image in one long `segment_sum` took 66 ms an iteration, in chunks 45.
+    # BAL 16: sums by image in one long `segment_sum` took 66 ms an iteration, in chunks 45. Half of
+    # the lengths take the same time, double up to a tenth more; half or double of the padding the
+    # same.
     chunk_lengths: tuple[int, ...] = (256, 64, 16)
     max_padding: float = 0.1
     # Below, the program without chunks compiles in a tenth of the time, which saves more than
     # chunks do.
     small_part: int = 2000
+    # Compiling takes seconds; the mask of 22 106 points costs nothing that can be measured (BAL 16:
+    # 100 ms an evaluation with and without, alternating). Not critical.
     masked_below: int = 100_000
     # Rounding pads by up to an eighth: less than the compilation that it saves a small problem; of
     # a large one an eighth of every iteration.
