@@ -126,7 +126,8 @@ class _Planner:
             ways = ("iterative",)
         blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
-        place = lambda at: (at.row.rows, at.column.rows) if at else (np.zeros(0, np.int64),) * 2
+        none = np.zeros(0, np.int64)
+        place = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
         ties = lambda g: place(blocks.get((g, g)))
         number = sum(given.number for given in self.by.observations.values())
         way, band = plan_reduction(shapes, ties, number, ways, self.settings)

@@ -85,7 +85,7 @@ def _uncorrelated(
     v: Float[Array, "n r"],
     hat: Float[Array, "n r"],
     own: Float[Array, "n r"],
-) -> dict[str, Float[Array, "n r"]]:
+) -> dict[str, Float[AnyArray, "n r"]]:
     used = weight > 0
     return {
         "residual": v,
@@ -103,7 +103,7 @@ def _correlated(
     u: Float[Array, "n r"],
     hat: Float[Array, "n r r"],
     own: Float[Array, "n r r"],
-) -> dict[str, Float[Array, "n r"]]:
+) -> dict[str, Float[AnyArray, "n r"]]:
     """Of whitening matrices L⁻¹ [n, r, r] and blocks B of the same shape."""
     used = diagonal_of(weight) > 0
     L = _invert_lower(jnp.where(used[..., None], weight, jnp.eye(weight.shape[-1])))
@@ -125,7 +125,7 @@ def _correlated(
 
 
 def _test(
-    standard: Float[Array, "n r"], hat: Float[Array, "n r"], used: Bool[Array, "n r"]
+    standard: Float[Array, "n r"], hat: Float[Array, "n r"], used: Bool[AnyArray, "n r"]
 ) -> Float[Array, "n r"]:
     controlled = used & (1 - hat > MIN_REDUNDANCY)
     return jnp.where(controlled, standard / jnp.sqrt(jnp.where(controlled, 1 - hat, 1.0)), jnp.nan)

@@ -36,7 +36,6 @@ from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
 
 VAGUE_RATIO = 50.0
 """An unknown whose σ is above a fiftieth of its extent (1.1° of a rotation, 2 cm a metre away) is
@@ -197,14 +196,14 @@ def _products(
     values: Values,
     factor: NormalFactor,
     moves: Tangent | None,
-    per_extent: Float[AnyArray, " reduced"],
-    directions: Float[AnyArray, "m reduced"],
+    per_extent: Float[Array, " reduced"],
+    directions: Float[Array, "m reduced"],
 ) -> Float[Array, "m reduced"]:
     """A times each of the directions [m, reduced]."""
     plan = factor.plan
     still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
 
-    def product(direction: Float[AnyArray, " reduced"]) -> Float[Array, " reduced"]:
+    def product(direction: Float[Array, " reduced"]) -> Float[Array, " reduced"]:
         right = still | split(plan, plan.kept, direction * per_extent)
         right = s_transform_transposed(declared, plan, values, right, moves)
         change = s_transform(declared, plan, values, solve(factor, right), moves)
