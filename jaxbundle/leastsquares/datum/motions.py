@@ -77,7 +77,7 @@ def _transform_pose(motion: Float[Array, " motions"], value: PoseValue) -> PoseV
 
 def _displace_point(
     motion: Float[Array, " motions"], value: Float[AnyArray, " 3"]
-) -> Float[Array, " 3"]:
+) -> Float[AnyArray, " 3"]:
     return value + displacement(motion, value)
 
 
