@@ -254,7 +254,7 @@ def test_a_large_network_takes_single_steps(network, options, monkeypatch):
     """To the same end, with two whole adjustments after the first."""
     spoilt, _, _ = with_blunders(network, 1)
     usual = adjust(spoilt, **options)
-    monkeypatch.setattr(snooping, "STEPPING", 0)
+    monkeypatch.setattr(snooping, "SINGLE_STEPS_FROM", 0)
     calls, whole = [], far_points.minimise
     monkeypatch.setattr(far_points, "minimise", lambda *a, **k: calls.append(1) or whole(*a, **k))
     found = adjust(spoilt, **options)

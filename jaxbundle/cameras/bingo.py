@@ -25,6 +25,7 @@ from jaxbundle.cameras import brown
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
+# Not published: fitted by least squares to the eight printed tables (see the module).
 S25 = 0.3737850724543663
 S26 = 0.304789700626975
 
@@ -32,6 +33,7 @@ S26 = 0.304789700626975
 def relative_distortion(p: Parameters, R: Scalar) -> Scalar:
     """dr/R, without unit, at the radius R from the image origin, in the image unit."""
     _, _, _, p25, p26, F = p
+    # R·F/100 = 1: the zero of dr that the format factor places in the image.
     rho = R * F / 100
     return F / 100 * (1 - rho**2) * (p25 * S25 + p26 * S26 * (rho - 0.4))
 
@@ -42,7 +44,7 @@ def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     return brown.reduce(p, x * factor, y * factor)
 
 
-def _radius(x, y):
+def _radius(x: Scalar, y: Scalar) -> Scalar:
     # √ has no derivative at 0; what is multiplied by x or y there needs none
     square = x * x + y * y
     inside = square > 0

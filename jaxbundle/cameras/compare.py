@@ -15,14 +15,15 @@ Source: the differencing of mrcal (Kogan), here at infinity, by least squares ov
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.cameras.convert import Area, image_area
-from jaxbundle.cameras.convert_fit import GRID, image_grid, images_of, rays_of
+from jaxbundle.cameras.convert_fit import GRID, come_back, image_grid, images_of, rays_of
 from jaxbundle.cameras.model import CameraModel, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
@@ -31,10 +32,7 @@ from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Numbers
-
-SAME_RAY = 1e-6
-"""Directions that differ by less, radians, are the same."""
+from jaxbundle.types import AnyArray, Numbers
 
 
 @print_in_one_screen
@@ -63,7 +61,7 @@ class Comparison:
         """Lengths of the differences."""
         return np.linalg.norm(self.difference, axis=2)
 
-    def to_xarray(self):
+    def to_xarray(self) -> Any:
         """The difference along both axes and its length over x and y of the image, as an
         `xarray.Dataset` (extra `grids`)."""
         dims, d = ("y", "x"), self.difference
@@ -118,10 +116,10 @@ def compare_cameras(
     xy = image_grid(low, high)
     shift, step = between_frames(other, source, image_size, pixel_size)
     rays = rays_of(source, values, xy)
-    back = np.abs(images_of(source, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
-    seen = back & _are_one_to_one(other, others, rays)
+    seen = come_back(source, values, xy, rays) & _are_one_to_one(other, others, rays)
     if seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
+    # Beyond the measurements a calibration extrapolates: differences there would turn the frame.
     near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
     if rotate and near.sum() < 3:
         raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
@@ -130,17 +128,28 @@ def compare_cameras(
     target = (xy - shift) / step
     with local_x64():
         if rotate:
+            # In the unit of the first calibration, whatever that of the second is.
             weight = near[:, None] * np.abs(step)
             rotation = np.array(_best_turn(other, p, rays, target, weight))
         there = np.array(_turn(other, p, rotation, rays))
     difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
+    return _as_comparison(source.unit, xy, difference, rotation)
+
+
+def _as_comparison(
+    unit: str,
+    xy: Float[np.ndarray, "points 2"],
+    difference: Float[np.ndarray, "points 2"],
+    rotation: Float[np.ndarray, "3"],
+) -> Comparison:
+    """The map of differences at the points of `image_grid`."""
     length = np.linalg.norm(difference, axis=1)
     known = np.isfinite(length)
     worst = int(np.nanargmax(length))
     columns, rows = GRID
     grid = xy.reshape(rows, columns, 2)
     return Comparison(
-        source.unit,
+        unit,
         grid[0, :, 0],
         grid[:, 0, 1],
         difference.reshape(rows, columns, 2),
@@ -168,6 +177,7 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     known = np.isfinite(d).all(1)
     r, d, x, y = r[known], d[known], x.ravel()[known], y.ravel()[known]
     ring = np.floor(r / step).astype(int)
+    # At the centre itself no direction is outward: 0.
     out = np.stack([x, y], 1) / np.maximum(r, 1e-300)[:, None]
     radial, tangential = (d * out).sum(1), out[:, 0] * d[:, 1] - out[:, 1] * d[:, 0]
     rings = np.unique(ring)
@@ -183,30 +193,50 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
     }
 
 
-def _are_one_to_one(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
+def _are_one_to_one(
+    model: CameraModel, values: Mapping[str, float], rays: Float[np.ndarray, "points 3"]
+) -> np.ndarray:
     """Which rays have an image that belongs to no other ray: a polynomial turns back, and beyond
     that radius its images are those of rays nearer to the axis."""
     images = images_of(model, values, rays)
     there = np.all(np.isfinite(images), axis=1)
     back = rays_of(model, values, np.where(there[:, None], images, np.nan))
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
-    return there & (np.linalg.norm(unit(back) - unit(rays), axis=1) < SAME_RAY)
+    # 1e-6 radians: far more than the inverse's rounding, far less than the way to another branch.
+    return there & (np.linalg.norm(unit(back) - unit(rays), axis=1) < 1e-6)
 
 
 @partial(compile_once, static=0)
-def _turn(model, p, rotation, rays):
+def _turn(
+    model: CameraModel,
+    p: Float[AnyArray, " parameters"],
+    rotation: Float[AnyArray, "3"],
+    rays: Float[AnyArray, "points 3"],
+) -> Float[Array, "points 2"]:
     """Images of the rotated rays [n, 2]."""
     R = matrix_from_rotation_vector(rotation)
     return jax.vmap(lambda ray: jnp.stack(project(model, tuple(p), *(R @ ray))))(rays)
 
 
 @partial(compile_once, static=0)
-def _best_turn(model, p, rays, xy, weight):
+def _best_turn(
+    model: CameraModel,
+    p: Float[AnyArray, " parameters"],
+    rays: Float[AnyArray, "points 3"],
+    xy: Float[AnyArray, "points 2"],
+    weight: Float[AnyArray, "points 2"],
+) -> Float[Array, "3"]:
     """θ that minimises the distances of the images of the rays to xy; rays of weight 0 may have no
     image."""
 
-    def misclosures(rotation, rays, xy, weight):
+    def misclosures(
+        rotation: Float[AnyArray, "3"],
+        rays: Float[AnyArray, "points 3"],
+        xy: Float[AnyArray, "points 2"],
+        weight: Float[AnyArray, "points 2"],
+    ) -> Float[Array, " equations"]:
         d = weight * (_turn(model, p, rotation, rays) - xy)
+        # `where`: NaN · 0 is NaN.
         return jnp.where((weight > 0) & jnp.isfinite(xy), d, 0.0).ravel()
 
     return minimise(misclosures, jnp.add, jnp.zeros(3), (rays, xy, weight), 3)[0]

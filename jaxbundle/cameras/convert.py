@@ -14,9 +14,11 @@ from jaxbundle.cameras.convert_exact import (
     CORRECTIONS,
     DISTORTIONS,
     NotExact,
+    Sizes,
     exact_parameters,
 )
 from jaxbundle.cameras.convert_fit import (
+    come_back,
     fit_parameters,
     image_grid,
     images_of,
@@ -32,9 +34,8 @@ from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
 MEASURABLE = 0.5
-"""Minimum part of the image with rays for a meaningful fit."""
-SAME_POINT = 1e-9
-"""Displacement of a point by rounding along the ray and back, relative to the image size."""
+"""Minimum part of the image with rays. Of less a fit says nothing about the rest, and such a
+distortion is rather a mistake in the parameters."""
 
 
 @print_anywhere
@@ -100,8 +101,7 @@ def convert_camera(
     shift, step = between_frames(source, target, *sizes)
     xy = image_grid(*(area or image_area(source, *sizes)))
     rays = rays_of(source, values, xy)
-    # beyond the radius where a correction turns back, its rays belong to other points
-    there = np.abs(images_of(source, values, rays) - xy).max(1) < SAME_POINT * np.ptp(xy)
+    there = come_back(source, values, xy, rays)
     if there.mean() < MEASURABLE:
         raise ValueError(
             f"only {100 * there.mean():.0f} % of the image has a ray in model {source.name!r}: its "
@@ -124,7 +124,21 @@ def convert_camera(
             held = {name: v for name, v in default.items() if name not in free}
             starts = [{**start, **held} for start in starts]
         found = fit_parameters(target, rays, wanted, starts, free)
-    length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
+    # Measured in any case: a formula is no proof that the two programs mean the same camera.
+    difference = images_of(target, found, rays) - wanted
+    return _as_conversion(target, found, reason, wanted, difference, float(there.mean()))
+
+
+def _as_conversion(
+    target: CameraModel,
+    found: Mapping[str, float],
+    reason: str,
+    xy: Float[np.ndarray, "points 2"],
+    difference: Float[np.ndarray, "points 2"],
+    covered: float,
+) -> Conversion:
+    """A conversion with its differences at points xy of the target."""
+    length = np.linalg.norm(difference, axis=1)
     if not np.isfinite(length).all():
         raise ValueError(
             f"model {target.name!r} has no image of {100 * np.isnan(length).mean():.0f} % of the "
@@ -138,13 +152,13 @@ def convert_camera(
         float(length[worst]),
         float(np.sqrt(np.mean(length**2))),
         target.unit,
-        (float(wanted[worst, 0]), float(wanted[worst, 1])),
-        float(there.mean()),
+        (float(xy[worst, 0]), float(xy[worst, 1])),
+        covered,
         reason,
     )
 
 
-def _check_defaults(found, target, free) -> None:
+def _check_defaults(found: Mapping[str, float], target: CameraModel, free: Sequence[str]) -> None:
     """**Raises:** `NotExact` if a parameter that is not free has another value than its default."""
     default = default_parameters(target)
     more = [n for n, v in default.items() if free and n not in free and found[n] != v]
@@ -152,7 +166,9 @@ def _check_defaults(found, target, free) -> None:
         raise NotExact(f"{', '.join(more)} must keep the default")
 
 
-def _exact(source, values, target, sizes, r0) -> dict[str, float]:
+def _exact(
+    source: CameraModel, values: Mapping[str, float], target: CameraModel, sizes: Sizes, r0: float
+) -> dict[str, float]:
     """Exact conversion by the formulas of narrow cameras, or those of wide ones.
 
     **Raises:** `NotExact`.

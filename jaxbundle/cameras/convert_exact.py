@@ -41,7 +41,8 @@ from jaxbundle.types import Numbers
 CORRECTIONS = ("brown", "usgs")
 DISTORTIONS = ("brown-projected", "opencv", "snavely")
 EQUAL = 1e-12
-"""Two numbers this close, relatively, are the same."""
+"""Two numbers this close, relatively, are the same: some thousand roundings, and a hundred times
+less than the last digit of any file of camera parameters."""
 
 Values = Mapping[str, float]
 Sizes = tuple[Numbers | None, Numbers | None]
@@ -68,6 +69,7 @@ def exact_parameters(
         common = _correction(source.name, values)
         return _as_usgs(common) if target.name == "usgs" else _as_brown(common, r0)
     if pair <= set(DISTORTIONS):
+        # Sizes cancel where both count alike.
         if (source.unit, source.axes) == (target.unit, target.axes):
             sizes = ((1, 1), (1, 1))
         return with_distortion(target, distortion(source, values, sizes), sizes, r0)
@@ -90,6 +92,7 @@ def _as_usgs(common: dict[str, float]) -> dict[str, float]:
 
 def _as_brown(common: dict[str, float], r0: float) -> dict[str, float]:
     _need_zero(common, ("K4", "P3", "P4"), "brown")
+    # `brown` has no linear term beside r0: c takes it, and all coefficients are divided by it.
     T = 1 + common["L"] + sum(common[f"K{i}"] * r0 ** (2 * i) for i in (1, 2, 3))
     divided = ("c", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
     return {name: common[name] / T for name in divided} | {
@@ -117,6 +120,7 @@ def distortion(source: CameraModel, values: Values, sizes: Sizes) -> dict[str, f
             "k2": values["k2"],
         }
     c, r0 = values["c"], values["r0"]
+    # The balanced polynomial is 0 at r0: its linear part is a change of c.
     s = 1 - sum(values[f"K{i}"] * r0 ** (2 * i) for i in (1, 2, 3))
     return common | {
         "fx": c * s * step[0],
@@ -153,6 +157,7 @@ def with_distortion(
             raise NotExact("snavely has its principal point at the image centre")
         return {"f": a, "k1": common["k1"], "k2": common["k2"]}
     k = [common[f"k{i}"] for i in (1, 2, 3)]
+    # The inverse of the line above, which is implicit in s.
     s = _balance(k, r0 / a)
     c = a / s
     return {
@@ -169,7 +174,9 @@ def with_distortion(
 
 
 def _balance(k: Numbers, rho: float) -> float:
-    """s with s = 1 − Σk_i·s^(2i+1)·ρ^2i, by Newton's method from 1."""
+    """s with s = 1 − Σk_i·s^(2i+1)·ρ^2i.
+
+    By Newton's method from 1 (quadratic: a few steps reach rounding, the rest stay there)."""
     terms = [k[i - 1] * rho ** (2 * i) for i in (1, 2, 3)]
     s = 1.0
     for _ in range(50):

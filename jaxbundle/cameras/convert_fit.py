@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Real
 
 from jaxbundle.cameras.convert_exact import (
     CORRECTIONS,
@@ -30,15 +30,15 @@ from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.float64 import local_x64
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Numbers
+from jaxbundle.types import AnyArray, Numbers
 
 MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": ("K4",)}
 """Parameters fitted in addition to those free by default."""
 
 GRID = (33, 25)
-MOST_EVALUATIONS = 200
-INSIDE = 1e-3
-"""Margin of a fit inside the range of a parameter, relative to the range."""
+"""Columns and rows of the points. Measured on `brown` fitted to an `opencv` of 1920 × 1080 pixels
+of 3 µm, as the RMS difference over a grid of 129 × 97: 0.182 µm; with half of the columns and rows
+0.189, with double 0.180 in four times the time."""
 
 
 def fitted_parameters(model: CameraModel) -> tuple[str, ...]:
@@ -52,16 +52,32 @@ def image_grid(low: Numbers, high: Numbers) -> Float[np.ndarray, "points 2"]:
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
 
 
-def rays_of(model: CameraModel, values: Values, xy) -> Float[np.ndarray, "points 3"]:
+def rays_of(
+    model: CameraModel, values: Values, xy: Real[AnyArray, "points 2"] | Sequence
+) -> Float[np.ndarray, "points 3"]:
     """Rays of measured image points; NaN if there are none."""
     with local_x64():
         return np.asarray(_rays(model, _order(model, values), np.asarray(xy, float)))
 
 
-def images_of(model: CameraModel, values: Values, rays) -> Float[np.ndarray, "points 2"]:
+def images_of(
+    model: CameraModel, values: Values, rays: Real[AnyArray, "points 3"] | Sequence
+) -> Float[np.ndarray, "points 2"]:
     """Measured images of rays; NaN if there are none."""
     with local_x64():
         return np.asarray(_images(model, _order(model, values), np.asarray(rays, float)))
+
+
+def come_back(
+    model: CameraModel,
+    values: Values,
+    xy: Float[np.ndarray, "points 2"],
+    rays: Float[np.ndarray, "points 3"],
+) -> Bool[np.ndarray, " points"]:
+    """Which points are the images of their rays: beyond the radius where a correction turns back,
+    its rays belong to other points."""
+    # 1e-9 of the image: rounding along the ray and back, 1e-5 pixels.
+    return np.abs(images_of(model, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
 
 
 def fit_parameters(
@@ -85,11 +101,13 @@ def fit_parameters(
     chosen = [model.parameters.index(name) for name in free or fitted_parameters(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with local_x64():
-        start = min((_order(model, values) for values in starts), key=lambda p: _finite(cost(p)))
+        # `fmin`: a start without an image of every ray costs NaN, more than any other.
+        least = lambda p: np.fmin(cost(p), np.inf)
+        start = min((_order(model, values) for values in starts), key=least)
         if not np.isfinite(cost(start)):
             raise ValueError("no start of the fit has an image of the whole area")
 
-        def complete(q):
+        def complete(q: Float[np.ndarray, " free"]) -> Float[np.ndarray, " parameters"]:
             p = start.copy()
             p[chosen] = q
             return p
@@ -97,6 +115,7 @@ def fit_parameters(
         low, high = _bounds(model, chosen)
         start[chosen] = np.clip(start[chosen], low, high)
         residuals = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
+        # All columns are computed: one program for any choice of free parameters.
         slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
         try:
             found = least_squares(
@@ -104,10 +123,12 @@ def fit_parameters(
                 start[chosen],
                 lambda q: slopes(q).reshape(-1, len(chosen)),
                 x_scale="jac",
+                # To rounding, so that a camera that the target can express is found exactly.
                 ftol=1e-15,
                 xtol=1e-15,
                 gtol=1e-15,
-                max_nfev=MOST_EVALUATIONS,
+                # A fit that needs more has no minimum in the range.
+                max_nfev=200,
                 bounds=(low, high),
             )
         except np.linalg.LinAlgError as error:
@@ -115,12 +136,15 @@ def fit_parameters(
     return dict(zip(model.parameters, complete(found.x).tolist()))
 
 
-def _bounds(model: CameraModel, chosen: Sequence[int]):
+def _bounds(
+    model: CameraModel, chosen: Sequence[int]
+) -> tuple[Float[np.ndarray, " chosen"], Float[np.ndarray, " chosen"]]:
     """Valid ranges of the parameters, with a small margin inside."""
     ends = [dict(model.ranges).get(model.parameters[j], (-np.inf, np.inf)) for j in chosen]
     low, high = np.array(ends, float).reshape(-1, 2).T
     width = high - low
-    margin = INSIDE * np.where(np.isfinite(width), width, 0.0)
+    # A thousandth of the range: at its end itself (α = 1, ξ = −1) formulas divide by 0.
+    margin = 1e-3 * np.where(np.isfinite(width), width, 0.0)
     return low + margin, high - margin
 
 
@@ -138,6 +162,8 @@ def start_values(
     plain |= {n: v for n, v in conventions.items() if v and n in target.never_free}
     distances = target.principal_distance
     both = focal if len(distances) == 2 else [focal.mean()] * 2
+    # A fisheye's polynomial in tan θ has no image at 90°; the stereographic camera has one
+    # everywhere.
     wide: dict[str, float] = dict(zip(("fx", "fy"), both))
     wide |= dict(zip(("cx", "cy"), point))
     focal = focal / magnification(target, plain)
@@ -145,6 +171,7 @@ def start_values(
     plain |= dict(zip(target.principal_point, point))
     plain = {name: plain[name] for name in target.parameters}
     k, p1, p2 = _first_orders(source, values)
+    # A correction maps measured to ideal, a distortion ideal to measured: inverse series.
     backward = (source.name in CORRECTIONS) != (target.name in CORRECTIONS)
     if backward:
         k, p1, p2 = invert_radial(k), -p1, -p2
@@ -167,7 +194,7 @@ def magnification(model: CameraModel, values: Values) -> float:
     return float(model.magnification([values.get(name, 1.0) for name in model.parameters]))
 
 
-def _first_orders(source, values):
+def _first_orders(source: CameraModel, values: Values) -> tuple[tuple[float, ...], float, float]:
     """k1 … k3, p1, p2 of the source's formula, for the principal distance 1 and v down."""
     if source.name in DISTORTIONS:
         common = distortion(source, values, sizes=((1, 1), (1, 1)))
@@ -178,29 +205,33 @@ def _first_orders(source, values):
     return tuple(common[f"k{i}"] for i in (1, 2, 3)), common["p1"], common["p2"]
 
 
-def _finite(cost: float) -> float:
-    return cost if np.isfinite(cost) else np.inf
-
-
-def _order(model: CameraModel, values: Values):
+def _order(model: CameraModel, values: Values) -> Float[np.ndarray, " parameters"]:
     return np.array([values[name] for name in model.parameters], float)
 
 
-def _one_image(model, p, ray):
+def _one_image(
+    model: CameraModel, p: Float[AnyArray, " parameters"], ray: Float[Array, "3"]
+) -> Float[Array, "2"]:
     return jnp.stack(project(model, tuple(p), *ray))
 
 
 @partial(compile_once, static=0)
-def _rays(model, p, xy):
+def _rays(
+    model: CameraModel, p: Float[AnyArray, " parameters"], xy: Float[AnyArray, "points 2"]
+) -> Float[Array, "points 3"]:
     return jax.vmap(lambda xy: jnp.stack(image_ray(model, tuple(p), *xy)))(xy)
 
 
 @partial(compile_once, static=0)
-def _images(model, p, rays):
+def _images(
+    model: CameraModel, p: Float[AnyArray, " parameters"], rays: Float[AnyArray, "points 3"]
+) -> Float[Array, "points 2"]:
     return jax.vmap(lambda ray: _one_image(model, p, ray))(rays)
 
 
 @partial(compile_once, static=0)
-def _jacobian(model, p, rays):
+def _jacobian(
+    model: CameraModel, p: Float[AnyArray, " parameters"], rays: Float[AnyArray, "points 3"]
+) -> Float[Array, "points 2 parameters"]:
     derivative: Callable = jax.jacfwd(_one_image, 1)
     return jax.vmap(lambda ray: derivative(model, p, ray))(rays)

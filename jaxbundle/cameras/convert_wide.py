@@ -21,9 +21,11 @@ with the distortion k1, k2, p1, p2 of `mei`, which at ξ = 0 is that of `opencv`
 """
 
 from collections.abc import Mapping
+from typing import NoReturn
 
 from jaxbundle.cameras.convert_exact import (
     DISTORTIONS,
+    EQUAL,
     NotExact,
     Sizes,
     distortion,
@@ -73,7 +75,9 @@ def as_stereographic(core: Values, target: CameraModel) -> list[dict[str, float]
         return []
 
 
-def _by_angle(source, values, target, _sizes, _r0):
+def _by_angle(
+    source: CameraModel, values: Values, target: CameraModel, _sizes: Sizes, _r0: float
+) -> dict[str, float] | None:
     names = [_plain_family(model, "radial-spline-", "equidistant") for model in (source, target)]
     if not {*names} <= {*ANGLE}:
         return None
@@ -88,7 +92,9 @@ def _by_angle(source, values, target, _sizes, _r0):
     return dict.fromkeys(target.parameters, 0.0) | core | found
 
 
-def _by_division(source, values, target, _sizes, _r0):
+def _by_division(
+    source: CameraModel, values: Values, target: CameraModel, _sizes: Sizes, _r0: float
+) -> dict[str, float] | None:
     """As `division`, or None if one of the two is not such a model."""
     pair = {source.name, target.name}
     if not (pair <= {*DIVISIONS} and pair & {"division", "scaramuzza"}):
@@ -128,21 +134,24 @@ def _by_division(source, values, target, _sizes, _r0):
     }
 
 
-def _need(values, model: str, **expected) -> None:
+def _need(values: Values, model: str, **expected: float) -> None:
     for name, value in expected.items():
+        # Exactly: a value close to it is another camera, which a fit can represent.
         if values[name] != value:
             _refuse(f"as a {model} its {name} is {value:g}, and it is {values[name]:.6g}")
 
 
-def _by_sphere(source, values, target, sizes, r0):
+def _by_sphere(
+    source: CameraModel, values: Values, target: CameraModel, sizes: Sizes, r0: float
+) -> dict[str, float] | None:
     names = [_plain_family(model, "spline-", "stereographic") for model in (source, target)]
     if not {*names} <= {*SPHERES}:
         return None
     _need_no_spline(source, values)
-    return _of_sphere(target, names[1], _as_sphere(source, names[0], values, sizes), sizes, r0)
+    return _from_sphere(target, names[1], _as_sphere(source, names[0], values, sizes), sizes, r0)
 
 
-def _as_sphere(source, name, values, sizes):
+def _as_sphere(source: CameraModel, name: str, values: Values, sizes: Sizes) -> dict[str, float]:
     """A camera in the parameters of `mei`."""
     if name == "mei":
         return dict(values)
@@ -156,13 +165,16 @@ def _as_sphere(source, name, values, sizes):
     need = {"eucm": ("beta", 1.0), "double-sphere": ("xi", 0.0), "division": ("k", 0.0)}.get(name)
     if need and values[need[0]] != need[1]:
         raise NotExact(f"{name} is another function unless {need[0]} is {need[1]:g}")
+    # ξ = α/(1 − α), see the module.
     if xi is None:
         xi = values["alpha"] / (1 - values["alpha"])
     core = {name: values[name] * (1 + xi if name[0] == "f" else 1) for name in CORE}
     return core | {"xi": xi} | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
 
 
-def _of_sphere(target, name, mei, sizes, r0):
+def _from_sphere(
+    target: CameraModel, name: str, mei: Values, sizes: Sizes, r0: float
+) -> dict[str, float]:
     """The parameters of a model of a camera in those of `mei`."""
     if name == "mei":
         return dict(mei)
@@ -172,11 +184,12 @@ def _of_sphere(target, name, mei, sizes, r0):
             _refuse(f"{name} is a perspective camera, and xi is {xi:.6g}")
         zero = ("k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2")
         return with_distortion(target, {**mei, **dict.fromkeys(zero, 0.0)}, sizes, r0)
+    # Only `mei` itself has a distortion beside its sphere.
     for term in ("k1", "k2", "p1", "p2"):
         if mei[term] != 0:
             _refuse(f"{target.name} has no {term}, which is {mei[term]:.6g}")
     only = {"stereographic": 1.0, "division": 0.0}.get(name, xi)
-    if abs(xi - only) > 1e-12:
+    if abs(xi - only) > EQUAL:
         _refuse(f"{target.name} is the sphere with xi = {only:g}, and it is {xi:.6g}")
     core = {n: mei[n] / (1 + xi if n[0] == "f" else 1) for n in CORE}
     alpha = xi / (1 + xi)
@@ -189,10 +202,10 @@ def _plain_family(model: CameraModel, family: str, plain: str) -> str:
     return plain if model.name.startswith(family) else model.name
 
 
-def _need_no_spline(source, values) -> None:
+def _need_no_spline(source: CameraModel, values: Values) -> None:
     if "spline-" in source.name and any(values[name] for name in source.parameters[len(CORE) :]):
         _refuse(f"the distortion of {source.name} is a spline")
 
 
-def _refuse(why: str):
+def _refuse(why: str) -> NoReturn:
     raise NotExact(why)

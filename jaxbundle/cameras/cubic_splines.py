@@ -27,5 +27,6 @@ def through_values(number: int) -> Float[np.ndarray, "knots number"]:
     A = np.zeros((knots, knots))
     for i in range(number):
         A[i, i : i + 3] = 1 / 6, 4 / 6, 1 / 6
+    # Second differences of the first and last three coefficients: the curvature at both ends is 0.
     A[number, :3] = A[number + 1, -3:] = 1, -2, 1
     return np.linalg.inv(A)[:, :number]

@@ -27,6 +27,7 @@ def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     fx, fy, cx, cy, k = p
     X, Y, Z = r, -s, -q
     N = Z + jnp.sqrt(Z * Z - 4 * k * (X * X + Y * Y))
+    # The root with + is the branch through the axis.
     N = jnp.where(N > 0, N, jnp.nan)
     return cx + 2 * fx * X / N, cy + 2 * fy * Y / N
 

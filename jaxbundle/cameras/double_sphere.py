@@ -35,6 +35,7 @@ def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     d1 = jnp.sqrt(square + Z * Z)
     above = xi * d1 + Z
     N = alpha * jnp.sqrt(square + above * above) + (1 - alpha) * above
+    # As far as the image grows: beyond, two rays share a point.
     w1 = reach(alpha)
     w2 = (w1 + xi) / jnp.sqrt(2 * w1 * xi + xi * xi + 1)
     N = jnp.where(Z > -w2 * d1, N, jnp.nan)

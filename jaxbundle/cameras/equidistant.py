@@ -38,11 +38,15 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 # 0: near 0 a series replaces them, exact to rounding. The inner `where` keeps the derivative of the
 # branch not taken finite.
 
+# Below this the first omitted term of the longest series, t¹⁰/11, is 9e-17, less than rounding; of
+# the others less still.
 _NEAR = 1e-3
 
 
-def angle_over_sine(square, q):
+def angle_over_sine(square: Scalar, q: Scalar) -> Scalar:
     """θ/ρ with ρ² = `square` = r² + s² and θ = atan2(ρ, −q)."""
+    # Not near θ = 180°, where the ray has no azimuth and the image none: there the quotient is
+    # right, infinite.
     near = (square < _NEAR * q * q) & (q < 0)
     t2 = jnp.where(near, square / jnp.where(near, q * q, 1.0), 0.0)
     series = (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) / jnp.where(near, -q, 1.0)
@@ -50,7 +54,7 @@ def angle_over_sine(square, q):
     return jnp.where(near, series, jnp.arctan2(rho, -q) / rho)
 
 
-def sine_over_angle(square):
+def sine_over_angle(square: Scalar) -> Scalar:
     """sin θ/θ with θ² = `square`."""
     near = square < _NEAR
     t2 = jnp.where(near, square, 0.0)
@@ -58,7 +62,7 @@ def sine_over_angle(square):
     return jnp.where(near, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), jnp.sin(theta) / theta)
 
 
-def cosine(square):
+def cosine(square: Scalar) -> Scalar:
     """cos θ with θ² = `square`."""
     near = square < _NEAR
     t2 = jnp.where(near, square, 0.0)

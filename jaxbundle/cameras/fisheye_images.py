@@ -26,10 +26,10 @@ from jaxbundle.cameras.scalars import OfRay, Pair, Parameters, Scalar, ToRay, Tr
 def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     """The ideal image of a ray, and the ray of an ideal image; arguments as of `perspective`."""
 
-    def scale(R, q):
+    def scale(R: Scalar, q: Scalar) -> Scalar:
         return 2 / (R - q)
 
-    def ray(square):
+    def ray(square: Scalar) -> Pair:
         return 4 / (4 + square), (4 - square) / (4 + square)
 
     return _image(columns, up, scale, ray)
@@ -38,10 +38,10 @@ def stereographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     """As `stereographic`; NaN beyond θ = 180°."""
 
-    def scale(R, q):
+    def scale(R: Scalar, q: Scalar) -> Scalar:
         return jnp.sqrt(2 / (R * (R - q)))
 
-    def ray(square):
+    def ray(square: Scalar) -> Pair:
         square = jnp.where(square < 4, square, jnp.nan)
         return jnp.sqrt(1 - square / 4), 1 - square / 2
 
@@ -51,10 +51,10 @@ def equisolid(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 def orthographic(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     """As `stereographic`; NaN from θ = 90° on, where the image would turn back."""
 
-    def scale(R, q):
+    def scale(R: Scalar, q: Scalar) -> Scalar:
         return jnp.where(q < 0, 1 / R, jnp.nan)
 
-    def ray(square):
+    def ray(square: Scalar) -> Pair:
         cosine = jnp.sqrt(jnp.where(square < 1, 1 - square, jnp.nan))
         return jnp.where(square < 1, 1.0, jnp.nan), cosine
 

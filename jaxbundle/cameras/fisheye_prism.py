@@ -32,17 +32,17 @@ from jaxbundle.cameras.equidistant import equidistant
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.radial import is_increasing, radial
-from jaxbundle.cameras.scalars import Formula, Parameters, Scalar
+from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar, Triple
 
 CORE = ("fx", "fy", "cx", "cy")
 _angle, _ray = equidistant((0, 1), up=False)
 
 
-def _decentre(x, y, r2, p1, p2):
+def _decentre(x: Scalar, y: Scalar, r2: Scalar, p1: Scalar, p2: Scalar) -> Pair:
     return 2 * p1 * x * y + p2 * (r2 + 2 * x * x), 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
 
 
-def thin_prism(p: Parameters, a: Scalar, b: Scalar):
+def thin_prism(p: Parameters, a: Scalar, b: Scalar) -> Pair:
     """[a', b'] of `thin-prism-fisheye`."""
     _, _, _, _, k1, k2, p1, p2, k3, k4, sx1, sy1 = p
     t2 = a * a + b * b
@@ -51,13 +51,13 @@ def thin_prism(p: Parameters, a: Scalar, b: Scalar):
     return a * k + da + sx1 * t2, b * k + db + sy1 * t2
 
 
-def tangential(p: Parameters, a: Scalar, b: Scalar):
+def tangential(p: Parameters, a: Scalar, b: Scalar) -> Pair:
     """[a', b'] of `kannala-brandt-tangential`."""
     *core, k1, k2, k3, k4, p1, p2 = p
     return thin_prism((*core, k1, k2, p1, p2, k3, k4, 0.0, 0.0), a, b)
 
 
-def rad_tan(p: Parameters, a: Scalar, b: Scalar):
+def rad_tan(p: Parameters, a: Scalar, b: Scalar) -> Pair:
     """[a', b'] of `rad-tan-thin-prism-fisheye`."""
     k, (p0, p1, s0, s1, s2, s3) = p[4:10], p[10:]
     factor = radial(k, a * a + b * b)
@@ -77,14 +77,15 @@ def _fisheye(
     undistort = implicit_inverse(distort, lambda p, X, Y: (X, Y), 12)
     one = (1.0, 1.0)
 
-    def project(p, r, s, q):
+    def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         a, b = _angle(one, r, s, q)
+        # Before decentring, which may move a point across the turn, but not turn the image back.
         there = is_increasing(coefficients(p), a * a + b * b)
         a, b = distort(p, a, b)
         u, v = p[2] + p[0] * a, p[3] + p[1] * b
         return jnp.where(there, u, jnp.nan), jnp.where(there, v, jnp.nan)
 
-    def unproject(p, u, v):
+    def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
         return _ray(one, *undistort(p, (u - p[2]) / p[0], (v - p[3]) / p[1]))
 
     return CameraModel(

@@ -25,6 +25,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
     """The pixel of a ray: the formula of `fov`."""
     fx, fy, cx, cy, omega = p
+    # atan2 keeps the quadrant, so that the image goes on beyond 90°.
     wide = 2 * jnp.tan(omega / 2)
     scale = wide / omega * angle_over_sine(wide * wide * (r * r + s * s), q)
     return cx + fx * scale * r, cy - fy * scale * s
@@ -35,6 +36,7 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
     fx, fy, cx, cy, omega = p
     X, Y = omega * (u - cx) / fx, omega * (v - cy) / fy
     square = X * X + Y * Y
+    # ω·ρ = π is straight backwards.
     square = jnp.where(square < jnp.pi**2, square, jnp.nan)
     scale = sine_over_angle(square)
     return X * scale, -Y * scale, -2 * jnp.tan(omega / 2) * cosine(square)

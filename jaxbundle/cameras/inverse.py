@@ -45,29 +45,36 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     """
 
     @jax.custom_jvp
-    def inverse(p, X, Y):
-        def newton(_, xy):
+    def inverse(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
+        def newton(_: int, xy: Pair) -> Pair:
             (gx, gy), J = value_and_derivative(g, p, *xy)
             dx, dy = _solve(J, X - gx, Y - gy)
             return xy[0] + dx, xy[1] + dy
 
+        # As many steps for every point: a loop that waits for the slowest of a million would wait
+        # for those without a root.
         x, y = jax.lax.fori_loop(0, iterations, newton, start(p, X, Y))
         (gx, gy), (a, b, c, d) = value_and_derivative(g, p, x, y)
+        # A thousand units of rounding: of p in the formula, amplified where J is nearly singular.
         remainder = jnp.abs(gx - X) + jnp.abs(gy - Y)
         size = jnp.abs(x) + jnp.abs(y) + jnp.abs(X) + jnp.abs(Y)
         found = remainder <= 1000 * jnp.finfo(jnp.result_type(x)).eps * size
+        # On the branch through the principal point the Jacobian keeps eigenvalues of positive real
+        # part.
         found &= (a * d - b * c > 0) & (a + d > 0)
         return jnp.where(found, x, jnp.nan), jnp.where(found, y, jnp.nan)
 
     @inverse.defjvp
-    def _(primals, tangents):
+    def _(primals: tuple, tangents: tuple) -> tuple[Pair, Pair]:
         (p, X, Y), (dp, dX, dY) = primals, tangents
         x, y = inverse(p, X, Y)
         _, J = value_and_derivative(g, p, x, y)
+        # ẋ = J⁻¹·(Ẋ − ∂g/∂p·ṗ), at the root, which is `inverse` again: differentiable once more.
         _, (gx, gy) = jax.jvp(lambda p: g(p, x, y), (p,), (dp,))
         return (x, y), _solve(J, dX - gx, dY - gy)
 
-    def with_floats(p, X, Y):
+    def with_floats(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
+        # Whole numbers have no derivatives: all become floats of one precision.
         dtype = jnp.result_type(float, *p, X, Y)
         *p, X, Y = (jnp.asarray(v, dtype) for v in (*p, X, Y))
         return inverse(tuple(p), X, Y)
@@ -88,28 +95,32 @@ def limit_region(
     """
     inverse = implicit_inverse(formula, start, iterations)
 
-    def only(p, at, result) -> Pair:
+    def only(p: Parameters, at: Pair, result: Pair) -> Pair:
         there = inside(p, *at)
         x, y = (jnp.where(there, value, jnp.nan) for value in result)
         return x, y
 
-    def back(p, X, Y):
+    def back(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
+        # The limit is applied to the root, not to the steps that lead to it.
         xy = inverse(p, X, Y)
         return only(p, xy, xy)
 
     return lambda p, x, y: only(p, (x, y), formula(p, x, y)), back
 
 
-def value_and_derivative(g, p, x, y):
+def value_and_derivative(
+    g: Formula, p: Parameters, x: Scalar, y: Scalar
+) -> tuple[Pair, tuple[Scalar, Scalar, Scalar, Scalar]]:
     """g and its derivative J = [[a, b], [c, d]] with respect to (x, y)."""
     one, zero = jnp.ones_like(x), jnp.zeros_like(x)
     at_p = partial(g, p)
+    # Two directions, each a column of J, with the value: cheaper than `jacfwd` of an array of two.
     value, (a, c) = jax.jvp(at_p, (x, y), (one, zero))
     _, (b, d) = jax.jvp(at_p, (x, y), (zero, one))
     return value, (a, b, c, d)
 
 
-def _solve(J, u, v):
+def _solve(J: tuple[Scalar, Scalar, Scalar, Scalar], u: Scalar, v: Scalar) -> Pair:
     """J⁻¹·(u, v)."""
     a, b, c, d = J
     determinant = a * d - b * c

@@ -12,7 +12,7 @@ behind it is projected all the same, through the projection centre: the caller l
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -132,14 +132,21 @@ class CameraModel:
         columns = [self.parameters.index(name) for name in self.principal_distance]
         ideal, ray = IMAGES[self.image](columns, self.axes == "up")
         if self.magnification is not None:
+            # Distortion formulas near the identity need an ideal image of the same scale on the
+            # axis.
             ideal, ray = (_magnify(of, columns, self.magnification) for of in (ideal, ray))
         formula, back = self.correct or self.distort, self.inverse
         if self.project is not None:
-            formula = _of_the_ideal_image(self.project, ray)
+            # `project` as a distortion of the ideal image, so that every model has the same two
+            # domains.
+            project = self.project
+            formula = lambda p, xi, yi: project(p, *ray(p, xi, yi))
         if self.unproject is not None:
-            corrected = _to_the_ideal_image(self.unproject, ideal)
+            unproject = self.unproject
+            corrected = lambda p, x, y: ideal(p, *unproject(p, x, y))
             formula, back = (corrected, back) if formula is None else (formula, corrected)
         assert formula is not None, "checked by _complete"
+        # The formula stated is exact; the other direction is its inverse, to rounding.
         back = back or implicit_inverse(
             formula, self.start or _less_its_origin(formula), self.iterations
         )
@@ -207,6 +214,7 @@ def _complete(model: CameraModel) -> dict:
             raise ValueError(f"{where}{name} is one of {known}, not {getattr(model, name)!r:.60}.")
     if not isinstance(model.iterations, int) or model.iterations < 1:
         raise ValueError(f"{where}iterations must be a number above 0, not {model.iterations!r}.")
+    # The first of the usual names that are among the parameters.
     known = lambda sets: next((names for names in sets if {*names} <= {*parameters}), ())
     kept = {
         "parameters": parameters,
@@ -232,17 +240,9 @@ def _complete(model: CameraModel) -> dict:
     return kept
 
 
-def _of_the_ideal_image(project: OfRay, ray: ToRay) -> Formula:
-    """The image of the ray of an ideal coordinate."""
-    return lambda p, xi, yi: project(p, *ray(p, xi, yi))
-
-
-def _to_the_ideal_image(unproject: ToRay, ideal: OfRay) -> Formula:
-    """The ideal coordinate of the ray of an image."""
-    return lambda p, x, y: ideal(p, *unproject(p, x, y))
-
-
-def _magnify(function, columns, magnification) -> Any:
+def _magnify(
+    function: Callable, columns: Sequence[int], magnification: Callable[[Parameters], Scalar]
+) -> Any:
     """An ideal image, or its rays, at the scale that the image has on the axis."""
     return lambda p, *at: function({c: p[c] * magnification(p) for c in columns}, *at)
 

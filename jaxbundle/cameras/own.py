@@ -2,20 +2,18 @@
 
 from collections.abc import Mapping
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxbundle.cameras.inverse import value_and_derivative
 from jaxbundle.cameras.model import FORMULAS, CameraModel
 from jaxbundle.float64 import local_x64
 from jaxbundle.system.programs import compile_once
-
-ROUND_TRIP = 1e-9
-"""Tolerance of an inverse relative to the principal distance."""
-SLANT = 0.05
-"""Distance from the axis at which a given inverse is tested, relative to the principal distance."""
+from jaxbundle.types import Scalar
 
 
 def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> None:
@@ -45,7 +43,9 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
             f"axes {model.axes!r} (x right, y {model.axes}) right, and the signs of the formula?"
         )
     size = max(abs(values[name]) for name in model.principal_distance)
-    if model.inverse is not None and not missed <= ROUND_TRIP * size:
+    # 1e-9 of the principal distance: 1e-5 pixels. An inverse that ends its iterations early, as
+    # OpenCV's, is refused, since the two domains of a residual would differ.
+    if model.inverse is not None and not missed <= 1e-9 * size:
         raise ValueError(
             f"{where}inverse is not the inverse of its formula: a point comes back {missed:.3g} "
             f"{model.unit} beside itself; omit inverse, and it is computed"
@@ -59,6 +59,7 @@ def _check_form(model: CameraModel) -> None:
     number_of, results = (3, "three") if name == "unproject" else (2, "two")
     number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
     p = (number,) * len(model.parameters)
+    # Numbers and arrays: a formula with an `if` works for one of them only.
     for given in (number, array):
         expected = (
             f"Camera model {model.name!r}: {name}(p, {arguments[0]}) must take the parameters "
@@ -80,7 +81,7 @@ def _check_form(model: CameraModel) -> None:
 
 
 @partial(compile_once, static=0)
-def _near_the_axis(model: CameraModel, p):
+def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...], Array]:
     """Image of the axis, derivative of the formula there, and the error of a point near it after
     formula and inverse."""
     p = tuple(p)
@@ -88,10 +89,13 @@ def _near_the_axis(model: CameraModel, p):
     size = p[model.parameters.index(model.principal_distance[0])]
     at = zero, zero
     if model.own_formula == "to_ideal":
+        # `to_ideal` is tested where the axis is imaged: at the measured point whose ideal one is 0.
         near = [-x for x in formula(p, *at)]  # where there is no inverse, something is wrong there
         at = [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(model.from_ideal(p, *at), near)]
     value, derivative = value_and_derivative(formula, p, *at)
-    near = at[0] + SLANT * size, at[1] - 0.6 * SLANT * size
+    # 3° off the axis, in no symmetric direction: any model has an image there.
+    slant = 0.05
+    near = at[0] + slant * size, at[1] - 0.6 * slant * size
     back = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal
     again = back(p, *formula(p, *near))
     missed = jnp.abs(again[0] - near[0]) + jnp.abs(again[1] - near[1])

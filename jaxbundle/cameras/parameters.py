@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -53,8 +54,9 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
             )
 
 
-def _is_finite_number(value) -> bool:
+def _is_finite_number(value: Any) -> bool:
     try:
+        # True would be 1, and a masked value whatever lies under the mask.
         return not (isinstance(value, bool) or np.ma.is_masked(value)) and math.isfinite(value)
     except (TypeError, OverflowError):
         return False

@@ -34,6 +34,7 @@ def pixel_frame(
         return np.zeros(2), np.ones(2)
     if image_size is None:
         raise ValueError("image_size is needed to relate its coordinates to pixels")
+    # (0, 0) is the centre of the first pixel, so the centre of the image is at (w − 1)/2.
     centre = (np.asarray(image_size, float) - 1) / 2
     if model.unit == "px":
         return centre, np.array([1.0, -1.0])
@@ -43,7 +44,10 @@ def pixel_frame(
 
 
 def in_model_units(
-    uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+    uv: Float[np.ndarray, "*any 2"],
+    model: CameraModel,
+    image_size: Numbers | None,
+    pixel_size: Numbers | None = None,
 ) -> Float[np.ndarray, "*any 2"]:
     """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
     origin, step = pixel_frame(model, image_size, pixel_size)
@@ -51,7 +55,10 @@ def in_model_units(
 
 
 def in_pixels(
-    xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+    xy: Float[np.ndarray, "*any 2"],
+    model: CameraModel,
+    image_size: Numbers | None,
+    pixel_size: Numbers | None = None,
 ) -> Float[np.ndarray, "*any 2"]:
     """The inverse of `in_model_units`."""
     origin, step = pixel_frame(model, image_size, pixel_size)

@@ -29,8 +29,6 @@ from jaxbundle.cameras.inverse import limit_region
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
-LEAST, MOST = 2, 40
-
 
 @lru_cache(maxsize=64)
 def radial_spline(number: int, degrees: float) -> CameraModel:
@@ -38,9 +36,11 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
 
     **Raises:** `ValueError` for a number that is not 2 to 40, a field of view not in 0° to 360°.
     """
-    if not (LEAST <= number <= MOST and 0 < degrees <= 360):
+    # Fewer values are hardly more than `equidistant`; 40 of 180° are one every 2°.
+    least, most = 2, 40
+    if not (least <= number <= most and 0 < degrees <= 360):
         raise ValueError(
-            f"a radial spline of {number} values over {degrees:g}°: {LEAST} to {MOST} values and a "
+            f"a radial spline of {number} values over {degrees:g}°: {least} to {most} values and a "
             "field of view up to 360° are expected, such as radial-spline-6-120"
         )
     last = float(np.radians(degrees / 2) ** 2)
@@ -56,6 +56,7 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
     def radial(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
         _, _, cx, cy, *values = p
         t2 = jnp.asarray(square(p, xi, yi))
+        # The spline is a function of θ², even in θ, hence smooth on the axis.
         weights = basis(t2 * (number / last), -1, number + 3) @ of_values.astype(t2.dtype)
         factor = 1 + sum(weights[..., i] * s for i, s in enumerate(values))
         return cx + xi * factor, cy + yi * factor

@@ -34,6 +34,7 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
     # √ has no derivative at 0; ρ³ has
     rho = jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1.0)), 0.0)
     Z = a0 + r2 * (a2 + rho * (a3 + rho * a4))
+    # The angle grows while Z − ρ·Z' > 0, at samples as in `radial.is_increasing`.
     growing = jnp.ones_like(r2, bool)
     for i in range(1, SAMPLES + 1):
         t = rho * (i / SAMPLES)
@@ -48,17 +49,13 @@ def _straight(p: Parameters, u: Scalar, v: Scalar) -> Pair:
     return (x - d * y) / det, (c * y - e * x) / det
 
 
-def _start(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
-    return X + p[1], Y + p[2]
-
-
 SCARAMUZZA = CameraModel(
     "scaramuzza",
     ("a0", "cx", "cy", "a2", "a3", "a4", "c", "d", "e"),
     unproject=unproject,
     unit="px",
     image="equidistant",
-    start=_start,
+    start=lambda p, X, Y: (X + p[1], Y + p[2]),
     iterations=14,
     principal_distance=("a0",),
     defaults={"c": 1.0},

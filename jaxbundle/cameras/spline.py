@@ -12,7 +12,7 @@ function. Outside the knots' field, |a| ≤ (NX − 3)·h/2 and |b| ≤ (NY − 
 It can represent any lens, including field curvature and decentred elements, with 2·NX·NY
 parameters. fx, fy, cx, cy are conventions: the grid absorbs their effect. Knots without points,
 and the rotation of the camera frame, which every pose absorbs, are determined by a weak prior σ of
-the knots (`PRIOR`) around the start values: in `calibrate`, the parametric lens of the start.
+the knots around the start values: in `calibrate`, the parametric lens of the start.
 
 `spline-12x9-110` has 12 × 9 knots and a field of view of 110°.
 
@@ -23,10 +23,13 @@ Source: the splined stereographic model of Kogan's mrcal (its documentation, "Sp
 lens model"), of third order, whose knots and order of parameters these are.
 """
 
+import dataclasses
+from collections.abc import Sequence
 from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxbundle.cameras import opencv
 from jaxbundle.cameras.cubic_splines import basis
@@ -35,9 +38,61 @@ from jaxbundle.cameras.model import CameraModel, LocalFormula
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 CORE = ("fx", "fy", "cx", "cy")
-PRIOR = 0.02
-"""σ of a knot about the parametric lens: some per cent of the radius, many pixels."""
-LEAST, MOST = 4, 40
+
+
+@dataclasses.dataclass(frozen=True)
+class _Grid:
+    """The knots of a model; `per_unit`: knots in a unit of the stereographic image."""
+
+    columns: int
+    rows: int
+    per_unit: float
+
+    def in_knots(self, p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
+        """Column and row of an ideal point, the first knot at (0, 0)."""
+        s = xi / p[0] * self.per_unit + (self.columns - 1) / 2
+        return s, yi / p[1] * self.per_unit + (self.rows - 1) / 2
+
+    def inside(self, p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
+        """Whether a point has 4 × 4 knots."""
+        s, t = self.in_knots(p, xi, yi)
+        return (s >= 1) & (s <= self.columns - 2) & (t >= 1) & (t <= self.rows - 2)
+
+    def distort(self, p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
+        """Ideal to measured coordinates, by all knots: most of the basis is 0."""
+        grid = jnp.stack(jnp.broadcast_arrays(*p[4:]), -1)
+        grid = grid.reshape(*grid.shape[:-1], self.rows, self.columns, 2)
+        return self.bend(p, grid, self.in_knots(p, xi, yi), xi, yi)
+
+    def bend(self, p: Parameters, grid: Array, at: Pair, xi: Scalar, yi: Scalar) -> Pair:
+        """By a grid of knots [..., rows, columns, 2] of which the first is at (0, 0)."""
+        along, across = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
+        da, db = jnp.moveaxis(jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0)
+        return p[2] + xi + p[0] * da, p[3] + yi + p[1] * db
+
+    def seen(self, p: Parameters, xi: Scalar, yi: Scalar) -> tuple[Array, ...]:
+        """The parameters of the 4 × 4 knots on which a point depends."""
+        s, t = self.in_knots(p, xi, yi)
+        first = lambda x, n: jnp.clip(jnp.floor(x), 1, n - 3).astype(int) - 1
+        j, i = first(s, self.columns), first(t, self.rows)
+        return tuple(
+            len(CORE) + 2 * ((i + row) * self.columns + j + column) + k
+            for row in range(4)
+            for column in range(4)
+            for k in range(2)
+        )
+
+    def distort_by_seen(
+        self, p: Parameters, which: Sequence[Array], knots: Sequence[Scalar], xi: Scalar, yi: Scalar
+    ) -> Pair:
+        """The same as `distort`, by the values of the knots that are seen."""
+        # The first of them has the number 2·(row·columns + column) after the core.
+        first = (which[0] - len(CORE)) // 2
+        s, t = self.in_knots(p, xi, yi)
+        grid = jnp.stack(knots, -1)
+        grid = grid.reshape(*grid.shape[:-1], 4, 4, 2)
+        at = s - first % self.columns, t - first // self.columns
+        return self.bend(p, grid, at, xi, yi)
 
 
 @lru_cache(maxsize=64)
@@ -47,55 +102,16 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
     **Raises:** `ValueError` for a grid that is not 4 to 40 knots either way, a field of view that
     is not in 0° to 350°.
     """
-    if not (LEAST <= min(columns, rows) and max(columns, rows) <= MOST and 0 < degrees <= 350):
+    # A point has 4 × 4 knots; 40 × 40 are 3200 parameters, 80 MB of normal equations.
+    least, most = 4, 40
+    if not (least <= min(columns, rows) and max(columns, rows) <= most and 0 < degrees <= 350):
         raise ValueError(
-            f"a spline of {columns} × {rows} knots over {degrees:g}°: {LEAST} to {MOST} knots "
+            f"a spline of {columns} × {rows} knots over {degrees:g}°: {least} to {most} knots "
             "either way and a field of view up to 350° are expected, such as spline-12x9-110"
         )
     per_unit = float((columns - 3) / (4 * np.tan(np.radians(degrees) / 4)))
-    middle = (columns - 1) / 2, (rows - 1) / 2
-
-    def in_knots(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-        return xi / p[0] * per_unit + middle[0], yi / p[1] * per_unit + middle[1]
-
-    def inside(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
-        s, t = in_knots(p, xi, yi)
-        return (s >= 1) & (s <= columns - 2) & (t >= 1) & (t <= rows - 2)
-
-    def grid_of_splines(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-        grid = jnp.stack(jnp.broadcast_arrays(*p[4:]), -1)
-        grid = grid.reshape(*grid.shape[:-1], rows, columns, 2)
-        return bent(p, grid, in_knots(p, xi, yi), xi, yi)
-
-    def bent(p: Parameters, grid, at: Pair, xi: Scalar, yi: Scalar) -> Pair:
-        """By a grid of knots [..., rows, columns, 2] of which the first is at (0, 0)."""
-        along, across = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
-        da, db = jnp.moveaxis(jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0)
-        return p[2] + xi + p[0] * da, p[3] + yi + p[1] * db
-
-    def corner(p: Parameters, xi: Scalar, yi: Scalar):
-        """The first column and row of the 4 × 4 knots that are seen."""
-        s, t = in_knots(p, xi, yi)
-        first = lambda x, n: jnp.clip(jnp.floor(x), 1, n - 3).astype(int) - 1
-        return first(s, columns), first(t, rows)
-
-    def seen(p: Parameters, xi: Scalar, yi: Scalar):
-        j, i = corner(p, xi, yi)
-        return tuple(
-            len(CORE) + 2 * ((i + row) * columns + j + column) + k
-            for row in range(4)
-            for column in range(4)
-            for k in range(2)
-        )
-
-    def by_seen(p: Parameters, which, knots, xi: Scalar, yi: Scalar) -> Pair:
-        first = (which[0] - len(CORE)) // 2
-        s, t = in_knots(p, xi, yi)
-        grid = jnp.stack(knots, -1)
-        grid = grid.reshape(*grid.shape[:-1], 4, 4, 2)
-        return bent(p, grid, (s - first % columns, t - first // columns), xi, yi)
-
-    distort, inverse = limit_region(grid_of_splines, inside, opencv.reduce, 12)
+    grid = _Grid(columns, rows, per_unit)
+    distort, inverse = limit_region(grid.distort, grid.inside, opencv.reduce, 12)
     knots = tuple(f"d{k}_{i}_{j}" for i in range(rows) for j in range(columns) for k in "xy")
     return CameraModel(
         f"spline-{columns}x{rows}-{degrees:g}",
@@ -106,6 +122,8 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
         image="stereographic",
         free=knots,
         never_free=CORE,
-        prior=dict.fromkeys(knots, PRIOR),
-        local=LocalFormula(32, seen, by_seen),
+        # σ of a knot about the parametric lens: some per cent of the radius, tens of pixels. Knots
+        # with points are known a hundred times better, so that it moves none of them.
+        prior=dict.fromkeys(knots, 0.02),
+        local=LocalFormula(32, grid.seen, grid.distort_by_seen),
     )

@@ -68,7 +68,10 @@ def fit(
         )
     design = jnp.hstack([source, jnp.ones_like(source[:, :1])])
     if weights is not None:
+        # p = 1/σ²: rows of the design and of the targets times √p.
         root = jnp.sqrt(weights)[:, None]
         design, target = root * design, root * target
+    # QR, not normal equations: pixel coordinates of some thousands beside ones have a condition
+    # that would be squared.
     Q, R = jnp.linalg.qr(design)
     return solve_triangular(R, Q.T @ target).T.reshape(6)

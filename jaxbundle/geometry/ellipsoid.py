@@ -34,9 +34,6 @@ class Ellipsoid(NamedTuple):
     c: Scalar
 
 
-AXIS = 1e-13
-"""A point nearer to the axis than this, in metres, is on it."""
-
 WGS84 = Ellipsoid(6378137.0, 6378137.0, 6356752.314245179)
 
 
@@ -127,16 +124,19 @@ def _on_axes(ellipsoid: Ellipsoid, v: Vector) -> Triple:
     return x, y, z
 
 
-def _foot(ellipsoid, X):
+def _foot(ellipsoid: Ellipsoid, X: Vector) -> tuple[tuple[Scalar, Scalar], Scalar, Triple]:
     """Sine and cosine of the latitude to a common factor, height, and unit normal (Fukushima)."""
     x, y, z = X
     a, c = ellipsoid.a, ellipsoid.c
     square = x * x + y * y
-    # on the axis the iteration would divide zero by zero
-    p = jnp.sqrt(jnp.where(square > AXIS**2, square, AXIS**2))
+    # On the axis the iteration would divide zero by zero. 1e-13 metres: no coordinate on the Earth
+    # has digits so small (rounding: 1e-9), and its square has all digits.
+    near = 1e-13
+    p = jnp.sqrt(jnp.where(square > near**2, square, near**2))
     k = c / a
     E, P, Z = 1 - k * k, p / a, k * z / a
     S, C = Z, k * P
+    # Halley's method, S and C up to a common factor: every step triples the correct digits.
     for _ in range(2):
         A = jnp.sqrt(S * S + C * C)
         D, F = Z * A**3 + E * S**3, P * A**3 - E * C**3

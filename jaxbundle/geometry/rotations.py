@@ -83,11 +83,12 @@ def quaternion_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array
 
     The product of those of the elementary rotations, (cos ½α, −sin ½α·e)."""
 
-    def about(axis, angle):
+    def about(axis: int, angle: Scalar) -> Float[Array, "4"]:
         c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
         return jnp.stack([c, *(-s if i == axis else jnp.zeros_like(s) for i in range(3))])
 
     omega, phi, kappa = angles
+    # In the order of the matrices: R3·R2·R1.
     q = quaternion_multiply(about(1, phi), about(0, omega))
     q = quaternion_multiply(about(2, kappa), q)
     return jnp.where(q[0] < 0, -q, q)
@@ -113,7 +114,9 @@ def omega_phi_kappa_near(
     (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns of each.
     """
     angles = omega_phi_kappa_from_matrix(M)
+    # (ω + π, π − φ, κ + π): the same rotation by the other branch of φ.
     other = angles * jnp.array([1.0, -1.0, 1.0]) + jnp.pi
+    # Whole turns nearest to the given angles.
     turned = lambda a: a + 2 * jnp.pi * jnp.round((given - a) / (2 * jnp.pi))
     angles, other = turned(angles), turned(other)
     distance = lambda a: jnp.sum((a - given) ** 2)

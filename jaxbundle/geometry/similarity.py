@@ -54,6 +54,7 @@ def transform_pose(
 
 def inverse(tau: Float[AnyArray, "7"]) -> Float[Array, "7"]:
     """The parameters of X = exp(−s)·Rsᵀ·(X' − t)."""
+    # X = exp(−s)·Rsᵀ·X' − exp(−s)·Rsᵀ·t: the shift goes through the rotation that leads back.
     turn_back = jnp.concatenate([jnp.zeros_like(tau[:3]), -tau[3:]])
     return jnp.concatenate([transform_point(turn_back, -tau[:3]), turn_back[3:]])
 
@@ -83,6 +84,7 @@ def helmert_point(X: Float[AnyArray, "3"]) -> Float[Array, "3 7"]:
 
     Columns in the order of τ: per object unit, per radian, per unit of log scale.
     """
+    # Of the displacement to first order, whose derivative at τ = 0 is that of the transformation.
     return jax.jacfwd(displacement)(jnp.zeros(7, X.dtype), X)
 
 

@@ -13,6 +13,11 @@ from jaxbundle.leastsquares.declarations import Kind as Kind
 from jaxbundle.leastsquares.declarations import Motions as Motions
 from jaxbundle.leastsquares.declarations import Observations as Observations
 from jaxbundle.leastsquares.declarations import Table as Table
+from jaxbundle.leastsquares.indexing.settings import PlanningSettings as PlanningSettings
+from jaxbundle.leastsquares.iterations.search import MarquardtDescent as MarquardtDescent
+from jaxbundle.leastsquares.iterations.search import NielsenTrustRegion as NielsenTrustRegion
+from jaxbundle.leastsquares.iterations.search import RegionSettings as RegionSettings
+from jaxbundle.leastsquares.iterations.stopping import StoppingSettings as StoppingSettings
 from jaxbundle.leastsquares.problem import Problem as Problem
 from jaxbundle.leastsquares.problem import make_problem as make_problem
 from jaxbundle.leastsquares.quality.derivatives import solve as solve

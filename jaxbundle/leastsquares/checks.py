@@ -8,17 +8,16 @@ With V and W of their own observations and Q of the solution,
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
-from jaxbundle.leastsquares.equations.normal import normal_equations
-from jaxbundle.leastsquares.indexing.rows import Data, Values, lay_out_data
+from jaxbundle.leastsquares.equations.normal import Tangent, normal_equations
+from jaxbundle.leastsquares.indexing.plan import Incidences, Plan
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
-
-STEPS = 20
 
 
 def determine(
@@ -48,11 +47,15 @@ def determine(
             tables.pop(e)
             functions.append(blank | {t: np.asarray(x)[: len(blank[t])] for t, x in tables.items()})
         rows = {t: np.stack([f[t] for f in functions]) for t in blank}
+        # V⁻¹ is the intersection with images given; V⁻¹WᵀQWV⁻¹ what their own uncertainty adds, in
+        # the datum of the adjustment, by propagation of three linear functions for each point.
         cofactors.append(np.asarray(inverse[row]) + found.propagate_rows(rows))
     return without_filling(problem, values), np.array(cofactors)
 
 
-def _by_row(at, W):
+def _by_row(
+    at: Incidences, W: Float[Array, "chunks length w v"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n w v"]]:
     """The incidences of a group sorted by eliminated row: that, the row of the group, V⁻¹·Wᵀ."""
     eliminated = np.asarray(at.eliminated).ravel()
     kept = np.repeat(np.asarray(at.row), at.eliminated.shape[1])
@@ -61,18 +64,23 @@ def _by_row(at, W):
 
 
 @compile_once
-def _intersect(declared, plan, data: Data):
+def _intersect(
+    declared: Declared, plan: Plan, data: Data, steps: int = 20
+) -> tuple[Values, Float[Array, "rows w w"], Tangent]:
+    """The eliminated rows with all others given, by Gauss–Newton steps; V⁻¹, and V⁻¹·Wᵀ of every
+    incidence. All steps are taken, more than converging rows need: one loop for all rows would
+    wait for the slowest."""
     laid, e = lay_out_data(plan, data), present(plan.eliminated)
     group = plan.groups[e]
     held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
     space = declared.spaces[e]
 
-    def further(values, _):
+    def further(values: Values, _: None) -> tuple[Values, None]:
         _, gradient, N = normal_equations(declared, plan, values, laid)
         step = -jnp.linalg.solve(N.eliminated + held, gradient[e][..., None])[..., 0]
         return values | {e: jax.vmap(space.retract)(values[e], step)}, None
 
-    values, _ = jax.lax.scan(further, data.start, None, STEPS)
+    values, _ = jax.lax.scan(further, data.start, None, steps)
     *_, N = normal_equations(declared, plan, values, laid)
     inverse = jnp.linalg.inv(N.eliminated + held)
     of = lambda g: inverse[plan.incidences[g].eliminated]

@@ -89,7 +89,7 @@ class Table:
     def rows(self) -> int:
         return len(jax.tree.leaves(self.value)[0])
 
-    def rows_of(self, labels, kind: str) -> np.ndarray:
+    def rows_of(self, labels: Sequence[str] | np.ndarray, kind: str) -> np.ndarray:
         """The rows with these labels, as touched by observations of a kind."""
         place = {self.label(row): row for row in range(self.rows)}
         missing = next((name for name in labels if name not in place), None)
@@ -227,7 +227,7 @@ class Observations:
         return len(self.rows[0])
 
     def resolve_labels(self, tables: Sequence[Table]) -> "Observations":
-        """The same with row numbers for labels.
+        """These observations with row numbers in place of labels.
 
         **Raises:** `InputError` for an unknown table or label."""
         called = {t.name: t for t in tables}
@@ -278,7 +278,7 @@ def _arrays(what: str, tree: PyTree) -> PyTree[np.ndarray]:
     return jax.tree.map(number, tree, is_leaf=lambda x: isinstance(x, list))
 
 
-def _row_numbers(kind: str, rows) -> np.ndarray:
+def _row_numbers(kind: str, rows: Sequence | np.ndarray) -> np.ndarray:
     """Whole numbers, or labels as objects."""
     if np.asarray(rows).dtype.kind in "OUS":
         return np.array([str(r) for r in np.ravel(rows)], dtype=object)
@@ -289,7 +289,9 @@ def _row_numbers(kind: str, rows) -> np.ndarray:
     return rows.astype(np.int64)
 
 
-def _whitening(name: str, covariance, number: int, residuals: int):
+def _whitening(
+    name: str, covariance: Any, number: int, residuals: int
+) -> Float[np.ndarray, "n r r"]:
     covariance = numeric_array(f"{name}: covariance", covariance, "[n, r, r]").astype(float)
     if covariance.shape != (number, residuals, residuals):
         raise InputError(
@@ -297,6 +299,8 @@ def _whitening(name: str, covariance, number: int, residuals: int):
             f"{list(covariance.shape)}"
         )
     size = np.sqrt(np.einsum("nii,njj->nij", covariance, covariance))
+    # 1e-9: rounding of a covariance that was computed, or printed with nine digits; Cholesky reads
+    # one triangle alone and would not see the other.
     if not (np.abs(covariance - covariance.mT) <= 1e-9 * size).all():
         raise InputError(f"{name}: a covariance is not symmetric or not finite")
     try:

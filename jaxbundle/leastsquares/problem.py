@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, PyTree
 
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
-from jaxbundle.leastsquares.declarations import Motions, Observations, Table
-from jaxbundle.leastsquares.indexing.indices import common, finish, round_up
+from jaxbundle.leastsquares.declarations import Kind, Motions, Observations, Table
+from jaxbundle.leastsquares.equations.normal import Tangent
+from jaxbundle.leastsquares.indexing.indices import Sizes, common, finish, round_up
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.planner import make_plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
@@ -30,16 +31,14 @@ from jaxbundle.leastsquares.indexing.rows import (
     evaluate,
     scalars,
 )
+from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
 from jaxbundle.leastsquares.iterations.retraction import retract
 from jaxbundle.leastsquares.iterations.solver import LeastSquares
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
+from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.leastsquares.weights import diagonal, inverse_sigma, used
 from jaxbundle.system.memory import return_freed_memory
-
-LARGE_PROBLEM = 200_000
-"""Problems with more observations are compiled for their exact sizes."""
-WORTH_RETURNING = 10_000
-"""Planning more observations leaves memory worth returning to the system."""
+from jaxbundle.types import AnyArray, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +55,11 @@ class Problem:
     choices: dict
     counts: "Counts"
     retraction: Callable
+
+    @property
+    def planning(self) -> PlanningSettings:
+        """The settings of its planning."""
+        return self.choices["settings",]
 
     def table(self, name: str) -> Table:
         """The table of this name."""
@@ -78,6 +82,7 @@ class Problem:
     def reduced_size(self) -> int:
         """Unknowns of the reduced system, including held ones."""
         e = self.plan.eliminated
+        # With held columns: the matrix has them, with ones on its diagonal.
         kept = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
         return kept if e is None else kept + self.kept_rows.sum() * self.table(e).space.width
 
@@ -115,8 +120,9 @@ def make_problem(
     *,
     motions: Motions | None = None,
     datum: Callable | None = None,
-    retraction=None,
+    retraction: Callable[[Declared], Callable] | None = None,
     reduction: str | None = None,
+    planning: PlanningSettings = PLANNING,
 ) -> Problem:
     """Plan and arrays of declared tables and observations.
 
@@ -124,7 +130,8 @@ def make_problem(
     [motions, defect] that change no observation and returns the datum unknowns, [rows, width] by
     table, and whether the datum is minimal. `retraction(declared)` gives the function `(plan,
     values, change)` that applies a change, by default `Retraction`. `reduction`: solver of the
-    reduced system, "dense", "banded" or "iterative"; by default chosen by size and fill."""
+    reduced system, "dense", "banded" or "iterative"; by default chosen by size and fill.
+    `planning`: sizes at which the plan changes its form."""
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
@@ -134,8 +141,9 @@ def make_problem(
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple((o.name, o.kind) for o in observations), spaces, motions)
     ways = REDUCTIONS if reduction is None else (reduction,)
-    planned = _make_plan(tables, observations, eliminate, ways)
-    data = make_data(declared, tables, observations)
+    # The plan depends on which rows meet and what is free, not on values.
+    planned = _make_plan(tables, observations, eliminate, ways, planning)
+    data = make_data(tables, observations)
     problem = Problem(
         tables,
         observations,
@@ -147,22 +155,36 @@ def make_problem(
         (retraction or Retraction)(declared),
     )
     problem = problem if motions is None else _with_datum(problem, datum)
-    if sum(o.number for o in observations) > WORTH_RETURNING:
+    # Sorting so many observations leaves megabytes in the allocator.
+    if sum(o.number for o in observations) > 10_000:
         return_freed_memory()
     return problem
 
 
-def _make_plan(tables, observations, eliminate, ways):
+def _make_plan(
+    tables: Sequence[Table],
+    observations: Sequence[Observations],
+    eliminate: str | None,
+    ways: Sequence[str],
+    settings: PlanningSettings,
+) -> tuple[Plan, Sizes, dict]:
     """The plan on the device, the sizes of its lists, and the choices made."""
-    host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways)
-    sizes = common([sizes], choose_rounding(observations))
+    host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways, settings=settings)
+    sizes = common([sizes], choose_rounding(observations, settings))
     return jax.device_put(finish(host, sizes)), sizes, choices
 
 
-def choose_rounding(observations) -> Callable:
+def choose_rounding(
+    observations: Sequence[Observations], settings: PlanningSettings
+) -> Callable[[Hashable, int], int]:
     """The rounding of plan sizes for this number of observations."""
-    large = sum(o.number for o in observations) > LARGE_PROBLEM
-    return lambda key, n: n if large else round_up(n)
+    large = is_large(observations, settings)
+    return lambda _key, n: n if large else round_up(n)
+
+
+def is_large(observations: Sequence[Observations], settings: PlanningSettings) -> bool:
+    """Whether a problem is worth a program of its own."""
+    return sum(o.number for o in observations) > settings.exact_sizes_from
 
 
 def with_factor(problem: Problem) -> Problem:
@@ -171,7 +193,7 @@ def with_factor(problem: Problem) -> Problem:
     if problem.plan.reduction in FACTORS:
         return problem
     given = problem.tables, problem.observations, problem.plan.eliminated
-    plan, sizes, choices = _make_plan(*given, FACTORS)
+    plan, sizes, choices = _make_plan(*given, FACTORS, problem.planning)
     if plan.reduction not in FACTORS:
         return problem
     plan = dataclasses.replace(plan, datum=problem.plan.datum)
@@ -208,6 +230,7 @@ def with_motions_at(problem: Problem, values: Values) -> Problem:
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
     floating = dataclasses.replace(problem.plan, datum=None)  # As in `make_problem`.
     gauge = find_open_motions(survey_motions(problem.declared, floating, data, real))
+    # The defect is that of the start values, whatever it is by chance elsewhere.
     if gauge.shape != datum.gauge.shape:
         return problem
     datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
@@ -215,7 +238,10 @@ def with_motions_at(problem: Problem, values: Values) -> Problem:
 
 
 def hold(
-    problem: Problem, table: str, rows, columns: slice | Sequence[int] = slice(None)
+    problem: Problem,
+    table: str,
+    rows: int | Sequence[int],
+    columns: slice | Sequence[int] = slice(None),
 ) -> Problem:
     """The problem with some unknowns held at their start values, removed from the datum
     unknowns."""
@@ -238,6 +264,7 @@ def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"
             if m.table == table:
                 part = wide if m.rows is None else wide[np.asarray(m.rows)]
                 now = np.array(group.free)
+                # `all_free` off: the mask takes part from now on, in another program.
                 now[:, m.start : m.start + m.width] = part[: len(now)]
                 group = dataclasses.replace(group, free=jax.device_put(now), all_free=False)
         groups[name] = group
@@ -255,7 +282,7 @@ def with_data(problem: Problem, data: Data) -> Problem:
     return dataclasses.replace(problem, data=data, counts=counts)
 
 
-def count(tables, data: Data) -> Counts:
+def count(tables: Sequence[Table], data: Data) -> Counts:
     """Rows with weight, and free unknowns."""
     return Counts(
         sum(int(used(np.asarray(w)).sum()) for w in data.weight.values()),
@@ -263,7 +290,7 @@ def count(tables, data: Data) -> Counts:
     )
 
 
-def check(tables, observations) -> None:
+def check(tables: Sequence[Table], observations: Sequence[Observations]) -> None:
     """Refuse duplicate table names, unknown tables, and rows that do not exist."""
     known = {}
     for table in tables:
@@ -282,7 +309,7 @@ def check(tables, observations) -> None:
 
 
 def distinct_names(observations: Sequence[Observations]) -> tuple[Observations, ...]:
-    """The same with names that differ: a second "distance" is "distance 2"."""
+    """Sets of observations under names that differ: a second "distance" is "distance 2"."""
     taken: set[str] = set()
     found = []
     for given in observations:
@@ -293,7 +320,11 @@ def distinct_names(observations: Sequence[Observations]) -> tuple[Observations, 
     return tuple(found)
 
 
-def check_numbers(tables, observations, weights) -> None:
+def check_numbers(
+    tables: Sequence[Table],
+    observations: Sequence[Observations],
+    weights: Mapping[str, Float[np.ndarray, "n ..."]],
+) -> None:
     """Refuse start values, and measured values with weight, that are not finite."""
     for table in tables:
         for rows in jax.tree.leaves(table.value):
@@ -306,6 +337,7 @@ def check_numbers(tables, observations, weights) -> None:
         for rows in jax.tree.leaves(given.measured):
             bad = ~np.isfinite(rows).reshape(given.number, math.prod(np.shape(rows)[1:]))
             counts = used(weight)
+            # Measured values without weight may be anything: excluded observations keep their rows.
             bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
             if bad.any():
                 row = int(np.argwhere(bad)[0][0])
@@ -315,7 +347,7 @@ def check_numbers(tables, observations, weights) -> None:
                 )
 
 
-def make_data(declared: Declared, tables, observations) -> Data:
+def make_data(tables: Sequence[Table], observations: Sequence[Observations]) -> Data:
     """The data of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = weights_of(tables, observations)
@@ -324,7 +356,9 @@ def make_data(declared: Declared, tables, observations) -> Data:
     return Data(*jax.device_put((start, measured, weights)))
 
 
-def weights_of(tables, observations) -> dict[str, Float[np.ndarray, "n ..."]]:
+def weights_of(
+    tables: Sequence[Table], observations: Sequence[Observations]
+) -> dict[str, Float[np.ndarray, "n ..."]]:
     """The weights of sets of observations by name; the number of residuals of a kind is found from
     the shapes."""
     called = {t.name: t for t in tables}
@@ -339,9 +373,12 @@ def weights_of(tables, observations) -> dict[str, Float[np.ndarray, "n ..."]]:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _evaluate(kind, spaces, values, measured):
+def _evaluate(
+    kind: Kind, spaces: tuple[Space, ...], values: Sequence[PyTree], measured: PyTree
+) -> tuple[Scalar, ...]:
     """The residuals of one observation."""
     blocks = [space.move(space.prepare(v), ()) for space, v in zip(spaces, values)]
+    # Only shapes are computed (`eval_shape`): how many residuals a kind has is nowhere declared.
     first = scalars(jax.tree.map(lambda x: x[None], measured))
     return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], first))
 
@@ -381,7 +418,7 @@ def without_filling(problem: Problem, values: Values) -> Values:
     }
 
 
-def _append_unused(x, n: int, mode: Literal["constant", "edge"]) -> Any:
+def _append_unused(x: AnyArray, n: int, mode: Literal["constant", "edge"]) -> Any:
     """At least one row more, so that there is an unused one."""
     x = x if isinstance(x, Tracer) else np.asarray(x)
     room = [(0, n - len(x)), *[(0, 0)] * (x.ndim - 1)]
@@ -401,12 +438,8 @@ def complete_data(problem: Problem, data: Data | None) -> Data:
     return pad_data(problem, jax.tree.map(double, data))
 
 
-LEAST_ROWS, MOST_ROWS = 128, 10_000
-"""Rows of the solver history; later steps are not recorded."""
-
-
 def make_solver(
-    problem: Problem, *, atol=1e-5, rtol=0.0, max_steps: int = 100, **options
+    problem: Problem, *, atol: float = 1e-5, rtol: float = 0.0, max_steps: int = 100, **options: Any
 ) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
     its program."""
@@ -414,7 +447,9 @@ def make_solver(
     squares = sum(_measured_squares(w, given.measured[o]) for o, w in given.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
-    rows = round_up(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
+    # The rows of the history are compiled in: all limits below 128 steps share a program. Steps
+    # after the first 10 000, which would be kept in three arrays on every device, are not recorded.
+    rows = round_up(min(max(max_steps + 1, 128), 10_000))
     return LeastSquares(
         problem.declared,
         problem.plan,
@@ -426,10 +461,14 @@ def make_solver(
     )
 
 
-def _measured_squares(weight, measured) -> float:
+def _measured_squares(
+    weight: Float[AnyArray, "n ..."], measured: PyTree[Float[AnyArray, "n ..."]]
+) -> float:
     """The sum of the squares of measured values divided by their σ, which gives the rounding of the
     residuals. Of several arrays the largest of those with one number for each residual counts; if
     there is none, the largest number of each observation."""
+    # Of correlated observations 1/σ given the others of its row: an estimate of rounding needs no
+    # more.
     w = diagonal(np.asarray(weight))
     size = lambda m: (len(w), math.prod(np.shape(m)[1:]))
     arrays = [np.asarray(m).reshape(size(m)) for m in jax.tree.leaves(measured)]
@@ -445,5 +484,5 @@ class Retraction:
 
     declared: Declared
 
-    def __call__(self, plan, values, change):
+    def __call__(self, plan: Plan, values: Values, change: Tangent) -> Values:
         return retract(self.declared, plan, values, change)

@@ -5,7 +5,8 @@ The padding that lets problems of similar size share compiled programs is remove
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +15,9 @@ from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions, move_into_datum
 from jaxbundle.leastsquares.datum.conditions import move_to_datum, of_groups
-from jaxbundle.leastsquares.equations.elimination import PIVOT, Factor, factorise, solve
+from jaxbundle.leastsquares.equations.elimination import PIVOT, NormalFactor, factorise, solve
 from jaxbundle.leastsquares.equations.linearise import differentiate
-from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
+from jaxbundle.leastsquares.equations.normal import Normal, Tangent, normal_equations
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
     Data,
@@ -30,8 +31,8 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.iterations.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import (
-    LARGE_PROBLEM,
     Problem,
+    is_large,
     make_solver,
     pad_data,
     pad_values,
@@ -47,30 +48,32 @@ from jaxbundle.leastsquares.quality.cofactors import (
 from jaxbundle.leastsquares.quality.reliability import Reliability, reliability
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray, present
 
 PLAN_PLACEHOLDER = "the plan"
 """Placeholder of the plan in a factor returned by a compiled function."""
 
-TO_SHARE = 10_000
-"""Problems with at least this many observations are distributed over several devices; for smaller
-ones waiting exceeds computing."""
-
-RETURNS, COST_TOLERANCE = 10, 1e-12
-"""Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
+MIN_SHARED_OBSERVATIONS = 10_000
+"""Problems with at least so many observations are distributed over several devices; of smaller ones
+(5 ms an iteration) the devices would wait for each other longer than they compute."""
 
 Rows = dict[str, Float[np.ndarray, "n r"]]
 """By the name of the set, rows in the given order."""
 
 
 def find_minimum(
-    problem: Problem, start: Values | None = None, *, progress: Callable | None = None, **options
+    problem: Problem,
+    start: Values | None = None,
+    *,
+    progress: Callable | None = None,
+    **options: Any,
 ) -> Minimum[Values]:
     """Iterate from `start` (default: that of the problem) and move the solution to the datum;
     `options`: of the solver (`make_solver`). Held values and datum are those of the problem.
 
     `progress(step, cost, λ)` is called during the iterations of large problems, otherwise at their
     end: JAX compiles a program that calls the host in every process anew."""
-    large = sum(o.number for o in problem.observations) > LARGE_PROBLEM
+    large = is_large(problem.observations, problem.planning)
     if large and progress is not None:
         options["progress"] = progress
     given = pad_values(problem, problem.data.start)
@@ -80,17 +83,19 @@ def find_minimum(
     if not large and progress is not None:
         minimise_from = _report_after(minimise_from, progress)
     first = minimum = minimise_from(start)
-    for _ in range(RETURNS):
+    # After ten returns the two do not agree: the last minimum is as good as the next.
+    for _ in range(10):
         there = with_motions_at(problem, without_filling(problem, minimum.values))
         values = _move_to_datum(there, minimum.values, given)
+        # No weighted points: motions change no observation at all, and the minimum stays one.
         if there is problem or not bool(converged(minimum.termination)):
             break
-        # Open combinations need not form a group (one open height of a point, say): the motion to #
-        # the datum may have left the minimum.
+        # Open combinations need not form a group (one open height of a point, say): the motion to
+        # the datum may have left the minimum. 1e-12: of the digits that vᵀPv has after rounding.
         before, after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
-        if after <= before * (1 + COST_TOLERANCE) + COST_TOLERANCE:
+        if after <= before * (1 + 1e-12) + 1e-12:
             break
         minimum = minimise_from(values)
     values = without_filling(problem, values)
@@ -100,7 +105,7 @@ def find_minimum(
 def _report_after(minimise_from: Callable, progress: Callable) -> Callable:
     """A search that calls `progress(step, cost, λ)` for every evaluation when it has ended."""
 
-    def minimise_and_report(start) -> Minimum[Values]:
+    def minimise_and_report(start: Values) -> Minimum[Values]:
         minimum = minimise_from(start)
         history = jax.tree.map(np.asarray, minimum.history)
         for step in range(min(int(minimum.iterations), len(history.cost))):
@@ -110,15 +115,15 @@ def _report_after(minimise_from: Callable, progress: Callable) -> Callable:
     return minimise_and_report
 
 
-def _on_one_device(problem: Problem, solver: LeastSquares):
+def _on_one_device(problem: Problem, solver: LeastSquares) -> Callable[[Values], Minimum[Values]]:
     data = pad_data(problem, problem.data)
     return lambda start: find(solver, data, start)
 
 
-def _on_all_devices(problem: Problem, solver: LeastSquares):
+def _on_all_devices(problem: Problem, solver: LeastSquares) -> Callable[[Values], Minimum[Values]]:
     shards = distribute(problem)
 
-    def minimise_from(start):
+    def minimise_from(start: Values) -> Minimum[Values]:
         found = find_minimum_of_shards(shards, solver, start)
         return dataclasses.replace(found, values=pad_values(problem, found.values))
 
@@ -129,7 +134,7 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
     """Whether there are several devices, and rows to distribute over them."""
     if len(sharing_devices()) == 1 or problem.plan.eliminated is None:
         return False
-    if sum(o.number for o in problem.observations) < TO_SHARE:
+    if sum(o.number for o in problem.observations) < MIN_SHARED_OBSERVATIONS:
         return False
     return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 
@@ -137,6 +142,8 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
 def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
     if problem.plan.datum is None:
         return values
+    # By programs per table, compiled once for all problems; the rare deformation that needs Newton
+    # steps compiles a program for its own.
     moved, there = move_into_datum(problem.declared, problem.plan, values, start)
     if not there:
         moved, _ = _move_by_newton(problem.declared, problem.plan, values, start)
@@ -156,7 +163,9 @@ def take_step(problem: Problem, values: Values) -> Values:
 
 
 @compile_once
-def _step(declared, plan, values, data, retraction):
+def _step(
+    declared: Declared, plan: Plan, values: Values, data: Data, retraction: Callable
+) -> Values:
     _, gradient, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     factor = factorise(Normal(plan, blocks))
     return retraction(plan, values, solve(factor, jax.tree.map(jnp.negative, gradient)))
@@ -184,6 +193,7 @@ class Solution:
     @functools.cached_property
     def residuals(self) -> Rows:
         """All residuals divided by their σ."""
+        # Residuals do not depend on the datum, whose motions at these values need not be surveyed.
         declared, plan = self._as_given.declared, self._as_given.plan
         return self._rows(_residuals(declared, plan, self._values, self._data))
 
@@ -199,13 +209,14 @@ class Solution:
         return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
 
     @functools.cached_property
-    def factor(self) -> Factor:
+    def factor(self) -> NormalFactor:
         """The normal equations, undamped, factorised."""
-        return with_plan(_factor(*self.given), self.problem.plan)
+        return with_plan(_factor(*self.arguments), self.problem.plan)
 
     @property
     def determined(self) -> bool:
         """Whether no unknown is so weak that its σ is rounding noise."""
+        # NaN pivots, of a matrix that is not positive definite, are no better than small ones.
         pivots = np.abs(np.asarray(self.factor.reduced.pivots))
         return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > PIVOT)
 
@@ -215,9 +226,9 @@ class Solution:
         return _cofactors(self.problem.declared, self._values, self.factor, self.moves)
 
     @functools.cached_property
-    def moves(self):
+    def moves(self) -> Tangent | None:
         """The generators of all tables along the motions; None if none is open."""
-        declared, plan, values = self.given[:3]
+        declared, plan, values = self.arguments[:3]
         return None if plan.datum is None else directions_of_motions(declared, values)
 
     def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
@@ -225,23 +236,26 @@ class Solution:
         return self._own[table]
 
     @functools.cached_property
-    def _own(self):
-        declared, plan, values = self.given[:3]
+    def _own(self) -> dict[str, Float[np.ndarray, "rows width width"]]:
+        """The cofactor blocks of all tables."""
+        declared, plan, values = self.arguments[:3]
         found = _of_tables(declared, plan, self.cofactors.own, values)
         return jax.tree.map(np.asarray, without_filling(self.problem, found))
 
     @functools.cached_property
     def reliability(self) -> Reliability:
         """Redundancy numbers and w of all observations."""
-        found = reliability(*self.given, self.cofactors)
+        found = reliability(*self.arguments, self.cofactors)
         return Reliability(**{f: self._rows(rows) for f, rows in vars(found).items()})
 
     def predicted_tests(self, data: Data) -> Rows:
         """nᵀu/√(1 + h) of all observations with the weights of `data` (`Reliability`; v/σ/√(1 + h)
         if uncorrelated): the normalised residuals of excluded observations, predicted from those in
         the adjustment and from the other residuals of their row."""
-        given = (*self.given[:3], pad_data(self.problem, data))
+        given = (*self.arguments[:3], pad_data(self.problem, data))
         found = reliability(*given, self.cofactors)  # a program that is there already
+        # v/σ of an observation that was not used has the variance 1 + h, not 1 − h: h from the
+        # unknowns, 1 from itself.
         v, h = self._rows(found.standard), self._rows(found.hat)
         return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
@@ -249,7 +263,7 @@ class Solution:
     def by_eliminated(self) -> Rows:
         """The derivatives [n, r, w] of all observations by the eliminated rows they touch, divided
         by their σ; without those that touch none."""
-        return self._rows(_by_eliminated(*self.given))
+        return self._rows(_by_eliminated(*self.arguments))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns, compiled
@@ -262,9 +276,11 @@ class Solution:
         still = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
         return _rows_of(function, self.problem.declared, self.values, still)
 
-    def propagate_rows(self, rows) -> Float[np.ndarray, "n n"]:
+    def propagate_rows(
+        self, rows: Mapping[str, Float[AnyArray, "n rows width"]]
+    ) -> Float[np.ndarray, "n n"]:
         """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""
-        declared, plan, values = self.given[:3]
+        declared, plan, values = self.arguments[:3]
         size = self.problem.sizes
         wide = {
             t: np.pad(np.asarray(x), ((0, 0), (0, size["table", t] - x.shape[1]), (0, 0)))
@@ -273,32 +289,36 @@ class Solution:
         return np.asarray(_propagate(declared, values, self.factor, wide, self.moves))
 
     @property
-    def given(self):
+    def arguments(self) -> tuple[Declared, Plan, Values, Data]:
+        """What compiled functions of a solution take first; arrays in the sizes of the plan."""
         problem = self.problem
         return problem.declared, problem.plan, self._values, self._data
 
-    def _rows(self, by_set) -> Rows:
+    def _rows(self, by_set: Mapping[str, AnyArray]) -> Rows:
         return {o.name: np.asarray(by_set[o.name])[: o.number] for o in self._as_given.observations}
 
 
 @compile_once
-def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
+def _residuals(
+    declared: Declared, plan: Plan, values: Values, data: Data
+) -> dict[str, Float[Array, "n r"]]:
     return restore_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
 
 
 @compile_once
-def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Factor:
+def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> NormalFactor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     return without_plan(factorise(Normal(plan, blocks)))
 
 
-def without_plan(factor: Factor) -> Factor:
+def without_plan(factor: NormalFactor) -> NormalFactor:
     """A factor without its plan, which a compiled function would copy."""
+    # Results of compiled functions are copies, also of arguments passed through.
     is_plan = lambda x: isinstance(x, Plan)
     return jax.tree.map(lambda x: PLAN_PLACEHOLDER if is_plan(x) else x, factor, is_leaf=is_plan)
 
 
-def with_plan(factor: Factor, plan: Plan) -> Factor:
+def with_plan(factor: NormalFactor, plan: Plan) -> NormalFactor:
     """The factor with its plan restored."""
     return jax.tree.map(lambda x: plan if isinstance(x, str) else x, factor)
 
@@ -308,9 +328,11 @@ _of_tables = compile_once(blocks_of_tables)
 
 
 @compile_once
-def _by_eliminated(declared, plan, values, data):
+def _by_eliminated(
+    declared: Declared, plan: Plan, values: Values, data: Data
+) -> dict[str, Float[Array, "n r w"]]:
     laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
-    width = plan.groups[plan.eliminated].width
+    width = plan.groups[present(plan.eliminated)].width
     for number in range(len(plan.parts)):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)
@@ -318,10 +340,12 @@ def _by_eliminated(declared, plan, values, data):
 
 
 @compile_once
-def _rows_of(function, declared, values, still):
+def _rows_of(
+    function: Callable[[Values], Array], declared: Declared, values: Values, still: Values
+) -> dict[str, Float[Array, "n rows width"]]:
     """The derivatives of a function of the tables by their changes, [n, rows, width] each."""
 
-    def of_change(change):
+    def of_change(change: Values) -> Float[Array, " n"]:
         moved = dict(values)
         for name, d in change.items():
             moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], d)
@@ -331,7 +355,9 @@ def _rows_of(function, declared, values, still):
 
 
 @compile_once
-def _propagate(declared, values, factor, rows, moves):
+def _propagate(
+    declared: Declared, values: Values, factor: NormalFactor, rows: Values, moves: Tangent | None
+) -> Float[Array, "n n"]:
     plan = factor.plan
     rows = jax.vmap(lambda r: of_groups(plan, r))(rows)
     return propagate(declared, values, factor, rows, moves)

@@ -14,11 +14,11 @@ of small matrix products).
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.geometry import (
     matrix_from_quaternion,
@@ -29,7 +29,12 @@ from jaxbundle.geometry.quaternions import small_difference
 from jaxbundle.types import AnyArray, Scalar
 
 Change = tuple[Scalar, ...]
+Triple = tuple[Scalar, ...]
+"""Three scalars, x, y, z; a comprehension makes a tuple of no known length for a type checker."""
+Block = PyTree[Scalar]
+"""What an observation receives of a row: scalars, or objects of scalars such as `Posed`."""
 Matrix = Float[Array, "width width"]
+Value = TypeVar("Value")
 
 
 @runtime_checkable
@@ -39,9 +44,9 @@ class Space(Protocol):
     @property
     def width(self) -> int: ...
 
-    def prepare(self, value: Any) -> Any: ...
+    def prepare(self, value: Any) -> Block: ...
 
-    def move(self, block: Any, change: Change) -> Any: ...
+    def move(self, block: Any, change: Change) -> Block: ...
 
     def retract(self, value: Any, change: Float[AnyArray, " width"]) -> Any: ...
 
@@ -52,8 +57,24 @@ class Space(Protocol):
     def chart(self, value: Any) -> tuple[Matrix, Matrix] | None: ...
 
 
+class WithoutChart:
+    """A space that is damped in its own directions."""
+
+    def chart(self, value: Any) -> None:  # noqa: ARG002 (other spaces need it)
+        return None
+
+
+def hold_by_retraction(
+    space: Space, value: Value, given: Value, free: Float[Array, " width"]
+) -> Value:
+    """`Space.hold` where directions are no numbers of the value: the change from `given` to it,
+    without that along held directions."""
+    held = space.retract(given, jnp.where(free > 0, space.difference(value, given), 0.0))
+    return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
+
+
 @dataclasses.dataclass(frozen=True)
-class Vector:
+class Vector(WithoutChart):
     """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: the free
     ones (None: all); `tied`: further ones that change with one of these, (column, index in
     `columns`) each."""
@@ -76,38 +97,46 @@ class Vector:
         pairs = (*((column, k) for k, column in enumerate(self.moving)), *self.tied)
         return tuple(column for column, _ in pairs), tuple(k for _, k in pairs)
 
-    def prepare(self, value):
+    def prepare(self, value: Float[Array, " *size"]) -> Block:
         return tuple(value) if self.size else value
 
-    def move(self, block, change):
+    def move(self, block: Block, change: Change) -> Block:
         if not self.size:
             return block + change[0] if change else block
         if not change:
             return block
         block = list(block)
         for column, k in zip(*self.moves):
+            # Tied columns change with theirs, as fy with fx.
             block[column] = block[column] + change[k]
         return tuple(block)
 
-    def retract(self, value, change):
+    def retract(
+        self, value: Float[Array, " *size"], change: Float[AnyArray, " width"]
+    ) -> Float[Array, " *size"]:
         if not self.size:
             return value + change[0] if change.shape[0] else value
         columns, of = (jnp.array(x, int) for x in self.moves)
         return value.at[columns].add(change[of])
 
-    def difference(self, value, origin):
+    def difference(
+        self, value: Float[Array, " *size"], origin: Float[Array, " *size"]
+    ) -> Float[Array, " width"]:
         change = value - origin
         return change[jnp.array(self.moving, int)] if self.size else change[None]
 
-    def hold(self, value, given, free):
+    def hold(
+        self,
+        value: Float[Array, " *size"],
+        given: Float[Array, " *size"],
+        free: Float[Array, " width"],
+    ) -> Float[Array, " *size"]:
         if not self.size:
             return jnp.where(free[0] > 0, value, given) if self.width else given
         columns, of = (jnp.array(x, int) for x in self.moves)
+        # A tied column is held with the one it follows.
         moves = jnp.zeros(self.size).at[columns].set(free[of])
         return jnp.where(moves > 0, value, given)
-
-    def chart(self, value):
-        return None
 
 
 class Turned(NamedTuple):
@@ -116,24 +145,26 @@ class Turned(NamedTuple):
     rows: tuple[Scalar, ...]
     turn: tuple[Scalar, Scalar, Scalar] | None = None
 
-    def apply(self, X):
+    def apply(self, X: Triple) -> Triple:
         """M·X."""
         m = self.rows
         ray = tuple(m[3 * i] * X[0] + m[3 * i + 1] * X[1] + m[3 * i + 2] * X[2] for i in range(3))
         if self.turn is None:
             return ray
+        # exp([θ]×) ≈ 1 + [θ]× + ½[θ]×²: to second order, since Hessians are taken at θ = 0.
         first = cross(self.turn, ray)
         second = cross(self.turn, first)
         return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first, second))
 
-    def matrix(self):
+    def matrix(self) -> Float[Array, "3 3"]:
         """M as an array [3, 3]."""
         columns = [self.apply(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
         return jnp.stack([jnp.stack(column) for column in columns], 1)
 
-    def apply_inverse(self, x):
+    def apply_inverse(self, x: Triple) -> Triple:
         """Mᵀ·x."""
         if self.turn is not None:
+            # The inverse rotation: θ → −θ, by the order of the product.
             first = cross(x, self.turn)
             second = cross(first, self.turn)
             x = tuple(a + b + 0.5 * c for a, b, c in zip(x, first, second))
@@ -145,40 +176,43 @@ class Posed(NamedTuple):
     """A pose for observations: rotation M and projection centre X0."""
 
     rotation: Turned
-    centre: tuple[Scalar, Scalar, Scalar]
+    centre: Triple
 
-    def ray(self, X):
+    def ray(self, X: Triple) -> Triple:
         """M·(X − X0): a point of object space in the frame of the pose."""
         return self.rotation.apply(tuple(a - b for a, b in zip(X, self.centre)))
 
-    def place(self, x):
+    def place(self, x: Triple) -> Triple:
         """X0 + Mᵀ·x: a point in the frame of the pose, in object space."""
         return tuple(a + b for a, b in zip(self.centre, self.rotation.apply_inverse(x)))
 
 
 @dataclasses.dataclass(frozen=True)
-class Rotation:
+class Rotation(WithoutChart):
     """Unit quaternions (w, x, y, z); a change is a rotation vector, M ← exp([δ]×)·M."""
 
     width = 3
 
-    def prepare(self, value):
+    def prepare(self, value: Float[Array, " 4"]) -> Turned:
         return Turned(tuple(matrix_from_quaternion(value).ravel()))
 
-    def move(self, block, change):
+    def move(self, block: Turned, change: Change) -> Turned:
         return block._replace(turn=tuple(change)) if change else block
 
-    def retract(self, value, change):
+    def retract(
+        self, value: Float[Array, " 4"], change: Float[AnyArray, " width"]
+    ) -> Float[Array, " 4"]:
         return retract_quaternion(value, change)
 
-    def difference(self, value, origin):
+    def difference(
+        self, value: Float[Array, " 4"], origin: Float[Array, " 4"]
+    ) -> Float[Array, " width"]:
         return quaternion_difference(value, origin)
 
-    def hold(self, value, given, free):
+    def hold(
+        self, value: Float[Array, " 4"], given: Float[Array, " 4"], free: Float[Array, " width"]
+    ) -> Float[Array, " 4"]:
         return jnp.where(free.max() > 0, value, given)
-
-    def chart(self, value):
-        return None
 
 
 class PoseValue(NamedTuple):
@@ -200,36 +234,36 @@ class Pose:
 
     width = 6
 
-    def prepare(self, value):
+    def prepare(self, value: PoseValue) -> Posed:
         matrix = tuple(matrix_from_quaternion(value.rotation).ravel())
         return Posed(Turned(matrix), tuple(value.position))
 
-    def move(self, block, change):
+    def move(self, block: Posed, change: Change) -> Posed:
         if not change:
             return block
         centre = tuple(c + d for c, d in zip(block.centre, change[:3]))
         return Posed(block.rotation._replace(turn=tuple(change[3:])), centre)
 
-    def retract(self, value, change):
+    def retract(self, value: PoseValue, change: Float[AnyArray, " width"]) -> PoseValue:
         return PoseValue(
             value.position + change[:3], retract_quaternion(value.rotation, change[3:])
         )
 
-    def difference(self, value, origin):
+    def difference(self, value: PoseValue, origin: PoseValue) -> Float[Array, " width"]:
         turn = quaternion_difference(value.rotation, origin.rotation)
         return jnp.concatenate([value.position - origin.position, turn])
 
-    def small_difference(self, value, origin):
+    def small_difference(self, value: PoseValue, origin: PoseValue) -> Float[Array, " width"]:
         turn = small_difference(value.rotation, origin.rotation)
         return jnp.concatenate([value.position - origin.position, turn])
 
-    def hold(self, value, given, free):
+    def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
         return PoseValue(
             jnp.where(free[:3] > 0, value.position, given.position),
             jnp.where(free[3:].max() > 0, value.rotation, given.rotation),
         )
 
-    def chart(self, value):
+    def chart(self, value: PoseValue) -> tuple[Matrix, Matrix]:
         M = matrix_from_quaternion(value.rotation)
         t = -M @ value.position
         # exp([δθ]×) ≈ 1 + [δθ]×: the derivatives are taken at 0 only.
@@ -240,7 +274,7 @@ class Pose:
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class Frame(WithoutChart):
     """A pose, `PoseValue`, that moves along and about its own axes, δ = (shift along x, y, z,
     rotation about x, y, z), restricted to `columns`: for a figure invariant to the other shifts and
     rotations (a plane along itself, a cylinder about its axis)."""
@@ -251,37 +285,34 @@ class Frame:
     def width(self) -> int:
         return len(self.columns)
 
-    def prepare(self, value):
+    def prepare(self, value: PoseValue) -> Posed:
         return Pose().prepare(value)
 
-    def move(self, block, change):
+    def move(self, block: Posed, change: Change) -> Posed:
         if not change:
             return block
-        every = [0.0] * 6
+        every: list[Scalar] = [0.0] * 6
         for column, d in zip(self.columns, change):
             every[column] = d
-        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(every[:3]))
+        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(tuple(every[:3])))
 
-    def retract(self, value, change):
+    def retract(self, value: PoseValue, change: Float[AnyArray, " width"]) -> PoseValue:
         every = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)
+        # The shift is along the axes of the frame as it is, not as it will be.
         shift = matrix_from_quaternion(value.rotation).T @ every[:3]
         return PoseValue(value.position + shift, retract_quaternion(value.rotation, every[3:]))
 
-    def difference(self, value, origin):
+    def difference(self, value: PoseValue, origin: PoseValue) -> Float[Array, " width"]:
         shift = matrix_from_quaternion(origin.rotation) @ (value.position - origin.position)
         turn = quaternion_difference(value.rotation, origin.rotation)
         return jnp.concatenate([shift, turn])[jnp.array(self.columns, int)]
 
-    def hold(self, value, given, free):
-        held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
-        return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
-
-    def chart(self, value):
-        return None
+    def hold(self, value: PoseValue, given: PoseValue, free: Float[Array, " width"]) -> PoseValue:
+        return hold_by_retraction(self, value, given, free)
 
 
 @dataclasses.dataclass(frozen=True)
-class Direction:
+class Direction(WithoutChart):
     """Unit vectors of `size` numbers; a change is one in the tangent plane, in an orthonormal basis
     of it (of the Householder reflection that takes the vector to an axis)."""
 
@@ -291,43 +322,51 @@ class Direction:
     def width(self) -> int:
         return self.size - 1
 
-    def prepare(self, value):
+    def prepare(self, value: Float[Array, " size"]) -> tuple[Change, tuple[Change, ...]]:
         return tuple(value), tuple(map(tuple, tangent_basis(value)))
 
-    def move(self, block, change):
+    def move(self, block: tuple[Change, tuple[Change, ...]], change: Change) -> Change:
         value, basis = block
         if not change:
             return value
         square = sum(d * d for d in change)
         return tuple(
+            # cos|δ| and sin|δ|/|δ| to second order.
             v * (1 - 0.5 * square) + sum(b * d for b, d in zip(row, change))
             for v, row in zip(value, basis)
         )
 
-    def retract(self, value, change):
+    def retract(
+        self, value: Float[Array, " size"], change: Float[AnyArray, " width"]
+    ) -> Float[Array, " size"]:
         moved = value + tangent_basis(value) @ change
         return moved / jnp.linalg.norm(moved)
 
-    def difference(self, value, origin):
+    def difference(
+        self, value: Float[Array, " size"], origin: Float[Array, " size"]
+    ) -> Float[Array, " width"]:
         return tangent_basis(origin).T @ value / (value @ origin)
 
-    def hold(self, value, given, free):
+    def hold(
+        self,
+        value: Float[Array, " size"],
+        given: Float[Array, " size"],
+        free: Float[Array, " width"],
+    ) -> Float[Array, " size"]:
         return jnp.where(free.max() > 0, value, given)
-
-    def chart(self, value):
-        return None
 
 
 def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
     """Columns orthogonal to a unit vector: those of a reflection that takes it to ∓ its last axis,
     without the last."""
+    # The sign that adds: the axis of the reflection is then never zero, wherever the vector points.
     sign = jnp.where(value[-1] < 0, -1.0, 1.0)
     axis = value.at[-1].add(sign)
     reflection = jnp.eye(len(value)) - 2 * jnp.outer(axis, axis) / (axis @ axis)
     return reflection[:, :-1]
 
 
-def turn_by(angle, x):
+def turn_by(angle: Triple, x: Triple) -> Triple:
     """exp([angle]×)·x for rotations below a third of a radian, by series: exact to rounding, with
     derivatives at 0."""
     square = sum(a * a for a in angle)
@@ -338,6 +377,6 @@ def turn_by(angle, x):
     return tuple(a + sine * b + cosine * c for a, b, c in zip(x, first, second))
 
 
-def cross(a, b):
+def cross(a: Triple, b: Triple) -> Triple:
     """The vector product of two triples of scalars."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

@@ -34,6 +34,8 @@ def inverse_sigma(weight: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "n r"
 def without_residual(W: Float[np.ndarray, "r r"], removed: int) -> Float[np.ndarray, "r r"]:
     """W of the residuals that remain: of their part of the covariance, not the rows that remain of
     W, which belong to all of them together."""
+    # C of all residuals, its part without the removed one, and L⁻¹ of that: a marginal covariance.
+    # Rows that remain of W alone would be those of a conditional one.
     stay = np.diagonal(W) > 0
     stay[removed] = False
     stay, found = np.flatnonzero(stay), np.zeros_like(W)

@@ -62,7 +62,7 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
     change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     here = Solution(problem, start)
-    A = _slopes(*here.given, found.shared, found.estimate)
+    A = _slopes(*here.arguments, found.shared, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
     weight = problem.data.weight

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.leastsquares.quality.components import Group
+from jaxbundle.leastsquares.quality.components import VarianceGroup as Group
 from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.units import ANGLE_UNITS
 

@@ -184,7 +184,7 @@ def weakness_of_unsolved(problem: Problem, values: Values) -> Weakness:
 
 def _in_words(problem: Problem, found) -> Weakness:
     ids = problem.network.points.id
-    return Weakness(found.names, found.worst, tuple(ids[p] for p in found.rows), found.of)
+    return Weakness(found.names, found.worst, tuple(ids[p] for p in found.rows), found.judged)
 
 
 def _extents(inspection: Inspection) -> Extents:

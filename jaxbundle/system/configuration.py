@@ -8,18 +8,11 @@ import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 from jaxbundle.system.xla_flags import jaxlib_version
-
-SHORTEST_KEPT = 0.02
-"""Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
-them."""
-
-LONGEST_WRITING = 60.0
-"""Seconds within which another process has written the file of a program, some megabytes."""
 
 THREADS = "NPROC"
 """XLA's environment variable of the number of threads of its pool; default: one for each core."""
@@ -91,7 +84,9 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     watch_cache(folder)
     _remove_damaged_programs(Path(os.path.abspath(folder)))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_KEPT)
+        # Seconds. JAX's 1 s keeps none of the dozen programs of a small network; reading a file
+        # takes some milliseconds, so that below 0.02 keeping saves nothing.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.02)
     return True
 
 
@@ -102,10 +97,11 @@ def _remove_damaged_programs(folder: Path) -> None:
     left by a full disk; one that is just being written by another process is not touched."""
     show, about = warnings.showwarning, "Error (reading|writing) persistent compilation cache entry"
 
-    def handle(message, *where, **options):
+    def handle(message: Warning | str, *where: Any, **options: Any) -> None:
         if not re.match(about, str(message)):
             return show(message, *where, **options)
-        name, latest = re.search(r"'(\w+)", str(message)), time.time() - LONGEST_WRITING
+        # Within a minute another process has written the file of a program, some megabytes.
+        name, latest = re.search(r"'(\w+)", str(message)), time.time() - 60.0
         for file in folder.glob(f"{name[1]}-*-cache") if name else ():
             with suppress(OSError):
                 if file.stat().st_mtime < latest:
@@ -143,24 +139,7 @@ def join_processes(
     """
     import jax
 
-    from jaxbundle.arguments import integer
-
-    expected = (
-        "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
-        "none of them under SLURM"
-    )
-    for name, value in (("processes", processes), ("process", process)):
-        if value is not None:
-            integer(name, value, least=0)
-    integer("lost_after_seconds", lost_after_seconds)
-    integer("wait_seconds", wait_seconds)
-    if address is not None:
-        parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
-        if not parts or not 0 < int(parts[2]) < 65536:
-            raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
-        if processes is not None and process is not None and not 0 <= process < processes:
-            raise InputError(f"process {process} of {processes} cannot be joined; {expected}")
-        _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
+    _check_joining(address, processes, process, lost_after_seconds, wait_seconds)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     # The service would intercept SIGTERM, and the process would continue.
     jax.config.update("jax_enable_preemption_service", False)
@@ -176,8 +155,39 @@ def join_processes(
         why = " ".join(str(error).split())[:300]
         if address is None and not any(name.startswith("SLURM_") for name in os.environ):
             why = "no SLURM variables were found"
-        raise InputError(f"the processes cannot be joined: {why}; {expected}") from None
+        raise InputError(f"the processes cannot be joined: {why}; {HOW_TO_JOIN}") from None
     return jax.process_index() == 0
+
+
+HOW_TO_JOIN = (
+    "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
+    "none of them under SLURM"
+)
+
+
+def _check_joining(
+    address: str | None,
+    processes: int | None,
+    process: int | None,
+    lost_after_seconds: int,
+    wait_seconds: int,
+) -> None:
+    """Check the arguments of `join_processes`, and that the address can be reached."""
+    from jaxbundle.arguments import integer
+
+    for name, value in (("processes", processes), ("process", process)):
+        if value is not None:
+            integer(name, value, least=0)
+    integer("lost_after_seconds", lost_after_seconds)
+    integer("wait_seconds", wait_seconds)
+    if address is None:
+        return
+    parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
+    if not parts or not 0 < int(parts[2]) < 65536:
+        raise InputError(f"the processes cannot be joined at {address!r}; {HOW_TO_JOIN}")
+    if processes is not None and process is not None and not 0 <= process < processes:
+        raise InputError(f"process {process} of {processes} cannot be joined; {HOW_TO_JOIN}")
+    _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
 
 
 def _check_address(host: str, port: int, process: int | None, wait_seconds: int) -> None:

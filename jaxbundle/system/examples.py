@@ -7,6 +7,7 @@ Their files are those of `examples/` in the repository: the wheel has copies of 
 import os
 import shutil
 from importlib.resources import as_file, files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ def write_example(name: str, folder: str | Path) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
-def _source(name: str):
+def _source(name: str) -> Traversable:
     """The files of an example, in the package or the source tree."""
     for place in (files("jaxbundle") / "examples", Path(__file__).parents[2] / "examples"):
         if (place / name).is_dir():

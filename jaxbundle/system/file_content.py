@@ -16,11 +16,11 @@ SYSTEM = ("/proc/", "/sys/")
 """System folders with pseudo-files, which may be endless or block."""
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
 """Folders of the open files of the process."""
-CHUNK = 2**20
 DEEPEST_NESTING = 64
-"""Maximum nesting of a document."""
+"""Maximum nesting of a document; those of the package have a few levels. Python's readers of TOML
+and JSON call themselves for every level, and end at about a thousand with a `RecursionError`."""
 LARGEST_INTEGER = 2**1023
-"""Largest integer that is exactly a float."""
+"""The largest power of two that is a float of double precision (IEEE 754)."""
 TOO_LARGE = "too large a number; finite numbers are expected"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
@@ -70,10 +70,11 @@ def read_content(path: str | Path, text: bool = True) -> bytes:
     **Raises:** `InputError` if it is missing, unreadable, or not a regular file.
     """
     check_plain(path)
-    chunks, lines = [], 1
+    # A megabyte at a time: a binary file of gigabytes is refused at its first zero byte.
+    size, chunks, lines = 2**20, [], 1
     try:
         with open(path, "rb") as file:
-            while chunk := file.read(CHUNK):
+            while chunk := file.read(size):
                 if text and (zero := chunk.find(0)) >= 0:
                     line = lines + chunk.count(b"\n", 0, zero)
                     raise InputError(
@@ -102,11 +103,11 @@ def parse_toml(path: str | Path, text: str) -> dict[str, Any]:
 
 
 def parse_json(path: str | Path, text: str) -> Any:
-    """The same of a text in JSON."""
+    """The document of a text in JSON; raises as `parse_toml`."""
     return _parse(path, text, json.loads, "JSON")
 
 
-def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str):
+def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str) -> Any:
     try:
         document = parse(text)
         wrong = _beyond(document)

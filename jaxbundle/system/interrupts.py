@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 GRACE = 0.3
-"""Seconds for the main thread to handle a signal."""
+"""Seconds for the main thread to handle a signal. It takes milliseconds unless it is in C++;
+short enough that nobody presses Ctrl-C again."""
 
 LONGEST_DEFERRAL = 10.0
-"""Seconds to finish a block of `defer_interrupts`; a hanging disk delays the exit no longer."""
+"""Seconds to finish a block of `defer_interrupts`, the renaming of finished files: milliseconds,
+unless the disk hangs, which delays the exit no longer than this."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":
@@ -66,6 +68,7 @@ def handle_interrupts() -> None:
     atexit.register(_leave)  # the first to be registered is the last to be called
     if os.name == "posix":
         reader, writer = os.pipe()
+        # A full pipe must not block the handler: one byte is enough.
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         threading.Thread(target=_watch, args=(reader,), daemon=True).start()
@@ -109,6 +112,7 @@ def _end(number: int) -> None:
     """Clean up, print the line, and end; a second thread waits here for the end."""
     if _ending is None or _temporaries is None:
         _say_and_exit(number)
+    # Never released: whoever comes second waits here until the process is gone.
     _ending.acquire()
     _become_deaf()
     _temporaries.remove_temporaries(LONGEST_DEFERRAL)

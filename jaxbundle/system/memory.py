@@ -22,7 +22,8 @@ SMALLEST_ADDRESS_SPACE = {"": 1.7e9, "calibrate": 2.1e9, "reconstruct": 2.8e9}
 programs; with 0.2 to 0.4 GB less LLVM or XLA abort the process (measured on small inputs, JAX 0.10,
 two cores)."""
 NO_LIMIT = 2**60
-"""Bytes: larger limits of version 1 of control groups mean none."""
+"""Bytes: larger limits of version 1 of control groups mean none. The kernel writes 2⁶³ − 1 rounded
+down to pages, whose size differs (Documentation/admin-guide/cgroup-v1/memory.rst)."""
 
 
 def free_memory() -> float:
@@ -62,6 +63,7 @@ def left_in_control_groups(root: str | Path = "/") -> float:
     left = math.inf
     for line in _read(Path(root, "proc/self/cgroup")).splitlines():
         _, controllers, group = (*line.split(":", 2), "", "")[:3]
+        # Version 2 has one line, "0::/group"; version 1 one for each controller.
         if controllers and "memory" not in controllers.split(","):
             continue
         mounted = Path(root, "sys/fs/cgroup", *["memory"] * bool(controllers))
@@ -70,6 +72,7 @@ def left_in_control_groups(root: str | Path = "/") -> float:
             names = ("memory.max", "memory.current", "inactive_file")
         # A container may see its own group as the root of the mounted tree.
         inside = mounted / group.lstrip("/")
+        # The limit of every enclosing group applies, too: the least of them counts.
         for folder in dict.fromkeys((inside, *inside.parents, mounted)):
             if folder == mounted or mounted in folder.parents:
                 left = min(left, _left_in(folder, *names))
@@ -90,6 +93,7 @@ def _left_in(folder: Path, limit: str, usage: str, cached: str) -> float:
     most, used = (_read(folder / name).strip() for name in (limit, usage))
     if not (most.isdecimal() and used.isdecimal()) or int(most) >= NO_LIMIT:
         return math.inf
+    # Cached files are counted as used, and are given up when memory is asked for.
     return int(most) - int(used) + _field(_read(folder / "memory.stat"), cached, 0.0)
 
 

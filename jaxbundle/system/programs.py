@@ -7,7 +7,9 @@ import equinox as eqx
 import jax
 
 
-def compile_once(function: Callable, static: Sequence[int] | int | None = None, **options) -> Any:
+def compile_once(
+    function: Callable, static: Sequence[int] | int | None = None, **options: Any
+) -> Any:
     """`jax.jit`, with `options`. `static`: the positions of arguments compiled in; None: everything
     that is no array, as by `equinox.filter_jit`."""
     if static is None:

@@ -5,6 +5,7 @@ as it advances. What follows a colon in the name of a stage is a detail that cha
 """
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 
@@ -21,7 +22,7 @@ class show_progress:
         self.bars = bars
         self.tasks: dict[str, Any] = {}
 
-    def __enter__(self):
+    def __enter__(self) -> Callable[[str, int, int], None]:
         if self.bars is None:
             from rich.console import Console
             from rich.progress import MofNCompleteColumn, Progress
@@ -44,5 +45,5 @@ class show_progress:
             self.tasks[name] = self.bars.add_task(stage, total=total)
         self.bars.update(self.tasks[name], description=stage, completed=done, total=total)
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.bars.stop()

@@ -62,6 +62,7 @@ def for_printing(text: str) -> str:
 
 
 def _escape(found: re.Match) -> str:
+    # JSON escapes are units of UTF-16: letters beyond U+FFFF have two.
     units = found[0].encode("utf-16-be")
     return "".join(f"\\u{units[i : i + 2].hex()}" for i in range(0, len(units), 2))
 

@@ -18,7 +18,7 @@ def map_in_threads(
     is tried again alone, after them. `advance(done)`: called after each."""
     items = list(items)
 
-    def attempt(item):
+    def attempt(item: Any) -> Any:
         try:
             return function(item)
         except MemoryError:

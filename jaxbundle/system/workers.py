@@ -10,12 +10,10 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from jaxbundle.system.temporaries import watch_process
-
-EXIT_TIMEOUT = 5.0
-"""Seconds for a process without work to end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +37,14 @@ class Workers:
     def __enter__(self) -> "Workers":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         for connection, process in (*self._idle, *((c, p) for c, (p, _) in self._busy.items())):
             connection.close()
             if connection in self._busy:
                 process.terminate()
-            process.join(EXIT_TIMEOUT)
+            # An idle process ends when its pipe closes, in milliseconds; one that computes in C++
+            # has been terminated. After 5 s it is left to the system.
+            process.join(5.0)
             watch_process(process, running=False)
         self._idle, self._busy = [], {}
 
@@ -82,7 +82,7 @@ class Workers:
         return ours, process
 
 
-def _describe_end(process) -> str:
+def _describe_end(process: BaseProcess) -> str:
     code = process.exitcode
     return f"signal {-code}" if code is not None and code < 0 else f"status {code}"
 

@@ -21,7 +21,7 @@ from jaxbundle import leastsquares as ls
 
 CURVATURE = 0.05
 LARGE = 2400
-"""Observations of a kind that is computed in chunks (`layout.SMALL_PART`)."""
+"""Observations of a kind that is computed in chunks (`PlanningSettings.small_part`)."""
 
 
 @dataclasses.dataclass(frozen=True)

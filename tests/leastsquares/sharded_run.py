@@ -64,7 +64,7 @@ def main(names, processes=1, rank=0, port=0, signal=0):
     jax.config.update("jax_enable_x64", True)
     if processes > 1:
         jaxbundle.join_processes(f"127.0.0.1:{port}", processes, rank, lost_after_seconds=10)
-    solution.TO_SHARE = 0
+    solution.MIN_SHARED_OBSERVATIONS = 0
     if signal:
         solution.distribute = lambda _: (os.kill(os.getpid(), signal), time.sleep(10))
     compiled = []

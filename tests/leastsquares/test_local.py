@@ -11,7 +11,7 @@ from jaxbundle.cameras.cubic_splines import basis
 from jaxbundle.leastsquares.declarations import Kind, Local, Table
 from jaxbundle.leastsquares.equations.normal import normal_equations
 from jaxbundle.leastsquares.indexing import rows
-from jaxbundle.leastsquares.indexing.layout import SMALL_PART
+from jaxbundle.leastsquares.indexing.settings import PLANNING
 from jaxbundle.leastsquares.problem import make_problem, pad_data
 
 KNOTS, CURVES, SHIFTS, POINTS = 12, 2, 3, 40
@@ -46,7 +46,7 @@ LOCAL = Kind("curve", curve, OF, ("y", "slope"), scalars=True,
 @pytest.fixture(scope="module", params=["point", None])
 def problem(request):
     random = np.random.default_rng(2)
-    number = SMALL_PART + 300
+    number = PLANNING.small_part + 300
     value = random.normal(size=(CURVES, KNOTS))
     free = np.ones((CURVES, KNOTS), bool)
     free[1, 3] = False
@@ -79,8 +79,8 @@ def test_wide_observations_are_computed_as_arrays(monkeypatch):
     random, found = np.random.default_rng(3), []
     start, sigma = random.normal(size=(2, 70)), random.uniform(0.1, 0.3, (2, 70))
     sigma[1, 5] = np.inf
-    for name, wide in (("array", rows.MOST_RESIDUALS), ("scalars", 1000)):
-        monkeypatch.setattr(rows, "MOST_RESIDUALS", wide)
+    for name, wide in (("array", rows.SCALAR_RESIDUALS_UP_TO), ("scalars", 1000)):
+        monkeypatch.setattr(rows, "SCALAR_RESIDUALS_UP_TO", wide)
         kind = Kind(name, lambda v, given: v * v[::-1] - given, ("wide",))
         table = Table("wide", start, free=np.arange(70)[None] != 8)
         problem = make_problem([table], [kind((np.arange(2),), 0 * start, sigma=sigma)])

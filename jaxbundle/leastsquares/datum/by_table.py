@@ -1,27 +1,29 @@
 """Motions of tables, by one program per table, called on the host.
 
-Tables of one space and size share a program, and so do all small ones, padded to `LEAST_ROWS`. A
+Tables of one space and size share a program, and so do all small ones, padded to one size. A
 program for a whole problem would be compiled again for every other shape.
 """
 
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.datum import conditions as datum
-from jaxbundle.leastsquares.datum.motions import Together, move_at_once
+from jaxbundle.leastsquares.datum.motions import JointMotion, move_at_once
 from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
+from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import present
+from jaxbundle.types import AnyArray, present
 
 TABLE_ALONE = "table"
 """The name of a table treated alone."""
-LEAST_ROWS = 128
-"""Tables are padded to at least this many rows."""
 
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:
@@ -33,6 +35,8 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
             rows = len(jax.tree.leaves(value)[0])
             found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
             continue
+        # A declaration of this table alone, equal for all of its kind: the key of the shared
+        # program.
         motions = Motions(given.names, action)
         one = Declared((), ((TABLE_ALONE, declared.spaces[name]),), motions)
         of_rows = lambda rows, one=one: _generators(one, {TABLE_ALONE: rows})[TABLE_ALONE]
@@ -53,7 +57,7 @@ def move_into_datum(
     curved, free = present(declared.motions).curved, _free(plan, declared, values)
     size = float(datum.largest(pinned.weight, start))
 
-    def further(values):
+    def further(values: Values) -> tuple[Values, float]:
         tables = {name: values[name] for name in pinned.weight}
         moves = directions_of_motions(declared, tables)
         away = {
@@ -68,6 +72,7 @@ def move_into_datum(
         }
         return moved, float(datum.largest(pinned.weight, change))
 
+    # Larger than any step, so that the first one is taken.
     distance, before, count = 1e300, np.inf, 0
     with np.errstate(all="ignore"):
         while datum.moves_on(size, distance, before, count):
@@ -76,15 +81,20 @@ def move_into_datum(
             except np.linalg.LinAlgError:
                 return values, False
             values, distance, before, count = moved, new, distance, count + 1
-    return values, distance <= datum.AT_DATUM * size
+    return values, distance <= datum.DATUM_MOTION.reached * size
 
 
-def _move_tables(declared, free, motion, values):
+def _move_tables(
+    declared: Declared,
+    free: Mapping[str, AnyArray],
+    motion: Float[AnyArray, " motions"],
+    values: Values,
+) -> Values:
     """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:
         by = motion
-        if isinstance(act, Together):
+        if isinstance(act, JointMotion):
             act, by = act.move, _move_at_once(act.transform, motion, act.size)
         of_rows = partial(_move, declared.spaces[name], act, by)
         moved[name] = _of_rows(of_rows, values[name], free[name])
@@ -92,20 +102,28 @@ def _move_tables(declared, free, motion, values):
 
 
 @compile_once
-def _difference(space, values, origin):
+def _difference(space: Space, values: Any, origin: Any) -> Float[Array, "rows width"]:
     return jax.vmap(space.difference)(values, origin)
 
 
 @compile_once
-def _move(space, act, motion, values, free):
+def _move(
+    space: Space,
+    act: Callable,
+    motion: Float[AnyArray, " motions"],
+    values: Any,
+    free: Float[Array, "rows width"],
+) -> Any:
     one = lambda value, f: space.hold(act(motion, value), value, f)
     return jax.vmap(one)(values, free)
 
 
-def _of_rows(program, *given):
+def _of_rows(program: Callable, *given: Any) -> Any:
     """A program on the rows of a table, padded and cut again; in NumPy."""
     rows = jax.tree.leaves(given)[0].shape[0]
-    more = max(LEAST_ROWS - rows, 0)
+    # 128 rows: cameras and stations of most networks in one program; half or double only moves
+    # where a second one is compiled.
+    more = max(128 - rows, 0)
     wide = lambda x: np.pad(x, [(0, more), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")
     return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
 

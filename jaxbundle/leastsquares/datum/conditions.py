@@ -16,27 +16,47 @@ path of the iterations.
 """
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.equations.normal import Tangent, total
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
-from jaxbundle.types import present
+from jaxbundle.types import AnyArray, Scalar, present
 
-HELD = 1e-7
-"""Smallest relative motion of datum unknowns that fix the datum."""
-NEAR_DATUM = 1e-3
-"""A motion to the datum by less than this fraction of the problem is near convergence."""
-LONGEST_MOTION = 1.0
-"""Largest single motion to the datum: radians, or a factor of e."""
-AT_DATUM = 1e-12
-"""A motion to the datum by less than this fraction of the problem is the last."""
-MOST_MOTIONS = 50
+MIN_RELATIVE_MOTION = 1e-7
+"""Smallest relative motion of datum unknowns that fix the datum. Below about 1e-8, √ε, the Gram
+matrix BᵀG of `s_transform` has lost all digits; at 1e-7 a datum still has two, at 1e-4 (a datum of
+points along a line, a ten-thousandth of its length wide) eight."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionSettings:
+    """The iteration of the motion to the datum; lengths are fractions of the largest coordinate.
+
+    - `near`: below it steps are Newton's, with the curvature of the motions. Gauss–Newton steps
+      alone do not converge for strong deformations; Newton steps from afar may go anywhere.
+    - `longest`: limit of a single step in rotations (radians) and scale (a factor of e): farther
+      off the linearised motion says nothing.
+    - `reached`: a smaller step is the last: a few hundred units of rounding.
+    - `small`: steps that are smaller, and no longer halve, are rounding too.
+    - `max_steps`: converging motions take 3 to 15.
+    """
+
+    near: float = 1e-3
+    longest: float = 1.0
+    reached: float = 1e-12
+    small: float = 1e-6
+    max_steps: int = 50
+
+
+DATUM_MOTION = MotionSettings()
 
 
 def generators(declared: Declared, values: Values) -> Tangent:
@@ -44,11 +64,13 @@ def generators(declared: Declared, values: Values) -> Tangent:
     given = present(declared.motions)
     motions, actions = len(given.names), dict(given.actions)
 
-    def of_table(name):
+    def of_table(name: str) -> Float[Array, "rows width motions"]:
         space, act = declared.spaces[name], actions.get(name)
         if act is None:
             rows = jax.tree.leaves(values[name])[0].shape[0]
             return jnp.zeros((rows, space.width, motions))
+        # Only first derivatives at motion 0 are needed; there motions in sequence equal
+        # simultaneous ones, whose quadrature would be compiled for nothing.
         act = getattr(act, "near", act)
         difference = getattr(space, "small_difference", space.difference)
         change = lambda value, m: difference(act(m, value), value)
@@ -57,7 +79,7 @@ def generators(declared: Declared, values: Values) -> Tangent:
     return {name: of_table(name) for name in values}
 
 
-def of_groups(plan: Plan, of_tables) -> Tangent:
+def of_groups(plan: Plan, of_tables: Mapping[str, Float[AnyArray, "rows width ..."]]) -> Tangent:
     """Quantities by table directions, [rows, width, …], rearranged by groups; zero for held
     unknowns."""
     found = {}
@@ -96,11 +118,13 @@ def leave_held(
     rows = jnp.concatenate(
         [(moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()]
     )
+    # The combination of motions c that leaves held unknowns, R·(g − c) = 0, with the smallest c: c
+    # = (RᵀR)⁺RᵀR·g, columns scaled, since radians stand beside metres.
     A = rows.T @ rows
     scale = jax.lax.stop_gradient(jnp.diagonal(A))
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
     A = A * scale * scale[:, None]
-    moved = jnp.linalg.pinv(A, HELD, hermitian=True) @ (A @ (gauge / scale[:, None]))
+    moved = jnp.linalg.pinv(A, MIN_RELATIVE_MOTION, hermitian=True) @ (A @ (gauge / scale[:, None]))
     moved = dataclasses.replace(datum, gauge=gauge - scale[:, None] * moved)
     return dataclasses.replace(plan, datum=moved)
 
@@ -112,6 +136,7 @@ def s_transform(
     if plan.datum is None:
         return change
     G, B = datum_directions(declared, plan, values, moves)
+    # BᵀG is as small as the defect: at most 7 × 7.
     gram = contract(plan, B, G)
     along = jnp.linalg.solve(gram, contract(plan, B, change))
     return {name: d - G[name] @ along for name, d in change.items()}
@@ -154,15 +179,15 @@ def move_to_datum(
     still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
     size = largest(datum.weight, start)
 
-    def moving(state):
+    def moving(state: tuple) -> bool | Bool[AnyArray, ""]:
         _, *progress = state
         return moves_on(size, *progress)
 
-    def further(state):
+    def further(state: tuple) -> tuple:
         values, before, _, count = state
         missing, slope = _datum_equations(declared, plan, values, start)
         near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
-        slope = jnp.where(before > NEAR_DATUM * size, slope, near)
+        slope = jnp.where(before > DATUM_MOTION.near * size, slope, near)
         step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
         moved = _move(declared, plan, step, values)
         differences = {
@@ -172,23 +197,35 @@ def move_to_datum(
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
-    return values, distance <= AT_DATUM * size
+    return values, distance <= DATUM_MOTION.reached * size
 
 
-def moves_on(size, distance, before, count):
+def moves_on(
+    size: Scalar,
+    distance: Scalar,
+    before: Scalar,
+    count: int | Int[Array, ""],
+    settings: MotionSettings = DATUM_MOTION,
+) -> bool | Bool[AnyArray, ""]:
     """Whether a motion to the datum continues after a step of `distance` and a previous one of
     `before`."""
-    falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
-    return (distance > AT_DATUM * size) & falling & (count < MOST_MOTIONS)
+    # Far from its end a motion may overshoot for some steps; near it, one that does not halve is
+    # rounding.
+    falling = (distance > settings.small * size) | (distance < 0.5 * before)
+    return (distance > settings.reached * size) & falling & (count < settings.max_steps)
 
 
-def limit_step(step, curved: tuple[int, ...]):
-    """A step of the motions, limited to `LONGEST_MOTION` in the curved ones."""
+def limit_step(
+    step: Float[AnyArray, " motions"],
+    curved: tuple[int, ...],
+    settings: MotionSettings = DATUM_MOTION,
+) -> Float[AnyArray, " motions"]:
+    """A step of the motions, limited in the curved ones."""
     longest = abs(step[np.array(curved, int)]).max(initial=0.0)
-    return step / (longest / LONGEST_MOTION).clip(1.0)
+    return step / (longest / settings.longest).clip(1.0)
 
 
-def largest(holding: Tangent, tables: Values):
+def largest(holding: Tangent, tables: Values) -> Any:
     """The largest value in the datum rows; NumPy for NumPy input."""
     where = np.where if all(isinstance(w, np.ndarray) for w in holding.values()) else jnp.where
     return max(
@@ -198,9 +235,12 @@ def largest(holding: Tangent, tables: Values):
     )
 
 
-def equations(datum: Datum, moves: Tangent, away: Tangent):
+def equations(
+    datum: Datum, moves: Tangent, away: Tangent
+) -> tuple[Float[AnyArray, " defect"], Float[AnyArray, "defect defect"]]:
     """Bᵀ(x − x_start) and BᵀG, over the datum tables; `away`: x − x_start."""
-    missing, gram = 0.0, 0.0
+    missing: Any = 0.0
+    gram: Any = 0.0
     for name, weight in datum.weight.items():
         G = moves[name] @ datum.gauge
         B = (G * weight[..., None]).reshape(-1, G.shape[-1])
@@ -209,8 +249,10 @@ def equations(datum: Datum, moves: Tangent, away: Tangent):
     return missing, gram
 
 
-def _datum_equations(declared, plan, values, start):
-    """The same, differentiable, from the tables."""
+def _datum_equations(
+    declared: Declared, plan: Plan, values: Values, start: Values
+) -> tuple[Float[AnyArray, " defect"], Float[AnyArray, "defect defect"]]:
+    """Bᵀ(x − x_start) and BᵀG of the tables at these values, differentiable."""
     datum = present(plan.datum)
     moves = generators(declared, {name: values[name] for name in datum.weight})
     away = {
@@ -220,7 +262,9 @@ def _datum_equations(declared, plan, values, start):
     return equations(datum, moves, away)
 
 
-def _missing(tau, fixed, given):
+def _missing(
+    tau: Float[Array, " defect"], fixed: tuple[Declared, Plan], given: tuple[Values, Values]
+) -> Float[AnyArray, " defect"]:
     """Bᵀ(x − x_start) after a motion along the open directions."""
     (declared, plan), (values, start) = fixed, given
     plan = leave_held(declared, plan, values)
@@ -237,22 +281,26 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
         return values
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
-    def along(tau, of, values):
+    def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
         datum = present(leave_held(declared, plan, of).datum)
         return _move(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.
     known = jax.lax.stop_gradient((values, start))
     slope = jax.jacfwd(_missing)(still, fixed, known)
+    # `values` are in the datum to 1e-12 already: one Newton step of rounding size, but with it the
+    # root below is exactly zero, where its equation is differentiated.
     values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
     tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
     return along(tau, values, values)
 
 
-def _move(declared, plan, motion, values):
+def _move(
+    declared: Declared, plan: Plan, motion: Float[AnyArray, " motions"], values: Values
+) -> Values:
     """All tables moved, except held values."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
-    for name, act in declared.motions.actions:
+    for name, act in present(declared.motions).actions:
         if name not in values:
             continue
         space = declared.spaces[name]
@@ -278,9 +326,10 @@ def zeros_of_tables(declared: Declared, values: Values) -> dict[str, Array]:
     return {name: jnp.zeros((n, declared.spaces[name].width)) for name, n in rows.items()}
 
 
-def contract(plan: Plan, B: Tangent, x: Tangent):
+def contract(plan: Plan, B: Tangent, x: Tangent) -> Float[Array, "defect ..."]:
     """Bᵀx over all rows; x may have an additional last axis."""
     parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
     e = plan.eliminated
-    kept = sum(part for name, part in parts.items() if name != e)
+    # Kept rows are on all devices, eliminated ones on one each.
+    kept: Any = sum(part for name, part in parts.items() if name != e)
     return kept if e is None else kept + total(plan, parts[e])

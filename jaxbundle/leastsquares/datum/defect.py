@@ -4,6 +4,7 @@ Computed once at the start values, on the host, from one compiled survey of the 
 table and their effect on observations.
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions
-from jaxbundle.leastsquares.datum.conditions import HELD, free_of_tables, of_groups
+from jaxbundle.leastsquares.datum.conditions import MIN_RELATIVE_MOTION, free_of_tables, of_groups
 from jaxbundle.leastsquares.equations.linearise import differentiate
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.plan import Datum, Plan
@@ -22,10 +23,10 @@ from jaxbundle.leastsquares.indexing.rows import Data, Declared, lay_out_data, p
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
-ROWS = 10_000
-"""Rows of J·G in one factorisation."""
-OPEN = 1e-10
-"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+MAX_OPEN_EFFECT = 1e-10
+"""Relative size of J·G below which a direction counts as open. Rounding gives about 1e-14, more if
+coordinates are much larger than the network; what fixes a datum by less than 1e-10 of its
+observations' own terms is no observation of it. Not critical from 1e-12 to 1e-8."""
 
 
 class CannotHold(InputError):
@@ -62,7 +63,13 @@ def survey_motions(
 
 
 @compile_once
-def _survey(declared, plan, data, real, moves) -> Survey:
+def _survey(
+    declared: Declared,
+    plan: Plan,
+    data: Data,
+    real: dict[str, Bool[np.ndarray, " rows"]],
+    moves: Tangent,
+) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)
     everywhere = {
@@ -84,6 +91,7 @@ def _survey(declared, plan, data, real, moves) -> Survey:
             blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
         if not blocks:  # Held tables only: it determines nothing.
             continue
+        # |J|·|G|: the size of the terms that cancel, for the scale of what remains.
         total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
         product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
         # Non-finite values at the start are ignored here; the solver will report them.
@@ -109,21 +117,27 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
     held = held / scale
+    # A held unknown that moves at all holds: every row counts the same.
     size = np.linalg.norm(held, axis=1, keepdims=True)
     rows = [held / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
     scales = [np.ones_like(scale), *[scale] * len(survey.products)]
+    # Directions with J·G = 0. Of the Gram matrix (JG)ᵀJG eigenvalues below 1e-16 of the largest are
+    # noise: open and weak (1e-8) would look alike; hence the triangle of a QR.
     _, singular, directions = np.linalg.svd(_triangle(rows, scales))
-    return directions[singular < OPEN].T / scale[:, None]
+    return directions[singular < MAX_OPEN_EFFECT].T / scale[:, None]
 
 
-def _triangle(parts, scales) -> Float[np.ndarray, "n n"]:
+def _triangle(
+    parts: Sequence[Float[np.ndarray, "rows n"]], scales: Sequence[Float[np.ndarray, " n"]]
+) -> Float[np.ndarray, "n n"]:
     """R of the QR of all rows of the parts, their columns divided by the scales: it has their
     singular values, of which a Gram matrix would lose half of the digits."""
     n = parts[0].shape[1]
     R = np.zeros((n, n))
     for rows, scale in zip(parts, scales):
-        for begin in range(0, len(rows), ROWS):
-            part = rows[begin : begin + ROWS] / scale
+        # 10 000 rows of seven motions at a time: half a megabyte, whatever the problem.
+        for begin in range(0, len(rows), 10_000):
+            part = rows[begin : begin + 10_000] / scale
             R = np.asarray(np.linalg.qr(np.concatenate([R, part]), mode="r"))
     return R
 
@@ -151,7 +165,7 @@ def make_datum(
     R = _triangle(chosen, [size] * len(chosen))
     if np.isfinite(R).all():  # otherwise the solver will report it
         singular = np.linalg.svd(R, compute_uv=False)
-        if singular[-1] <= HELD * singular[0]:
+        if singular[-1] <= MIN_RELATIVE_MOTION * singular[0]:
             raise CannotHold(defect)
     if minimal:
         picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
@@ -165,12 +179,16 @@ def make_datum(
     return Datum(*jax.device_put((gauge, weight, pins, held)))
 
 
-def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
+def _choose_pins(
+    plan: Plan, G: dict[str, Float[np.ndarray, "rows w defect"]]
+) -> dict[str, np.ndarray]:
     """As many kept unknowns as the defect, chosen well spread; every kind of direction is
     normalised by its size, unless that is rounding."""
     rows, shapes = [], []
+    # Coordinates of a large block move by kilometres in a rotation, its angles by radians: without
+    # this all pins would be coordinates.
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
-    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
+    least = max(1e-300, MAX_OPEN_EFFECT * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
         sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))
@@ -185,8 +203,12 @@ def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
     }
 
 
-def _pick_rows(G, candidates):
+def _pick_rows(
+    G: Float[np.ndarray, "rows defect"], candidates: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " rows"]:
     """1 for as many independent rows of G as it has columns, 0 for the others."""
+    # Pivoting by the largest row, of an orthonormal basis: the unknowns that hold the datum best
+    # (D-optimal step by step), e.g. points far apart.
     q, _ = np.linalg.qr(G)
     rows = q * candidates[:, None]
     chosen = np.zeros(len(rows))

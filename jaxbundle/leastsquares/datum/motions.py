@@ -6,16 +6,19 @@ and scale act simultaneously over a unit of time, not in sequence (canonical coo
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.quaternions import turn_object_slightly
 from jaxbundle.geometry.similarity import displacement
 from jaxbundle.leastsquares.declarations import Motions, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
+from jaxbundle.types import AnyArray
 
 SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
 
@@ -54,7 +57,7 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Together:
+class JointMotion:
     """`move(motion, value)` of motions whose shift follows rotation and scale, for simultaneous
     motions; `near`: the same to first order, for the directions of the motions;
     `transform(motion, place)` for the shifts, which are the first `size` numbers."""
@@ -64,43 +67,50 @@ class Together:
     transform: Callable
     size: int
 
-    def __call__(self, motion, value):
+    def __call__(self, motion: Float[Array, " motions"], value: Any) -> Any:
         return self.move(move_at_once(self.transform, motion, self.size), value)
 
 
-def _transform_pose(motion, value: PoseValue) -> PoseValue:
+def _transform_pose(motion: Float[Array, " motions"], value: PoseValue) -> PoseValue:
     return PoseValue(*transform_pose(motion, *value))
 
 
-def _displace_point(motion, value):
+def _displace_point(
+    motion: Float[Array, " motions"], value: Float[AnyArray, " 3"]
+) -> Float[AnyArray, " 3"]:
     return value + displacement(motion, value)
 
 
-def _displace_pose(motion, value: PoseValue) -> PoseValue:
+def _displace_pose(motion: Float[Array, " motions"], value: PoseValue) -> PoseValue:
     position = _displace_point(motion, value.position)
     return PoseValue(position, turn_object_slightly(value.rotation, motion[3:6]))
 
 
-def _transform_in_plane(motion, value):
+def _transform_in_plane(
+    motion: Float[Array, " motions"], value: Float[Array, " 2"]
+) -> Float[Array, " 2"]:
     x, y, turn, log_scale = motion
     c, s = jnp.exp(log_scale) * jnp.cos(turn), jnp.exp(log_scale) * jnp.sin(turn)
     return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
 
 
-_move_point = Together(transform_point, _displace_point, transform_point, 3)
-move_pose = Together(_transform_pose, _displace_pose, transform_point, 3)
+_move_point = JointMotion(transform_point, _displace_point, transform_point, 3)
+move_pose = JointMotion(_transform_pose, _displace_pose, transform_point, 3)
 """A pose, or a frame, that moves with space."""
-_move_in_plane = Together(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
+_move_in_plane = JointMotion(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
 
 
-def move_at_once(transform, motion, size: int):
+def move_at_once(
+    transform: Callable, motion: Float[Array, " motions"], size: int
+) -> Float[Array, " motions"]:
     """The motion with shift after rotation and scale that equals a simultaneous one: ∫₀¹ A(u)·t du,
     A(u) the rotation and scale after the time u (Gauss–Legendre, to rounding up to two turns and a
     scale of e⁵)."""
+    # A shift per unit of time, rotated and scaled by what has happened until then.
     still = motion.at[:size].set(0.0)
     moved = jax.vmap(lambda u: transform(u * still, motion[:size]))((NODES + 1) / 2)
     return still.at[:size].set(WEIGHTS / 2 @ moved)
 
 
-def _shift(motion, value):
+def _shift(motion: Float[Array, " motions"], value: Float[Array, ""]) -> Float[Array, ""]:
     return value + motion[0]

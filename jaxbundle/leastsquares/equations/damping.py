@@ -13,51 +13,61 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import Plan, UnknownGroup
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 
-Metric = dict[str, Float[Array, "rows w *w"]]
+DampingMatrix = dict[str, Float[Array, "rows w *w"]]
+Tangent = dict[str, Float[Array, "rows w"]]
 
 
-def measure(declared: Declared, plan: Plan, values: Values, own) -> Metric:
+def measure(
+    declared: Declared, plan: Plan, values: Values, own: dict[str, Float[Array, "rows w w"]]
+) -> DampingMatrix:
     """D of every group: matrices [rows, w, w] if a space has a chart, else diagonals [rows, w]; 1
     for held unknowns. `own`: the diagonal blocks of N."""
-    return {name: _of_group(declared, plan.groups[name], values, B) for name, B in own.items()}
+    return {name: _measure_group(declared, plan.groups[name], values, B) for name, B in own.items()}
 
 
-def _of_group(declared, group, values, blocks):
+def _measure_group(
+    declared: Declared, group: UnknownGroup, values: Values, blocks: Float[Array, "rows w w"]
+) -> Float[Array, "rows w *w"]:
+    """D of one group."""
     charts = []
     for member in group.members:
         rows = values[member.table]
         rows = rows if member.rows is None else jax.tree.map(lambda x, m=member: x[m.rows], rows)
         charts.append(jax.vmap(declared.spaces[member.table].chart)(rows))
     if all(chart is None for chart in charts):
-        return _positive(jnp.diagonal(blocks, axis1=1, axis2=2))
+        diagonal = jnp.diagonal(blocks, axis1=1, axis2=2)
+        return jnp.where(diagonal > 0, diagonal, 1.0)
+    # A group may hold several tables (a pose and its camera): each with its own chart, or none.
     T = inverse = jnp.broadcast_to(jnp.eye(blocks.shape[1]), blocks.shape)
     for member, chart in zip(group.members, charts):
         at = slice(member.start, member.start + member.width)
         if chart is not None:
             T, inverse = T.at[:, at, at].set(chart[0]), inverse.at[:, at, at].set(chart[1])
 
-    def one(T, inverse, N, free):
+    def measure_row(
+        T: Float[Array, "w w"],
+        inverse: Float[Array, "w w"],
+        N: Float[Array, "w w"],
+        free: Float[Array, " w"],
+    ) -> Float[Array, "w w"]:
+        # Tᵀ·diag(M)·T with M = T⁻ᵀ·N·T⁻¹, N in the unknowns of the chart.
         D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
         D = D * free * free[:, None]  # Held unknowns are decoupled from free ones.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
-    return jax.vmap(one)(T, inverse, blocks, group.free)
+    return jax.vmap(measure_row)(T, inverse, blocks, group.free)
 
 
-def _positive(diagonal):
-    return jnp.where(diagonal > 0, diagonal, 1.0)
-
-
-def times(D: Metric, change):
+def times(D: DampingMatrix, change: Tangent) -> Tangent:
     """D·δ."""
     product = lambda d, x: jnp.einsum("nij,nj->ni", d, x) if d.ndim == 3 else d * x
     return {name: product(D[name], x) for name, x in change.items()}
 
 
-def matrices(D: Metric) -> Metric:
+def matrices(D: DampingMatrix) -> DampingMatrix:
     """D as matrices [rows, w, w]."""
     return {
         name: d if d.ndim == 3 else d[:, :, None] * jnp.eye(d.shape[1]) for name, d in D.items()

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
@@ -31,51 +31,64 @@ from jaxbundle.leastsquares.equations.normal import (
 )
 from jaxbundle.leastsquares.equations.reduced import Reduced
 
-MOST_STEPS, MOST_MORE = 2000, 100
-"""Steps of conjugate gradients, and of their refinement."""
-REACHABLE_RESIDUAL = 1e-10
-"""The relative residual that rounding allows in one run: below it the search directions are noise,
-and steps may drift, above all along open motions. Solutions of full precision are refined once
-more, and are NaN if even this was not reached."""
-SMALLEST_DENOMINATOR = 1e-300
-
 
 class ConjugateGradients(eqx.Module):
-    """S = A − Zᵀ·Z scaled, applied to vectors, and L⁻¹ of its diagonal blocks. `tolerance`: the
-    norm of the residual relative to that of the right-hand side."""
+    """S = A − Zᵀ·Z scaled, applied to vectors, and L⁻¹ of its diagonal blocks.
+
+    - `tolerance`: the norm of the residual relative to that of the right-hand side.
+    - `reachable`: the relative residual that rounding allows in one run. Below it the search
+      directions are noise, and steps may drift, above all along open motions. Solutions with a
+      smaller `tolerance` are refined once more, and are NaN if even this was not reached.
+    - `max_steps`, `max_refinement_steps`: more show that the system cannot be solved so. In exact
+      arithmetic conjugate gradients end after as many steps as unknowns; a tolerance of 1e-2 takes
+      some tens.
+    """
 
     normal: Normal
     Z: dict[str, Float[Array, "chunks length w v"]]
     scale: Tangent
     lower_inverse: dict[str, Float[Array, "rows w w"]]
     tolerance: float = eqx.field(static=True)
+    reachable: float = eqx.field(static=True, default=1e-10)
+    max_steps: int = eqx.field(static=True, default=2000)
+    max_refinement_steps: int = eqx.field(static=True, default=100)
 
     def solve(self, b: Tangent) -> Tangent:
         times = lambda indices, x: {
             g: jnp.einsum(indices, M, x[g]) for g, M in self.lower_inverse.items()
         }
+        # One preconditioner on both sides keeps the operator symmetric. The residual is then in
+        # units of σ with all else given, radians beside metres: one norm, one tolerance.
         divided, back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
         right, tag = divided(b), lx.positive_semidefinite_tag
         product = lambda y: divided(self._times(back(y)))
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
 
-        def improved(y, left, tolerance, steps):
+        def improved(
+            y: Tangent, left: Tangent, tolerance: float, steps: int
+        ) -> tuple[Tangent, Tangent]:
             """y refined with the residual `left`, if that decreases it; and the new residual."""
-            # lineax annotates a float, but accepts an array
-            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), SMALLEST_DENOMINATOR)
+            # lineax annotates a float, but accepts an array. 1e-300: a right-hand side of zeros
+            # has its solution at once, instead of 0/0.
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), 1e-300)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
             change = lx.linear_solve(operator, left, method, throw=False).value
             better = jax.tree.map(jnp.add, y, change)
             after = jax.tree.map(jnp.subtract, right, product(better))
+            # Near the limit of rounding a run may end worse than it began.
             less = optx.two_norm(after) < optx.two_norm(left)
             return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
 
         nothing = jax.tree.map(jnp.zeros_like, right)
-        reached = max(self.tolerance, REACHABLE_RESIDUAL)
-        y, left = improved(nothing, right, reached, MOST_STEPS)
-        if self.tolerance < REACHABLE_RESIDUAL:
-            y, left = improved(y, left, self.tolerance / REACHABLE_RESIDUAL, MOST_MORE)
-            solved = optx.two_norm(left) <= 2 * REACHABLE_RESIDUAL * optx.two_norm(right)
+        reached = max(self.tolerance, self.reachable)
+        # Iterative refinement: the second run solves for the error of the first, whose residual is
+        # computed from scratch. One run to the full tolerance would iterate on rounding.
+        y, left = improved(nothing, right, reached, self.max_steps)
+        if self.tolerance < self.reachable:
+            more = self.tolerance / self.reachable
+            y, left = improved(y, left, more, self.max_refinement_steps)
+            # Twice: the residual is computed anew, not by the recursion that met the limit.
+            solved = optx.two_norm(left) <= 2 * self.reachable * optx.two_norm(right)
             y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
         return back(y)
 
@@ -98,7 +111,13 @@ class ConjugateGradients(eqx.Module):
         return average_over_devices(plan, {g: rows * self.scale[g] for g, rows in product.items()})
 
 
-def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:
+def precondition(
+    normal: Normal,
+    Z: dict[str, Float[Array, "chunks length w v"]],
+    S: Reduced,
+    scale: Tangent,
+    tolerance: float,
+) -> ConjugateGradients:
     """S for conjugate gradients, `S.own` its diagonal blocks scaled."""
     lower_inverse = {g: inverse_of_lower(B) for g, B in S.own.items()}
     return ConjugateGradients(normal, Z, scale, lower_inverse, tolerance)
@@ -113,7 +132,8 @@ def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
     """
     w = B.shape[1]
 
-    def eliminate(k, both):
+    # Gauss–Jordan without pivoting, which a positive definite matrix does not need.
+    def eliminate(k: Int[Array, ""], both: Float[Array, "rows w v"]) -> Float[Array, "rows w v"]:
         row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
         below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)
         return (both - below[:, :, None] * row[:, None]).at[:, k].set(row)

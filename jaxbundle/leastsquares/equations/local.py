@@ -12,11 +12,12 @@ iteration to iteration; they are not part of the plan.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.equations.linearise import (
@@ -25,9 +26,18 @@ from jaxbundle.leastsquares.equations.linearise import (
     zero_held_columns,
     zero_held_columns_of_eliminated,
 )
-from jaxbundle.leastsquares.indexing.plan import Part, Plan
-from jaxbundle.leastsquares.indexing.rows import Declared, Laid, look_up, map_blocks, whiten
-from jaxbundle.leastsquares.spaces import Space, Vector
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
+from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
+    Declared,
+    Prepared,
+    Weight,
+    look_up,
+    map_blocks,
+    whiten,
+)
+from jaxbundle.leastsquares.spaces import Block, Change, Space, Vector
+from jaxbundle.types import Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +53,7 @@ class LocalJacobian:
     columns: Int[Array, "chunks length m"]
 
 
-def local_touch(declared: Declared, part: Part) -> int | None:
+def local_touch(declared: Declared, part: ObservationPart) -> int | None:
     """The touch of a part that uses few of many columns; None if there is none."""
     kind = declared.kinds[part.set_name]
     if kind.local is None or not part.large:
@@ -51,12 +61,14 @@ def local_touch(declared: Declared, part: Part) -> int | None:
     space = declared.spaces[kind.of[kind.local.slot]]
     if not isinstance(space, Vector) or space.tied or space.width < 2 * kind.local.number:
         return None
+    # Only a touch of this slot alone: beside other tables of its group the columns would not be
+    # those of the vector.
     alone = [[s for s, _ in touch.slots] == [kind.local.slot] for touch in part.touches]
     return alone.index(True) if any(alone) else None
 
 
 def differentiate_locally(
-    declared: Declared, plan: Plan, number: int, touch: int, prepared, laid: Laid
+    declared: Declared, plan: Plan, number: int, touch: int, prepared: Prepared, laid: ChunkedData
 ) -> LocalJacobian:
     """As `differentiate`, for a part that has such a touch."""
     part = plan.parts[number]
@@ -68,13 +80,15 @@ def differentiate_locally(
     table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]
     values = tuple(table[row if row.ndim == 2 else row[:, None], column] for column in at)
     spaces = tuple(declared.spaces[name] for name in kind.of)
-    widths = list(widths_of(declared, plan, part))
+    widths = list(widths_of(declared, part))
     widths[local.slot] = local.number
     residual = _LocalResidual(kind, spaces)
     r, blocks = differentiate_rows(
         residual, tuple(widths), part, blocks, (measured, at, values), weight
     )
     group = plan.groups[part.touches[touch].group]
+    # From elements of the vector to columns of the group; held elements to a column beyond its
+    # width, where `mode="drop"` leaves them out.
     to = jnp.full(len(prepared[kind.of[local.slot]]), group.width)
     space = spaces[local.slot]
     assert isinstance(space, Vector)
@@ -109,8 +123,10 @@ class _Columns:
 
     kind: Kind
 
-    def __call__(self, blocks, measured, weight):
-        assert self.kind.local is not None
+    def __call__(
+        self, blocks: tuple[Block, ...], measured: PyTree[Scalar], weight: Weight
+    ) -> tuple:
+        assert self.kind.local is not None  # `weight` is passed to all functions of observations
         return self.kind.local.columns(*blocks, measured)
 
 
@@ -121,7 +137,9 @@ class _LocalResidual:
     kind: Kind
     spaces: tuple[Space, ...]
 
-    def __call__(self, blocks, given, weight, changes):
+    def __call__(
+        self, blocks: tuple[Block, ...], given: tuple, weight: Weight, changes: Sequence[Change]
+    ) -> Change:
         local, (measured, columns, values) = self.kind.local, given
         assert local is not None
         values = tuple(v + d for v, d in zip(values, changes[local.slot], strict=True))
@@ -133,21 +151,31 @@ class _LocalResidual:
 
 
 def products_of(
-    like: Float[Array, "rows w w"], row: Int[Array, " chunks"], J, columns
+    like: Float[Array, "rows w w"],
+    row: Int[Array, " chunks"],
+    J: Float[Array, "chunks length r m"],
+    columns: Int[Array, "chunks length m"],
 ) -> Float[Array, "rows w w"]:
     """The products of every observation, added up chunk by chunk in the shape of N."""
 
-    def add(N, chunk):
+    def add(
+        N: Float[Array, "rows w w"], chunk: tuple[Array, Array, Array]
+    ) -> tuple[Float[Array, "rows w w"], None]:
         row, J, at = chunk
         products = jnp.einsum("kri,krj->kij", J, J)
         return N.at[row, at[:, :, None], at[:, None, :]].add(products, mode="drop"), None
 
+    # A loop over chunks, not one scatter: products of all observations would be m² numbers each,
+    # 16² instead of 2 · 16.
     nothing = jnp.zeros(like.shape) + 0.0 * J.ravel()[0]  # varying over the devices like J
     return jax.lax.scan(add, nothing, (row, J, columns))[0]
 
 
-def spread(found: Float[Array, "chunks length m *v"], columns, width: int):
+def spread(
+    found: Float[Array, "chunks length m *v"], columns: Int[Array, "chunks length m"], width: int
+) -> Float[Array, "chunks width *v"]:
     """Rows that belong to columns, summed over the observations of a chunk: [chunks, width, v]."""
     zero = jnp.zeros((found.shape[0], width, *found.shape[3:]))
+    # Two observations of a chunk may share columns: they add up.
     chunk = jnp.arange(found.shape[0])[:, None, None]
     return zero.at[chunk, columns].add(found, mode="drop")

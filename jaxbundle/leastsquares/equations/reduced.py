@@ -42,6 +42,7 @@ class Reduced(eqx.Module):
 
     def matrix(self, plan: Plan, groups: Groups) -> Float[Array, "n n"]:
         """The matrix of some groups; only its lower triangle is right."""
+        # The factorisation reads the lower triangle alone, so that the upper one is not assembled.
         size = lambda g: plan.groups[g].free.size
         rows = [
             [
@@ -60,6 +61,7 @@ class Reduced(eqx.Module):
         matrix = jnp.zeros((n, m, w, v))
         if (a, b) in self.off:
             at = plan.blocks[a, b]
+            # Of one group with itself the blocks are those below the diagonal.
             matrix = matrix.at[at.row, at.column].add(self.off[a, b])
         if a == b:
             matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.own[a])
@@ -97,7 +99,7 @@ def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n
 
 
 @cholesky_of_lower.defjvp
-def _(primals, tangents):
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # JAX's derivative rule expects the full symmetric change.
     whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
     factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
@@ -106,6 +108,7 @@ def _(primals, tangents):
 
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     """The blocks of a symmetric matrix of some groups where S has blocks."""
+    # Cut by rows, then by columns: `parts[b][a]` is [row of a, column of a, row of b, column of b].
     cut = lambda x: split(plan, groups, x)
     parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
     index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
@@ -120,7 +123,9 @@ def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
     return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
 
 
-def split(plan: Plan, groups: Groups, vector: Float[Array, "n ..."]):
+def split(
+    plan: Plan, groups: Groups, vector: Float[Array, "n ..."]
+) -> dict[str, Float[Array, "rows w ..."]]:
     """The rows of some groups in one, group by group."""
     ends = np.cumsum([plan.groups[g].free.size for g in groups])
     parts = jnp.split(vector, ends[:-1]) if groups else ()

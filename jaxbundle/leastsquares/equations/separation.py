@@ -24,9 +24,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-SMALLEST_REDUNDANCY = 1e-2
-"""Directions with a smaller redundancy number carry no information."""
-
 
 def choose_together(
     tests: Float[np.ndarray, " n"],
@@ -65,6 +62,7 @@ def find_alternatives(
     suspect: int,
     critical: float,
     apart: float,
+    min_redundancy: float = 1e-2,
 ) -> list[int]:
     """Observations that explain the same error as the suspect, so that either may be wrong.
 
@@ -74,13 +72,20 @@ def find_alternatives(
     - `observations`: the rows of each observation; `suspect` one of them.
     - `critical`: others with a test below this are not suspected.
     - `apart`: the suspect is certainly wrong if its test exceeds this without the other one.
+    - `min_redundancy`: directions of the residuals with a smaller redundancy number carry no
+      information: a hundredth of an error appears in them.
     """
+    # R = I − A·A⁺: the redundancy matrix if everything else were known, which makes the residuals
+    # of this eliminated row as independent as they can be. With the other unknowns free they
+    # separate less well: the alternatives found here remain alternatives.
     R = np.eye(len(design)) - design @ np.linalg.pinv(design)
 
     def explained(*which: int) -> float:
         rows = np.concatenate([observations[i] for i in which])
+        # (R_AA)⁺ by its eigenvalues: for the two rays of a point R has rank one, and the test of
+        # both together is that of either.
         size, axes = np.linalg.eigh(R[np.ix_(rows, rows)])
-        seen = size > SMALLEST_REDUNDANCY
+        seen = size > min_redundancy
         along = axes[:, seen].T @ residual[rows]
         return float(along**2 @ (1 / size[seen]))
 

@@ -7,17 +7,13 @@ from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.indexing.indices import as_column, as_index
-from jaxbundle.leastsquares.indexing.plan import Group, Member
+from jaxbundle.leastsquares.indexing.plan import Member, UnknownGroup
+from jaxbundle.leastsquares.indexing.settings import PlanningSettings
 from jaxbundle.types import present
-
-MASKED = 100_000
-"""From this number of eliminated rows, whether all of them are free is compiled in. With fewer rows
-some may be held by the same program, as in data snooping: a mask costs little, compiling much.
-"""
 
 
 @dataclasses.dataclass
@@ -28,14 +24,14 @@ class Choices:
     before: dict[Hashable, Any]
     made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
-    def __call__(self, *key, found) -> Any:
+    def __call__(self, *key: Hashable, found: Any) -> Any:
         """The given choice, or an earlier one."""
         self.made[key] = self.before.get(key, found)
         return self.made[key]
 
 
 @dataclasses.dataclass
-class Share:
+class ObservationSubset:
     """The observations that make a part; `slot`: that of the eliminated row."""
 
     set_name: str
@@ -63,18 +59,19 @@ class Grouping:
         observations: Sequence[Observations],
         eliminate: str | None,
         choose: Choices,
+        settings: PlanningSettings,
     ):
         self.tables = {t.name: t for t in tables}
         self.observations = {given.name: given for given in observations}
-        self.eliminate, self.choose = eliminate, choose
-        self.moving = choose("moving", found=[t.name for t in tables if t.free.any()])
-        self.stays = self._rows_that_stay()
+        self.eliminate, self.choose, self.settings = eliminate, choose, settings
+        self.estimated = choose("estimated", found=[t.name for t in tables if t.free.any()])
+        self.coupled_rows = self._find_coupled_rows()
         self.shares = self._share_observations()
         self._form_groups()
 
     # ------------------------------------------------------------------ what is eliminated
 
-    def _rows_that_stay(self):
+    def _find_coupled_rows(self) -> Bool[np.ndarray, " rows"] | None:
         """Rows of the eliminated table that stay in the reduced system: those tied by an
         observation to another row of their table."""
         if self.eliminate is None:
@@ -83,34 +80,39 @@ class Grouping:
         stays = np.zeros(table.rows, bool)
         for given in self.observations.values():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            # Two rows of the eliminated table in one observation (a distance between points): V
+            # would not be block diagonal, so both go to the reduced system.
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
-        return self.choose("stays", found=stays & table.free.any(1))
+        return self.choose("coupled rows", found=stays & table.free.any(1))
 
-    def _share_observations(self):
+    def _share_observations(self) -> list[ObservationSubset]:
         """Observations of one set, separated by the slot that touches an eliminated row."""
         shares = []
         for o, given in self.observations.items():
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
+            # −1: the observation touches no eliminated row; it adds to the reduced system directly.
             slot_of = np.full(given.number, -1)
             for s in slots:
-                slot_of[~present(self.stays)[given.rows[s]]] = s
+                slot_of[~present(self.coupled_rows)[given.rows[s]]] = s
             # Two held rows of the table may meet: the last counts as eliminated.
             # A set without observations is an empty share.
             for slot in self.choose("slots", o, found=np.unique(slot_of).tolist() or [-1]):
                 rows = np.flatnonzero(slot_of == slot)
-                shares.append(Share(o, rows, None if slot < 0 else slot))
+                shares.append(ObservationSubset(o, rows, None if slot < 0 else slot))
         return shares
 
     # ------------------------------------------------------------------ groups
 
-    def _form_groups(self):
+    def _form_groups(self) -> None:
         """Kept tables in groups; the eliminated rows are the last group."""
         self.members, self.group_of = {}, {}
-        for name in self.moving:
+        for name in self.estimated:
             table = self.tables[name]
             if name == self.eliminate:
                 continue
+            # A pose and the camera that took only this image, one block of 9 instead of blocks of 6
+            # and 3: one list of pairs instead of three.
             host = next((g for g in self.members if self._meet_always(g, name)), None)
             host = self.choose("host", name, found=host)
             if host is None:
@@ -122,7 +124,8 @@ class Grouping:
                 self.group_of[name] = host, start, np.arange(table.rows)
         self.row_in, name = {}, self.eliminate
         if name is not None:
-            stays = present(self.stays)
+            stays = present(self.coupled_rows)
+            # Kept rows and eliminated ones are numbered separately.
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if stays.any():
                 kept = f"{name} (kept)"
@@ -134,7 +137,7 @@ class Grouping:
         # In the order of JAX's pytrees.
         self.kept = sorted(g for g in self.members if g != name)
 
-    def _meet_always(self, group, name):
+    def _meet_always(self, group: str, name: str) -> bool:
         """Whether the rows of a table occur in exactly the same observations of eliminated rows as
         those of a group."""
         first = self.members[group][0][0]
@@ -148,6 +151,7 @@ class Grouping:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
             b = [s for s, t in enumerate(of) if t == name]
+            # Touched by one kind without the other: their blocks have different incidences.
             if len(a) != len(b) or len(a) > 1:
                 return False
             if a:
@@ -156,7 +160,7 @@ class Grouping:
                     return False
         return met
 
-    def group(self, name: str) -> Group:
+    def group(self, name: str) -> UnknownGroup:
         members, free = [], []
         for table, start, rows in self.members[name]:
             given = self.tables[table]
@@ -166,13 +170,13 @@ class Grouping:
         free = np.concatenate(free, 1)
         # A slot of the eliminated table touches its kept rows, or a held one, which is not there.
         partial = any(rows is not None for *_, rows in self.members[name])
-        may_be_held = name == self.eliminate and len(free) < MASKED
+        may_be_held = name == self.eliminate and len(free) < self.settings.masked_below
         may_be_held |= partial and name != self.eliminate
         all_free = bool(free.all()) and not may_be_held
         all_free = self.choose("all free", name, found=all_free)
-        return Group(tuple(members), as_column(free, ("group", name)), all_free)
+        return UnknownGroup(tuple(members), as_column(free, ("group", name)), all_free)
 
-    def touched_groups(self, number: int, share: Share) -> list[TouchedGroup]:
+    def touched_groups(self, number: int, share: ObservationSubset) -> list[TouchedGroup]:
         """The kept groups touched by share `number`, in order.
 
         Slots of one group are one touch if they have the same row in every observation of the

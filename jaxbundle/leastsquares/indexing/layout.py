@@ -1,46 +1,48 @@
 """Observations in chunks that touch the same rows; pairs in chunks of the same block."""
 
+from collections.abc import Hashable, Sequence
+
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxbundle.leastsquares.indexing.indices import as_index
-from jaxbundle.leastsquares.indexing.plan import Key, Pairs
-
-CHUNK_LENGTHS = (256, 64, 16)
-MOST_EMPTY = 0.1
-"""Chunks may pad a part by this fraction."""
-SMALL_PART = 2000
-"""Parts with fewer observations have chunks of length one, and compile in a tenth of the time."""
-PAIR_CHUNKS, FEW_PAIR_CHUNKS = (256, 64, 12), (8,)
-FEW_PAIRS = 50_000
-"""Lists of fewer pairs have chunks of one length, which compiles in a third of the time."""
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Key
+from jaxbundle.leastsquares.indexing.settings import PlanningSettings
 
 
-def chunk_length(major: Int[np.ndarray, " n"]) -> int:
-    """The longest chunks of rows of one major with little padding."""
+def chunk_length(major: Int[np.ndarray, " n"], settings: PlanningSettings) -> int:
+    """The longest chunks of rows of one major with little padding; 1 for few rows."""
+    if len(major) < settings.small_part:
+        return 1
     _, number = np.unique(major, return_counts=True)
     fits = (
         length
-        for length in CHUNK_LENGTHS
-        if (-(-number // length) * length).sum() <= (1 + MOST_EMPTY) * len(major)
+        for length in settings.chunk_lengths
+        if (-(-number // length) * length).sum() <= (1 + settings.max_padding) * len(major)
     )
-    return next(fits, 1) if len(major) >= SMALL_PART else 1
+    return next(fits, 1)
 
 
-def lay_out(major: Int[np.ndarray, " n"], minor: Int[np.ndarray, " n"], length: int):
+def lay_out(
+    major: Int[np.ndarray, " n"], minor: Int[np.ndarray, " n"], length: int
+) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Rows sorted by (major, minor) in chunks of one major: the row at every position (a short
     chunk repeats its last), and whether the position is used."""
+    # Within a major the minor ascends: eliminated rows are then read forwards in memory.
     order = np.lexsort((minor, major))
     if not len(order):
         return order, np.zeros(0, bool)
     _, first, number = np.unique(major[order], return_index=True, return_counts=True)
     room = -(-number // length) * length
     within = np.arange(room.sum()) - np.repeat(np.cumsum(room) - room, room)
+    # Unused positions repeat a row that exists: what is computed there is finite, and weighted 0.
     last = np.repeat(number, room) - 1
     return order[np.repeat(first, room) + np.minimum(within, last)], within <= last
 
 
-def pairs_between(a: Int[np.ndarray, " n"], b: Int[np.ndarray, " m"]):
+def pairs_between(
+    a: Int[np.ndarray, " n"], b: Int[np.ndarray, " m"]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """All (i, j) with a[i] = b[j]."""
     order = np.argsort(b, kind="stable")
     start = np.searchsorted(b[order], a, "left")
@@ -50,17 +52,29 @@ def pairs_between(a: Int[np.ndarray, " n"], b: Int[np.ndarray, " m"]):
     return i, order[np.repeat(start, count) + within]
 
 
-def pair_chunk_lengths(pairs: int) -> tuple[int, ...]:
+def pair_chunk_lengths(pairs: int, settings: PlanningSettings) -> tuple[int, ...]:
     """The chunk lengths for this number of pairs; none without pairs."""
-    return () if not pairs else FEW_PAIR_CHUNKS if pairs < FEW_PAIRS else PAIR_CHUNKS
+    if not pairs:
+        return ()
+    few = pairs < settings.few_pairs
+    return (settings.few_pairs_chunk_length,) if few else settings.pair_chunk_lengths
 
 
-def chunk_pairs(i, j, block, into, along, key: Key, lengths: tuple[int, ...]) -> Pairs:
+def chunk_pairs(
+    i: Int[np.ndarray, " n"],
+    j: Int[np.ndarray, " n"],
+    block: Int[np.ndarray, " n"],
+    into: Sequence[tuple[Hashable, int]],
+    along: Hashable,
+    key: Key,
+    lengths: tuple[int, ...],
+) -> IncidencePairs:
     """Pairs sorted by block, in chunks of one block, the longest first."""
     order = np.argsort(block, kind="stable")
     i, j = i[order], j[order]
     blocks, start, left = np.unique(block[order], return_index=True, return_counts=True)
     first, second, of = [], [], []
+    # Blocks with many pairs take long chunks first, what is left shorter ones; the last is padded.
     for length in lengths:
         number = -(-left // length) if length == lengths[-1] else left // length
         chunk = np.repeat(np.arange(len(blocks)), number)
@@ -68,10 +82,11 @@ def chunk_pairs(i, j, block, into, along, key: Key, lengths: tuple[int, ...]) ->
         at = start[chunk][:, None] + within[:, None] * length + np.arange(length)
         valid = at < (start + left)[chunk][:, None]
         at = np.where(valid, at, 0)
+        # −1 at unused positions: the empty incidence, whose product is 0.
         own = ("pairs", *key, length)
         first.append(as_index(np.where(valid, i[at], -1), own, *into[0]))
         second.append(as_index(np.where(valid, j[at], -1), own, *into[1]))
         of.append(as_index(blocks[chunk], own, along))
         taken = np.minimum(number * length, left)
         start, left = start + taken, left - taken
-    return Pairs(tuple(first), tuple(second), tuple(of))
+    return IncidencePairs(tuple(first), tuple(second), tuple(of))

@@ -25,6 +25,8 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.leastsquares.indexing.reduction import Band
 
 Key = tuple[str, str]
+Slots = tuple[tuple[int, int], ...]
+"""Slots of a kind, and the first column of each in its group."""
 
 
 class Member(eqx.Module):
@@ -37,7 +39,7 @@ class Member(eqx.Module):
     rows: Int[Array, " n"] | None
 
 
-class Group(eqx.Module):
+class UnknownGroup(eqx.Module):
     """A block row of the normal equations; `free` is 0 for held directions."""
 
     members: tuple[Member, ...]
@@ -53,20 +55,20 @@ class Group(eqx.Module):
         return self.free.shape[1]
 
 
-class Touch(eqx.Module):
+class TouchedRows(eqx.Module):
     """How a part touches a kept group: the slots of the kind (slot, first column), the columns, and
     the row of every chunk. `incidence`: the index of W of every observation; None: the observations
     are the incidences."""
 
     group: str = eqx.field(static=True)
-    slots: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    slots: Slots = eqx.field(static=True)
     start: int = eqx.field(static=True)
     stop: int = eqx.field(static=True)
     row: Int[Array, " chunks"]
     incidence: Int[Array, "chunks length"] | None
 
 
-class Couple(eqx.Module):
+class PairBlock(eqx.Module):
     """Two touches of a part and the block of the reduced matrix where their rows meet: in every
     chunk the block's number, and whether the first row stands in its row (0) or its column (1).
     `same`: 1 if both are the same row, None if never."""
@@ -78,7 +80,7 @@ class Couple(eqx.Module):
     same: Float[Array, " chunks"] | None
 
 
-class Part(eqx.Module):
+class ObservationPart(eqx.Module):
     """Observations of a set in the order of computation. `lookup`: the rows of the tables of the
     slots, one per chunk or (`by_row`) one per observation; `eliminated`: the eliminated row;
     `source`: the observation; `place`: for every observation its position in this part."""
@@ -91,8 +93,8 @@ class Part(eqx.Module):
     eliminated: Int[Array, "chunks length"] | None
     source: Int[Array, "chunks length"]
     place: Int[Array, " observations"]
-    touches: tuple[Touch, ...]
-    couples: tuple[Couple, ...]
+    touches: tuple[TouchedRows, ...]
+    couples: tuple[PairBlock, ...]
 
 
 class Incidences(eqx.Module):
@@ -102,7 +104,7 @@ class Incidences(eqx.Module):
     row: Int[Array, " chunks"]
 
 
-class Pairs(eqx.Module):
+class IncidencePairs(eqx.Module):
     """Pairs of incidences of two groups, in chunks of fixed lengths, each chunk of one block."""
 
     first: tuple[Int[Array, "chunks length"], ...]
@@ -116,7 +118,7 @@ class Blocks(eqx.Module):
 
     row: Int[Array, " blocks"]
     column: Int[Array, " blocks"]
-    pairs: Pairs | None
+    pairs: IncidencePairs | None
 
 
 class Datum(eqx.Module):
@@ -137,9 +139,9 @@ class Plan(eqx.Module):
     observations are distributed; None: one device. `reduction`: solver of the reduced system
     (`reduction.py`); `band`: if it is banded."""
 
-    groups: dict[str, Group]
+    groups: dict[str, UnknownGroup]
     eliminated: str | None = eqx.field(static=True)
-    parts: tuple[Part, ...]
+    parts: tuple[ObservationPart, ...]
     incidences: dict[str, Incidences]
     blocks: dict[Key, Blocks]
     reduction: str | None = eqx.field(static=True, default="dense")

@@ -2,24 +2,33 @@
 
 import dataclasses
 from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.indexing.grouping import Choices, Grouping, Share
+from jaxbundle.leastsquares.indexing.grouping import Choices, Grouping, ObservationSubset
 from jaxbundle.leastsquares.indexing.indices import Sizes, as_column, as_index, count
 from jaxbundle.leastsquares.indexing.layout import (
-    SMALL_PART,
     chunk_length,
     chunk_pairs,
     lay_out,
     pair_chunk_lengths,
     pairs_between,
 )
-from jaxbundle.leastsquares.indexing.plan import Blocks, Couple, Incidences, Part, Plan, Touch
-from jaxbundle.leastsquares.indexing.reduction import FACTORS, MOST_PAIRS, plan_reduction
+from jaxbundle.leastsquares.indexing.plan import (
+    Blocks,
+    Incidences,
+    Key,
+    ObservationPart,
+    PairBlock,
+    Plan,
+    TouchedRows,
+)
+from jaxbundle.leastsquares.indexing.reduction import FACTORS, Band, plan_reduction
+from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
 
 
 def make_plan(
@@ -28,29 +37,31 @@ def make_plan(
     eliminate: str | None,
     choices: dict | None = None,
     ways: Sequence[str] = REDUCTIONS,
+    settings: PlanningSettings = PLANNING,
 ) -> tuple[Plan, Sizes, dict]:
-    """The plan on the host, its arrays as `Index` and `Column` (`indices.finish`), the sizes of its
-    lists, and the choices made (lengths of chunks, blocks of the reduced matrix). `choices`: those
-    of a larger problem of which this is a part, to be reused; `ways`: allowed solvers of the
-    reduced system."""
+    """The plan on the host, its arrays as `PlanIndex` and `PlanColumn` (`indices.finish`), the
+    sizes of its lists, and the choices made (lengths of chunks, blocks of the reduced matrix,
+    settings). `choices`: those of a larger problem of which this is a part, to be reused; `ways`:
+    allowed solvers of the reduced system."""
     choose = Choices(choices or {})
-    plan = _Planner(Grouping(tables, observations, eliminate, choose), ways).plan()
+    settings = choose("settings", found=settings)
+    plan = _Planner(Grouping(tables, observations, eliminate, choose, settings), ways).plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
     sizes |= {("observations", o.name): o.number + 1 for o in observations}
     return plan, sizes | count(plan), choose.made
 
 
 @dataclasses.dataclass
-class _LaidPart:
-    """A part in its chunks of `length`, along the list `along`; `used`: which positions are
-    used."""
+class _PartInChunks:
+    """A part in its chunks of `length`, along the list `along`; `used`: which positions are used.
+    The arrays of `part`, an `ObservationPart`, are still `PlanIndex` and `PlanColumn`."""
 
-    part: Part
+    part: Any
     used: Bool[np.ndarray, " places"]
     length: int
     along: Hashable
 
-    def set(self, field: str, number: int, **changed) -> None:
+    def set(self, field: str, number: int, **changed: Any) -> None:
         """Replaces an item in one of the touches or couples."""
         items = list(getattr(self.part, field))
         items[number] = dataclasses.replace(items[number], **changed)
@@ -58,7 +69,7 @@ class _LaidPart:
 
 
 @dataclasses.dataclass
-class _LaidIncidences:
+class _IncidencesInChunks:
     """Incidences of a group in their chunks; for each incidence: place, both rows."""
 
     incidences: Incidences
@@ -69,12 +80,29 @@ class _LaidIncidences:
     length: int
 
 
+DirectBlocks = dict[Key, list[tuple[int, int, np.ndarray, np.ndarray]]]
+"""By groups (later, earlier): part, number of its pair of touches, row and column by chunk."""
+
+
+class _PairList(NamedTuple):
+    """Pairs of incidences of two groups: places of both, row and column of their block, and the
+    lists (with the length of chunks) in which the places are."""
+
+    first: Int[np.ndarray, " n"]
+    second: Int[np.ndarray, " n"]
+    row: Int[np.ndarray, " n"]
+    column: Int[np.ndarray, " n"]
+    into: Sequence[tuple[Hashable, int]]
+
+
 class _Planner:
+    """The steps of `make_plan`; `by`: what is eliminated, and the groups."""
+
     def __init__(self, grouping: Grouping, ways: Sequence[str]):
-        self.by, self.choose = grouping, grouping.choose
+        self.by, self.choose, self.settings = grouping, grouping.choose, grouping.settings
         self.ways = self.choose("ways", found=tuple(ways))
 
-    def plan(self):
+    def plan(self) -> Plan:
         parts = [self.lay_out(k, share) for k, share in enumerate(self.by.shares)]
         incidences = {g: self.incidences_of(g, parts) for g in self.by.kept}
         incidences = {g: found for g, found in incidences.items() if found is not None}
@@ -84,27 +112,35 @@ class _Planner:
         parts = tuple(p.part for p in parts)
         return Plan(groups, self.by.eliminate, parts, incidences, blocks, reduction, band)
 
-    def reduce(self, parts, incidences, groups):
+    def reduce(
+        self,
+        parts: list[_PartInChunks],
+        incidences: dict[str, _IncidencesInChunks],
+        groups: dict[str, Any],
+    ) -> tuple[dict[Key, Blocks], str | None, Band | None]:
         """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
+        # m incidences of an eliminated row are m(m − 1)/2 pairs: counted before they are listed.
         met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
-        if len(ways) > 1 and (met * (met - 1)).sum() / 2 > MOST_PAIRS:
+        if len(ways) > 1 and (met * (met - 1)).sum() / 2 > self.settings.max_pairs:
             ways = ("iterative",)
         blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
         shapes = {g: groups[g].free.rows.shape for g in self.by.kept}
-        place = lambda at: (at.row.rows, at.column.rows) if at else np.zeros((2, 0), np.int64)
+        none = np.zeros(0, np.int64)
+        place = lambda at: (at.row.rows, at.column.rows) if at else (none, none)
         ties = lambda g: place(blocks.get((g, g)))
         number = sum(given.number for given in self.by.observations.values())
-        way, band = plan_reduction(shapes, ties, number, ways)
+        way, band = plan_reduction(shapes, ties, number, ways, self.settings)
         self.choose.made["ways",] = (way,)
         return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
 
-    def lay_out(self, k: int, share: Share) -> _LaidPart:
+    def lay_out(self, k: int, share: ObservationSubset) -> _PartInChunks:
         """Part k in chunks, with its touches (couples and incidences are added later)."""
         given = self.by.observations[share.set_name]
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
         slots = self.by.touched_groups(k, share)
+        # One number for every combination of kept rows that occurs; `unique` keeps it small.
         major = np.zeros(len(share.source), np.int64)
         for _, touched in slots:
             slot = touched[0][0]
@@ -113,14 +149,16 @@ class _Planner:
             major = np.unique(major * (row.max(initial=0) + 2) + row + 1, return_inverse=True)[1]
         minor = rows[share.slot] if share.slot is not None else np.arange(len(major))
         along = ("part", k)
-        length = self.choose("length", along, found=chunk_length(major))
-        large = self.choose("large", k, found=len(major) >= SMALL_PART)
+        length = self.choose("length", along, found=chunk_length(major, self.settings))
+        large = self.choose("large", k, found=len(major) >= self.settings.small_part)
         order, used = lay_out(major, minor, length)
         chunk = lambda x: x[order].reshape(-1, length)
         lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)
         first[major] = np.arange(len(major))  # An observation of every major.
         for s, name in enumerate(of):
             at = chunk(rows[s])
+            # A slot whose row is the same in a chunk is looked up once for it, the others for each
+            # observation.
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
             one = self.choose("by chunk", k, s, found=one and s != share.slot)
             by_row.append(not one)
@@ -132,7 +170,7 @@ class _Planner:
             stop = max(start + self.by.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
             index = as_index(row, along, ("group", group))
-            touches.append(Touch(group, tuple(touched), start, stop, index, None))
+            touches.append(TouchedRows(group, tuple(touched), start, stop, index, None))
         source = np.where(used, share.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
         place[share.source[order][used]] = np.flatnonzero(used)
@@ -141,7 +179,7 @@ class _Planner:
             at = self.by.row_in[chunk(rows[share.slot])]
             eliminated = as_index(at, along, ("group", self.by.eliminate))
         number = ("observations", share.set_name)
-        made = Part(
+        made = ObservationPart(
             set_name=share.set_name,
             slot=share.slot,
             by_row=tuple(by_row),
@@ -153,9 +191,9 @@ class _Planner:
             touches=tuple(touches),
             couples=(),
         )
-        return _LaidPart(made, used, length, along)
+        return _PartInChunks(made, used, length, along)
 
-    def incidences_of(self, group, parts):
+    def incidences_of(self, group: str, parts: list[_PartInChunks]) -> _IncidencesInChunks | None:
         """The incidences of a group; sets the incidence of the observations of the parts."""
         at = [
             (k, t)
@@ -174,8 +212,11 @@ class _Planner:
             row.append(np.repeat(p.part.touches[t].row.rows, p.length))
             used.append(p.used)
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
+        # An incidence is a combination of both rows; several observations may share it (an image
+        # point and a distance to the same camera).
         keys = row[used].astype(np.int64) * number + eliminated[used]
         keys, of = np.unique(keys, return_inverse=True)
+        # Observations that are incidences themselves, the usual case: W needs no sum by incidence.
         apart = len(at) == 1 and len(keys) == used.sum()
         if self.choose("incidences apart", group, found=apart):
             p = parts[at[0][0]]
@@ -183,7 +224,7 @@ class _Planner:
         else:
             r, q = keys // number, keys % number
             along = ("incidences", group)
-            length = self.choose("length", along, found=chunk_length(r))
+            length = self.choose("length", along, found=chunk_length(r, self.settings))
             order, live = lay_out(r, q, length)
             place = np.empty(len(keys), np.int64)
             place[order[live]] = np.flatnonzero(live)
@@ -201,15 +242,18 @@ class _Planner:
         )
         live = np.flatnonzero(used)
         eliminated, row = eliminated[live], row[live]
-        return _LaidIncidences(plan, live, eliminated, row, along, length)
+        return _IncidencesInChunks(plan, live, eliminated, row, along, length)
 
-    def find_blocks(self, parts, incidences):
+    def find_blocks(
+        self, parts: list[_PartInChunks], incidences: dict[str, _IncidencesInChunks]
+    ) -> dict[Key, Blocks]:
         """The blocks of the reduced matrix between kept groups: from pairs of incidences, and from
         observations that touch two kept rows."""
-        direct = {}  # (later, earlier): [(part, couple, row, column, along)]
+        direct: DirectBlocks = {}
         for k, p in enumerate(parts):
             self._couples(k, p, direct)
         blocks = {}
+        # Blocks below the diagonal of the reduced matrix, groups in the order of JAX's pytrees.
         for place, later in enumerate(self.by.kept):
             for earlier in self.by.kept[: place + 1]:
                 key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
@@ -219,7 +263,8 @@ class _Planner:
                     blocks[key] = made
         return blocks
 
-    def _couples(self, k, p, direct):
+    def _couples(self, k: int, p: _PartInChunks, direct: DirectBlocks) -> None:
+        """Adds the pairs of touches of part k, and their rows and columns to `direct`."""
         touches = p.part.touches
         couples = []
         for j in range(len(touches)):
@@ -237,34 +282,34 @@ class _Planner:
                     none |= equal
                 row = np.where(none, -1, row)
                 direct.setdefault((a.group, b.group), []).append((k, len(couples), row, column))
-                couples.append(Couple(j, i, None, turned, same))
+                couples.append(PairBlock(j, i, None, turned, same))
         p.part = dataclasses.replace(p.part, couples=tuple(couples))
 
-    def _pairs(self, later, earlier, within):
-        """Pairs of incidences: places and rows of the block (row of the later, of the earlier)."""
+    def _pairs(
+        self, later: _IncidencesInChunks | None, earlier: _IncidencesInChunks | None, within: bool
+    ) -> _PairList:
+        """The pairs of incidences of one eliminated row, of two groups or `within` one."""
         if later is None or earlier is None:
             empty = np.zeros(0, np.int64)
-            return empty, empty, empty, empty, None
+            return _PairList(empty, empty, empty, empty, ())
         i, j = pairs_between(later.eliminated, earlier.eliminated)
+        # Touched rows may be held, or eliminated themselves: no block.
         there = (later.row[i] >= 0) & (earlier.row[j] >= 0)
         if within:  # below the diagonal; an incidence paired with itself is summed by chunks
             there &= later.row[i] > earlier.row[j]
         i, j = i[there], j[there]
-        return (
-            later.live[i],
-            earlier.live[j],
-            later.row[i],
-            earlier.row[j],
-            (
-                (later.along, later.length),
-                (earlier.along, earlier.length),
-            ),
-        )
+        into = (later.along, later.length), (earlier.along, earlier.length)
+        return _PairList(later.live[i], earlier.live[j], later.row[i], earlier.row[j], into)
 
-    def _block_list(self, key, pairs, direct, parts):
+    def _block_list(
+        self, key: Key, pairs: _PairList, direct: Sequence, parts: list[_PartInChunks]
+    ) -> Blocks | None:
+        """The blocks of two groups, from their pairs and from observations that touch both."""
         i, j, row, column, into = pairs
         columns = np.int64(self.by.rows(key[1]))
         number = lambda r, c: r.astype(np.int64) * columns + c
+        # The blocks that occur, in the order of row and column: by the fill of S, not of a dense
+        # matrix.
         keys = [number(row, column), *(number(r[r >= 0], c[r >= 0]) for *_, r, c in direct)]
         keys = self.choose("blocks", *key, found=np.unique(np.concatenate(keys)))
         if not len(keys):
@@ -274,7 +319,7 @@ class _Planner:
             block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
             parts[k].set("couples", couple, block=as_index(block, parts[k].along, along))
         found = None
-        lengths = self.choose("pair chunks", *key, found=pair_chunk_lengths(len(i)))
+        lengths = self.choose("pair chunks", *key, found=pair_chunk_lengths(len(i), self.settings))
         if lengths:
             block = np.searchsorted(keys, number(row, column))
             found = chunk_pairs(i, j, block, into, along, key, lengths)

@@ -11,6 +11,7 @@ each super-block of m unknowns, and for conjugate gradients about forty passes o
 observations, without pairs of incidences.
 """
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,21 +19,11 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxbundle.leastsquares.indexing.indices import as_column
+from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
+from jaxbundle.types import present
 
 FACTORS = ("dense", "banded")
-ALWAYS_DENSE = 1000
-"""Smaller reduced systems are always solved densely."""
-GAIN = 3.0
-"""Required saving of operations relative to the dense solver."""
-LARGEST_FACTOR = 2e9 / 8
-"""Largest factor, in elements; larger systems are solved iteratively."""
-MOST_PAIRS = 3e8
-"""Largest number of pairs of incidences; systems with more are solved iteratively."""
-STEPS, WORK = 40, 600.0
-"""For conjugate gradients: number of passes, and cost per observation and pass, in operations of a
-factorisation."""
-NARROWEST = 32
-"""Minimum size of a super-block; with fewer unknowns overhead dominates."""
+Rows = Int[np.ndarray, " n"]
 
 
 class Band(eqx.Module):
@@ -45,47 +36,78 @@ class Band(eqx.Module):
     blocks: int = eqx.field(static=True)
 
 
-def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, ways):
+def plan_reduction(
+    shapes: dict[str, tuple[int, int]],
+    ties: Callable[[str], tuple[Rows, Rows]],
+    observations: int,
+    ways: Sequence[str],
+    settings: PlanningSettings,
+) -> tuple[str | None, Band | None]:
     """The solver for kept groups of these shapes (rows, width), None if none of `ways` fits into
     memory, and the band if it is banded; a single one of `ways` is used regardless.
 
     `ties(group)`: row and column of its blocks beside the diagonal."""
     unknowns = sum(n * w for n, w in shapes.values())
-    if not shapes or (len(ways) > 1 and unknowns < ALWAYS_DENSE):
+    if not shapes or (len(ways) > 1 and unknowns < settings.always_dense_below):
         return "dense", None
     group = max(shapes, key=lambda g: np.prod(shapes[g]))
     (row, column), (rows, w) = ties(group), shapes[group]
-    band = find_band(group, row, column, rows, w) if "banded" in ways else None
+    band = find_band(group, row, column, rows, w, settings) if "banded" in ways else None
     way = ways[0]
     if len(ways) > 1:
-        way = choose_reduction(band, w, unknowns, observations, ways)
+        way = choose_reduction(band, w, unknowns, observations, ways, settings)
     return way, band if way == "banded" else None
 
 
-def find_band(group: str, row, column, rows: int, w: int) -> Band:
+def find_band(
+    group: str,
+    row: Rows,
+    column: Rows,
+    rows: int,
+    w: int,
+    settings: PlanningSettings = PLANNING,
+) -> Band:
     """A narrow band of the blocks (row, column) of a group of so many rows of `w` unknowns."""
     from scipy import sparse  # imported here: a tenth of a second
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+    # Ordered by rows of the group, not by unknowns: a row keeps its unknowns together.
     links = sparse.coo_matrix((np.ones(len(row)), (row, column)), (rows, rows))
     place = np.empty(rows, np.int32)
     place[reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)] = np.arange(rows)
-    width = max(int(np.abs(place[row] - place[column]).max(initial=0)), -(-NARROWEST // w))
+    # The band is as wide as its widest block: one long link, as of a closed loop, widens all of it.
+    width = max(
+        int(np.abs(place[row] - place[column]).max(initial=0)), -(-settings.min_super_block // w)
+    )
     blocks = rows // width + 1  # The last position is empty.
     return Band(group, as_column(place, ("group", group), blocks * width - 1), width, blocks)
 
 
-def choose_reduction(band: Band | None, w: int, unknowns: int, observations: int, ways):
+def choose_reduction(
+    band: Band | None,
+    w: int,
+    unknowns: int,
+    observations: int,
+    ways: Sequence[str],
+    settings: PlanningSettings = PLANNING,
+) -> str | None:
     """The solver for this number of unknowns, those of the band in blocks of `w`; None: none
     fits."""
-    n, work = float(unknowns), {"iterative": (STEPS * WORK * observations, 0.0)}
+    passes = settings.conjugate_gradient_steps * settings.conjugate_gradient_work
+    n, work = float(unknowns), {"iterative": (passes * observations, 0.0)}
     work["dense"] = n**3 / 3, n**2
     if band is not None:
         place: Any = band.place  # not an array yet (`as_column`)
         m, rows = float(band.width * w), len(place.rows) * w
+        # Super-blocks: L (m³/3), C by substitution (m³), C·Cᵀ (2·m³); then X and the corner of the
+        # border of q unknowns.
         q = n - rows
         border = 2 * rows * m * q + rows * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
-    fits = {way: work[way][0] for way in ways if work[way][1] <= LARGEST_FACTOR}
+    fits = {way: work[way][0] for way in ways if work[way][1] <= settings.max_factor_elements}
     least = min(fits, key=fits.__getitem__, default=None)
-    return "dense" if "dense" in fits and fits["dense"] < GAIN * fits[least] else least
+    return (
+        "dense"
+        if "dense" in fits and fits["dense"] < settings.required_gain * fits[present(least)]
+        else least
+    )

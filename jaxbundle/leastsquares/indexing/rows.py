@@ -6,6 +6,7 @@ Everything is a structure of arrays: one array for each scalar of a block.
 """
 
 import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,12 +16,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind, Motions
-from jaxbundle.leastsquares.indexing.plan import Part, Plan
-from jaxbundle.leastsquares.spaces import Space, Vector
-from jaxbundle.types import AnyArray
+from jaxbundle.leastsquares.indexing.plan import ObservationPart, Plan
+from jaxbundle.leastsquares.spaces import Block, Change, Space, Vector
+from jaxbundle.types import AnyArray, Scalar
 
-MOST_RESIDUALS = 64
-"""Residuals of one observation, as of the priors of a spline camera."""
+SCALAR_RESIDUALS_UP_TO = 64
+"""Kinds of arrays with more residuals per observation, as the priors of a spline camera have, are
+differentiated as arrays. Scalar by scalar XLA compiles them for minutes: the program grows with
+residuals × columns, 64² statements at this limit. Not critical: kinds of the package have a few
+residuals, or hundreds."""
+
+Weight = tuple[Any, ...]
+"""Of one observation: 1/σ of every residual, or the rows of L⁻¹ as tuples."""
+
+Prepared = dict[str, PyTree[Float[Array, " rows"]]]
+"""By table, the prepared blocks of its rows, one array for each scalar."""
 
 Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 """The rows of every table."""
@@ -38,7 +48,7 @@ class Data(eqx.Module):
     weight: dict[str, Float[AnyArray, "n ..."]]
 
 
-class Laid(eqx.Module):
+class ChunkedData(eqx.Module):
     """Measurements and weights of every part in the order of computation, scalar by scalar."""
 
     measured: tuple[PyTree[Float[Array, "chunks length"]], ...]
@@ -63,10 +73,10 @@ class Declared:
         return dict(self.named_spaces)
 
 
-def lay_out_data(plan: Plan, data: Data) -> Laid:
+def lay_out_data(plan: Plan, data: Data) -> ChunkedData:
     """The measurements, looked up once per solution."""
     of = lambda rows, part: look_up(scalars(rows), part.source)
-    return Laid(
+    return ChunkedData(
         tuple(of(data.measured[part.set_name], part) for part in plan.parts),
         tuple(of(data.weight[part.set_name], part) for part in plan.parts),
     )
@@ -83,13 +93,13 @@ def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
     """The elements of every row: numbers as they are, vectors as tuples, matrices as tuples of
     tuples."""
 
-    def split(x):
+    def split(x: Float[Array, "n ..."]) -> Any:
         return x if x.ndim == 1 else Elements(split(x[:, i]) for i in range(x.shape[1]))
 
     return jax.tree.map(split, rows)
 
 
-def prepare(declared: Declared, values: Values) -> dict[str, PyTree[Float[Array, " rows"]]]:
+def prepare(declared: Declared, values: Values) -> Prepared:
     """The prepared block of every row of every table."""
     return {name: jax.vmap(declared.spaces[name].prepare)(rows) for name, rows in values.items()}
 
@@ -102,14 +112,28 @@ class Residual:
     kind: Kind
     spaces: tuple[Space, ...]
 
-    def __call__(self, blocks, measured, weight, changes=None):
+    def __call__(
+        self,
+        blocks: Sequence[Block],
+        measured: PyTree[Scalar],
+        weight: Weight,
+        changes: Sequence[Change] | None = None,
+    ) -> Change:
         changes = ((),) * len(self.spaces) if changes is None else changes
+        # Derivatives are taken at zero changes; the changed block is the one place where the chart
+        # of a space enters the residual.
         moved = [s.move(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
         return whiten(evaluate(self.kind, moved, measured), weight)
 
-    def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
-        """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
-        of columns, which XLA would compile for minutes as scalars."""
+    def array(
+        self,
+        blocks: Sequence[Block],
+        measured: PyTree[Scalar],
+        weight: Change,
+        changes: Sequence[Float[Array, " width"]],
+    ) -> Float[Array, " r"]:
+        """Residuals / σ as an array, of changes [width] of every slot: for kinds of arrays with
+        hundreds of columns (`SCALAR_RESIDUALS_UP_TO`)."""
         moved = []
         for space, block, change in zip(self.spaces, blocks, changes, strict=True):
             if isinstance(space, Vector) and space.size:
@@ -125,19 +149,19 @@ class Residual:
         v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
         return jnp.where(w > 0, w * v, 0.0)
 
-    def is_wide(self, weight) -> bool:
+    def is_wide(self, weight: Weight) -> bool:
         """Whether to use `array`: the kind works on arrays and has a weight per residual."""
-        many = len(weight) > MOST_RESIDUALS
+        many = len(weight) > SCALAR_RESIDUALS_UP_TO
         return not self.kind.scalars and many and not isinstance(weight[0], tuple)
 
 
-def residual_of(declared: Declared, part: Part) -> Residual:
+def residual_of(declared: Declared, part: ObservationPart) -> Residual:
     """The residuals of one observation of a part."""
     kind = declared.kinds[part.set_name]
     return Residual(kind, tuple(declared.spaces[name] for name in kind.of))
 
 
-def evaluate(kind: Kind, blocks, measured):
+def evaluate(kind: Kind, blocks: Iterable[Block], measured: PyTree[Scalar]) -> Change:
     """The residuals of one observation as a tuple of scalars."""
     if not kind.scalars:
         blocks = (_stack(b) for b in blocks)
@@ -148,22 +172,23 @@ def evaluate(kind: Kind, blocks, measured):
     return (found,) if jnp.ndim(found) == 0 else tuple(found)
 
 
-def _stack(block) -> Any:
+def _stack(block: Block) -> Any:
     """Tuples of scalars as arrays; other blocks as they are."""
     if type(block) in (tuple, Elements) and block:
         return jnp.stack([_stack(x) for x in block])
     return block
 
 
-def whiten(v, weight):
+def whiten(v: Change, weight: Weight) -> Change:
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
+        # L⁻¹ is lower triangular, but its zeros cost less than a loop that knows them.
         rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
         return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
 
 
-def diagonal_of(weight) -> Any:
+def diagonal_of(weight: Weight | Float[AnyArray, "n r *r"]) -> Any:
     """The weight of every residual, 0 if it does not count: of observations [n, r] or [n, r, r], or
     of one as scalars."""
     if isinstance(weight, tuple):
@@ -171,23 +196,31 @@ def diagonal_of(weight) -> Any:
     return weight if weight.ndim == 2 else weight.diagonal(axis1=1, axis2=2)
 
 
-def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
+def fill_places(plan: Plan, laid: ChunkedData) -> tuple[Plan, ChunkedData]:
     """Positions without weight use the rows of one with weight: an undefined value, such as the
     distance of a point from itself, would be NaN in reverse mode in spite of its zero weight."""
     parts, measured = [], []
     for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
         shape = part.source.shape
         live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
+        # `argmax`: the first position with weight, or 0.
         place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
         every = lambda at, shape=shape: jnp.broadcast_to(at if at.ndim == 2 else at[:, None], shape)
         seen = lambda x, place=place: x.ravel()[place]
         lookup, by_row = tuple(seen(every(at)) for at in part.lookup), (True,) * len(part.lookup)
         parts.append(dataclasses.replace(part, lookup=lookup, by_row=by_row))
         measured.append(jax.tree.map(seen, values))
-    return dataclasses.replace(plan, parts=tuple(parts)), Laid(tuple(measured), laid.weight)
+    return dataclasses.replace(plan, parts=tuple(parts)), ChunkedData(tuple(measured), laid.weight)
 
 
-def map_observations(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) -> Any:
+def map_observations(
+    part: ObservationPart,
+    kind: Kind,
+    prepared: Prepared,
+    laid: ChunkedData,
+    number: int,
+    function: Callable,
+) -> Any:
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
     axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
@@ -195,19 +228,33 @@ def map_observations(part: Part, kind: Kind, prepared, laid: Laid, number: int, 
 
 
 @partial(jax.jit, static_argnums=(0, 1), inline=True)
-def map_blocks(function, by_row, blocks, measured, weight):
+def map_blocks(
+    function: Callable,
+    by_row: tuple[bool, ...],
+    blocks: tuple[Block, ...],
+    measured: PyTree[Float[Array, "chunks length"]],
+    weight: PyTree[Float[Array, "chunks length"]],
+) -> Any:
     """`map_observations` of blocks that are looked up."""
+    # Outer axis: chunks; inner: observations of a chunk, over which a row looked up by chunk is
+    # constant. Traced once for all parts of equal kinds and shapes.
     axes = tuple(0 if one else None for one in by_row)
     return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
 
 
-def look_up(columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]):
+def look_up(
+    columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]
+) -> PyTree[Float[Array, "..."]]:
     """The elements of every column at these (non-negative) indices of a plan."""
+    # Indices of a plan are in bounds by construction. Without the promise XLA compares and clamps
+    # each, and negative ones are counted from the end.
     there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
     return jax.tree.map(lambda column: column.at[at].get(**there), columns)
 
 
-def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
+def residuals(
+    declared: Declared, plan: Plan, values: Values, laid: ChunkedData
+) -> tuple[Float[Array, "chunks length r"], ...]:
     """Residuals divided by σ of every part, [chunks, length, r]."""
     prepared, found = prepare(declared, values), []
     for number, part in enumerate(plan.parts):
@@ -217,11 +264,14 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     return tuple(found)
 
 
-def restore_order(plan: Plan, parts) -> dict[str, Float[Array, "n ..."]]:
+def restore_order(
+    plan: Plan, parts: Iterable[Float[Array, "chunks length ..."]]
+) -> dict[str, Float[Array, "n ..."]]:
     """Quantities by observation of every part, by the name of its set, rows in the given
     order."""
     found: dict[str, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
+        # Observations of other parts of the set have the empty position, whose value is 0.
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]
         known = found.get(part.set_name)
         found[part.set_name] = flat if known is None else known + flat

@@ -11,10 +11,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxbundle.leastsquares.iterations.search import RegionState, gain_ratio
-from jaxbundle.leastsquares.iterations.stopping import LIMIT, Approach, Tolerance
+from jaxbundle.leastsquares.iterations.search import (
+    TRUST_REGION,
+    RegionState,
+    gain_ratio,
+)
+from jaxbundle.leastsquares.iterations.stopping import (
+    LIMIT,
+    STOPPING,
+    Approach,
+    StoppingSettings,
+    Tolerance,
+)
 
 
 class Loop(eqx.Module):
@@ -41,7 +51,8 @@ def iterate(
     start: PyTree,
     tolerance: Callable[[Any], Tolerance],
     max_steps: int | Int[Array, ""],
-    go: bool | Array = True,
+    go: bool | Bool[Array, ""] = True,
+    stopping: StoppingSettings = STOPPING,
 ) -> Loop:
     """Iterate from start values until a stopping criterion is met.
 
@@ -50,17 +61,17 @@ def iterate(
     - `linearise(x)`: the normal equations at x, a tree of arrays, and ½vᵀPv, not finite where it
       cannot be computed.
     - `step(equations, λ)`: the change δ = −(N + λ·D)⁻¹·g, and the numbers −gᵀδ and δᵀ·D·δ.
-    - `retract(x, δ)`: applies the change.
-    - `tolerance(equations)`: the tolerances.
-    - `go`: if false, nothing is done.
+    - `retract(x, δ)`: applies the change; `tolerance(equations)`: the tolerances.
+    - `go`: if false, nothing is done; `stopping`: when the damping is dropped.
     """
 
     def body(loop: Loop) -> Loop:
-        first = loop.steps == 0
-        trial_equations, trial_cost = linearise(loop.trial)
+        # The start is tried in the first pass: the program contains the linearisation once.
+        first, (trial_equations, trial_cost) = loop.steps == 0, linearise(loop.trial)
         noise = tolerance(loop.equations).noise(loop.cost)
         ratio = gain_ratio(loop.predicted, loop.cost - trial_cost, noise)
         accept, region = loop.region.after(first, ratio)
+        # N in every pass: under `vmap` a condition would compute both branches, too.
         at, equations, cost = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old),
             (loop.trial, trial_equations, trial_cost),
@@ -71,18 +82,12 @@ def iterate(
         )
         damping = 1 / step_size
         change, decrement, damped = step(equations, damping)
+        # A step that cannot be computed is no step; `judge` decides what it means.
         finite = jnp.isfinite(decrement)
         change = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), change)
+        costs = loop.cost, cost, trial_cost
         termination, approach = approach.judge(
-            tolerance(equations),
-            step_size,
-            finite,
-            decrement,
-            first,
-            accept,
-            loop.cost,
-            cost,
-            trial_cost,
+            tolerance(equations), step_size, finite, decrement, first, accept, *costs
         )
         return Loop(
             at=at,
@@ -97,22 +102,24 @@ def iterate(
             steps=loop.steps + 1,
         )
 
+    goes_on = lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go
+    return jax.lax.while_loop(goes_on, body, _begin(linearise, start, stopping))
+
+
+def _begin(linearise: Callable, start: PyTree, stopping: StoppingSettings) -> Loop:
+    """The state before the first pass, which accepts the start values."""
     equations, zero = jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linearise, start)
     )
-    return jax.lax.while_loop(
-        lambda loop: (loop.termination == LIMIT) & (loop.steps < max_steps) & go,
-        body,
-        Loop(
-            at=start,
-            trial=start,
-            equations=equations,
-            cost=zero,
-            predicted=zero,
-            step_size=jnp.full_like(zero, jnp.inf),
-            region=RegionState.begin(),
-            approach=Approach.begin(),
-            termination=jnp.asarray(LIMIT),
-            steps=jnp.asarray(0),
-        ),
+    return Loop(
+        at=start,
+        trial=start,
+        equations=equations,
+        cost=zero,
+        predicted=zero,
+        step_size=jnp.full_like(zero, jnp.inf),
+        region=RegionState.begin(TRUST_REGION),
+        approach=Approach.begin(stopping),
+        termination=jnp.asarray(LIMIT),
+        steps=jnp.asarray(0),
     )

@@ -22,9 +22,11 @@ def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[st
     for name, group in plan.groups.items():
         for member in group.members:
             part = change[name][:, member.start : member.start + member.width]
+            # Rows of the table that are in no group, held or in another group, do not change.
             if member.rows is not None:
                 rows = jax.tree.leaves(values[member.table])[0].shape[0]
                 part = jnp.zeros((rows, member.width)).at[member.rows].add(part)
+            # A table may be in two groups: eliminated rows, and those that are kept.
             known = found.get(member.table)
             found[member.table] = part if known is None else known + part
     return found

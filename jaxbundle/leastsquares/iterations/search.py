@@ -6,6 +6,10 @@ gradient, and N as a linear operator (`normal.Normal`). Unknowns are on manifold
 passed in the tangent space of the accepted one: `y` is zero, `y_eval` the step tried.
 """
 
+# Arguments that the interfaces of optimistix and lineax prescribe:
+# ruff: noqa: ARG002
+
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -19,12 +23,15 @@ from jaxbundle.choices import METHODS
 from jaxbundle.leastsquares.equations.damping import times
 from jaxbundle.leastsquares.equations.elimination import (
     FULL_PRECISION,
-    Factor,
+    NormalFactor,
     damp,
     factorise,
     solve,
 )
 from jaxbundle.leastsquares.equations.normal import Normal, Tangent, dot
+
+Evaluation = Any
+"""`optimistix.FunctionInfo.Eval` of the point tried, which is no class to a type checker."""
 
 
 class Info(optx.FunctionInfo.EvalGradHessian):
@@ -36,34 +43,33 @@ class Info(optx.FunctionInfo.EvalGradHessian):
     noise: Float[Array, ""]
 
 
-SUFFICIENT_DECREASE = 1e-3
-"""A step is accepted if it achieves this fraction of the predicted decrease."""
-LARGEST_RADIUS = 1e16
-"""Radius of the trust region beyond which damping is rounding."""
-UNDAMPED_DATUM = 1e8
-"""Steps with less damping need regularised datum directions."""
-INEXACT = 1e-2
-"""Relative residual of an iteratively solved reduced system, in the steps of the solver."""
-
-
 class Elimination(lx.AbstractLinearSolver):
-    """Solves with N by elimination, for any descent that takes a linear solver."""
+    """Solves with N by elimination, for any descent that takes a linear solver.
+
+    `regular`: with regularised datum directions; `tolerance`: relative residual of a reduced system
+    solved iteratively."""
 
     regular: bool | Bool[Array, ""] = True
     tolerance: float = eqx.field(static=True, default=FULL_PRECISION)
 
-    def init(self, operator: Normal, options: dict[str, Any]) -> Factor:
+    def init(self, operator: Normal, options: dict[str, Any]) -> NormalFactor:
         if not isinstance(operator, Normal):
             raise ValueError("Elimination solves with the normal equations of a plan only")
         return factorise(operator, self.regular, self.tolerance)
 
-    def compute(self, state: Factor, vector: Tangent, options: dict[str, Any]):
+    def compute(
+        self, state: NormalFactor, vector: Tangent, options: dict[str, Any]
+    ) -> tuple[Tangent, optx.RESULTS, dict[str, Any]]:
         return solve(state, vector), lx.RESULTS.successful, {}
 
-    def transpose(self, state: Factor, options: dict[str, Any]):
+    def transpose(
+        self, state: NormalFactor, options: dict[str, Any]
+    ) -> tuple[NormalFactor, dict[str, Any]]:
         return state, options
 
-    def conj(self, state: Factor, options: dict[str, Any]):
+    def conj(
+        self, state: NormalFactor, options: dict[str, Any]
+    ) -> tuple[NormalFactor, dict[str, Any]]:
         return state, options
 
     def assume_full_rank(self) -> bool:
@@ -71,9 +77,17 @@ class Elimination(lx.AbstractLinearSolver):
 
 
 class MarquardtDescent(optx.AbstractDescent):
-    """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped."""
+    """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped.
 
-    undamped: float = eqx.field(static=True, default=float("inf"))
+    - `regular_from`: step sizes from which the datum directions of a problem that may float are
+      regularised. Damping alone makes them regular before: λ·D exceeds rounding there.
+    - `inexact`: relative residual of a reduced system that is solved iteratively. The step need not
+      be exact: the next one is computed from the true residuals (inexact Newton: Dembo, Eisenstat
+      and Steihaug 1982).
+    """
+
+    regular_from: float = eqx.field(static=True, default=1e8)
+    inexact: float = eqx.field(static=True, default=1e-2)
 
     def init(self, y: Tangent, f_info_struct: Info) -> None:
         return None
@@ -81,11 +95,34 @@ class MarquardtDescent(optx.AbstractDescent):
     def query(self, y: Tangent, f_info: Info, state: None) -> Info:
         return f_info
 
-    def step(self, step_size: Float[Array, ""], state: Info):
+    def step(self, step_size: Float[Array, ""], state: Info) -> tuple[Tangent, Any]:
         damped = damp(state.hessian, 1 / step_size)
-        solver = Elimination(step_size > UNDAMPED_DATUM, INEXACT)
+        # Pins in damped steps too would hold single unknowns of the datum and bend the steps: 15
+        # evaluations on BAL 16 instead of 10.
+        solver = Elimination(step_size > self.regular_from, self.inexact)
         change = lx.linear_solve(damped, state.grad, solver, throw=False).value
         return jax.tree.map(jnp.negative, change), optx.RESULTS.successful
+
+
+@dataclasses.dataclass(frozen=True)
+class RegionSettings:
+    """The trust region.
+
+    - `initial`: its first radius 1/λ.
+    - `sufficient_decrease`: a step is accepted if its gain ratio exceeds this.
+    - `largest`: radius beyond which damping is rounding.
+    """
+
+    # The radius of Ceres' Levenberg–Marquardt (`initial_trust_region_radius`): λ = 1e-4 of the
+    # diagonal, nearly undamped. Nielsen's rule changes it threefold a step.
+    initial: float = 1e4
+    # Ceres' `min_relative_decrease`, too: any step that decreases vᵀPv more than by accident.
+    sufficient_decrease: float = 1e-3
+    # λ·D is then 1e-16 of N, below its rounding.
+    largest: float = 1e16
+
+
+TRUST_REGION = RegionSettings()
 
 
 class RegionState(eqx.Module):
@@ -93,33 +130,54 @@ class RegionState(eqx.Module):
 
     radius: Float[Array, ""]
     divisor: Float[Array, ""]
+    settings: RegionSettings = eqx.field(static=True, default=TRUST_REGION)
 
     @classmethod
-    def begin(cls, radius: float = 1e4) -> "RegionState":
-        return cls(jnp.asarray(radius), jnp.asarray(2.0))
+    def begin(cls, settings: RegionSettings) -> "RegionState":
+        """Before the first step."""
+        return cls(jnp.asarray(settings.initial), jnp.asarray(2.0), settings)
 
-    def after(self, first, gain_ratio) -> tuple[Bool[Array, ""], "RegionState"]:
-        """Whether a step with this gain ratio is accepted, and the next region: widened by the rule
-        of Nielsen (1999), narrowed by 2, 4, 8, …"""
-        accept = first | (gain_ratio > SUFFICIENT_DECREASE)
-        finite = jnp.minimum(self.radius, LARGEST_RADIUS)
+    def after(
+        self, first: Bool[Array, ""], gain_ratio: Float[Array, ""]
+    ) -> tuple[Bool[Array, ""], "RegionState"]:
+        """Whether a step with this gain ratio is accepted, and the next region.
+
+        With ρ the gain ratio (Nielsen 1999, IMM-REP-1999-05, there for λ = 1/radius):
+
+            accepted:   radius ← radius/max(1/3, 1 − (2ρ − 1)³)
+            rejected:   radius ← radius/2, then /4, /8, …
+
+        The cubic has no jumps at thresholds: steps that alternate about a threshold of the older
+        rules (Marquardt's factors 10) make the radius oscillate."""
+        rules = self.settings
+        accept = first | (gain_ratio > rules.sufficient_decrease)
+        finite = jnp.minimum(self.radius, rules.largest)
         growth = 1 / jnp.maximum(1 / 3, 1 - (2 * gain_ratio - 1) ** 3)
-        wider = jnp.minimum(finite * growth, LARGEST_RADIUS)
+        wider = jnp.minimum(finite * growth, rules.largest)
         radius = jnp.where(accept, wider, finite / self.divisor)
         radius = jnp.where(first, self.radius, radius)
-        return accept, RegionState(radius, jnp.where(accept, 2.0, 2.0 * self.divisor))
+        divisor = jnp.where(accept, 2.0, 2.0 * self.divisor)
+        return accept, RegionState(radius, divisor, rules)
 
 
 class NielsenTrustRegion(optx.AbstractSearch):
     """Accept steps that decrease vᵀPv, with a trust region by the rule of Nielsen
     (`RegionState`)."""
 
-    initial: float = 1e4
+    settings: RegionSettings = eqx.field(static=True, default=TRUST_REGION)
 
     def init(self, y: Tangent, f_info_struct: Info) -> RegionState:
-        return RegionState.begin(self.initial)
+        return RegionState.begin(self.settings)
 
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
+    def step(
+        self,
+        first_step: Bool[Array, ""],
+        y: Tangent,
+        y_eval: Tangent,
+        f_info: Info,
+        f_eval_info: Evaluation,
+        state: RegionState,
+    ) -> tuple[Float[Array, ""], Bool[Array, ""], Any, RegionState]:
         change = jax.tree.map(jnp.subtract, y_eval, y)
         predicted = predicted_decrease(f_info, change)
         decrease = f_info.as_min() - f_eval_info.as_min()
@@ -133,7 +191,15 @@ class FullStep(optx.AbstractSearch):
     def init(self, y: Tangent, f_info_struct: Info) -> None:
         return None
 
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: None):
+    def step(
+        self,
+        first_step: Bool[Array, ""],
+        y: Tangent,
+        y_eval: Tangent,
+        f_info: Info,
+        f_eval_info: Evaluation,
+        state: None,
+    ) -> tuple[Float[Array, ""], Bool[Array, ""], Any, None]:
         return jnp.asarray(jnp.inf), jnp.asarray(True), optx.RESULTS.successful, None
 
 
@@ -146,15 +212,23 @@ def predicted_decrease(info: Info, change: Tangent) -> Float[Array, ""]:
     """The decrease of ½vᵀPv that the linearised residuals predict for a damped step,
     ½(−gᵀδ + λ·δᵀDδ)."""
     plan, D = info.hessian.plan, info.hessian.blocks.damping_matrix
+    # ½(vᵀPv − v̂ᵀPv̂) of the linearised residuals v̂ = v + J·δ: with (N + λD)·δ = −g the terms in N
+    # cancel, so that no product with N is needed.
     damped = info.damping * dot(plan, change, times(D, change))
     return 0.5 * (damped - dot(plan, info.grad, change))
 
 
-def gain_ratio(predicted, decrease, noise) -> Float[Array, ""]:
+def gain_ratio(
+    predicted: Float[Array, ""], decrease: Float[Array, ""], noise: Float[Array, ""]
+) -> Float[Array, ""]:
     """The decrease of ½vᵀPv as a fraction of the predicted one; −1 if it is not finite.
 
     A prediction below rounding counts as achieved unless the sum of squares visibly grows.
     """
+    # Without the last rule the final steps, whose decrease rounding makes negative as often as
+    # positive, are rejected by chance: λ grows until the problem is stuck at its minimum.
+    # A residual that is not finite, as of a point behind a camera, makes the ratio −1: rejected,
+    # and the radius shrinks until the step stays in the domain.
     ratio = jnp.where(predicted > 0, decrease / predicted, -1.0)
     ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
     below_rounding = (predicted > 0) & (predicted < noise) & (decrease > -noise)

@@ -16,18 +16,17 @@ import jax.numpy as jnp
 from jax import Array
 from jax.lax import stop_gradient
 from jax.scipy.linalg import cho_factor, cho_solve
-from jaxtyping import Float, PyTree
+from jaxtyping import Bool, Float, PyTree
 
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.iterations.loop import iterate
 from jaxbundle.leastsquares.iterations.stopping import Tolerance
 
 SMALLEST_EIGENVALUE = 1e-10
-"""Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem."""
-MOST_EVALUATIONS = 30
-"""Evaluations."""
-LAST_STEP = 1e-8
-"""The last step moves no unknown by more than this fraction of its σ; an undamped step follows."""
+"""Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem: some
+combination of unknowns changes the residuals 1e-5 times as much as one of them alone. Rounding
+leaves 1e-15, so that a thousand times less would still be found; but start values so weak lead to
+no adjustment."""
 
 
 class Fit(eqx.Module):
@@ -42,18 +41,18 @@ class Fit(eqx.Module):
     weakest: Float[Array, ""]
 
     @property
-    def determined(self):
+    def determined(self) -> Bool[Array, ""]:
         return self.weakest > SMALLEST_EIGENVALUE
 
 
 def adjust(
     residuals: Callable,
     retract: Callable,
-    start,
+    start: PyTree[Float[Array, "..."]],
     data: tuple,
     unknowns: int,
-    steps=MOST_EVALUATIONS,
-):
+    steps: int = 30,
+) -> Fit:
     """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
     estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
     return finish(residuals, retract, estimate, data, unknowns)
@@ -62,40 +61,52 @@ def adjust(
 def minimise(
     residuals: Callable,
     retract: Callable,
-    start,
+    start: PyTree[Float[Array, "..."]],
     data: tuple,
     unknowns: int,
-    steps=MOST_EVALUATIONS,
-):
+    steps: int = 30,
+) -> tuple[PyTree[Float[Array, "..."]], Float[Array, ""]]:
     """The estimate at the end of the iterations, and its vᵀv, without derivatives.
 
     **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum
-    evaluations.
+    evaluations. Starts are those of closed forms, a few steps away; a hopeless one is given up
+    at 30, because under `vmap` all others wait for it.
     """
     start, data = stop_gradient((start, data))
 
-    def linearise(x):
+    def linearise(x: PyTree[Float[Array, "..."]]) -> tuple[tuple, Float[Array, ""]]:
         N, g, v = _linearise(residuals, retract, x, data, unknowns)
+        # NaN as cost lets the trust region reject the step.
         there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
         return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
 
-    def step(equations, damping):
+    def step(
+        equations: tuple, damping: Float[Array, ""]
+    ) -> tuple[Float[Array, " u"], Float[Array, ""], Float[Array, ""]]:
         N, g, _ = equations
         D = jnp.diag(N)
+        # An unknown without observations: any damping will do.
         D = jnp.where(D > 0, D, 1.0)
         change = -_solve(N + damping * jnp.diag(D), g)
         return change, -g @ change, D @ change**2
 
-    def tolerance(equations):
+    def tolerance(equations: tuple) -> Tolerance:
+        # The last step moves no unknown by more than 1e-8 of its σ; `finish` takes one more.
         N, _, rows = equations
         zero = jnp.zeros((), N.dtype)
-        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + LAST_STEP, zero)
+        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + 1e-8, zero)
 
     loop = iterate(linearise, step, retract, start, tolerance, steps)
     return loop.at, jnp.where(jnp.isfinite(loop.cost), 2 * loop.cost, jnp.inf)
 
 
-def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknowns: int) -> Fit:
+def finish(
+    residuals: Callable,
+    retract: Callable,
+    estimate: PyTree[Float[Array, "..."]],
+    data: tuple,
+    unknowns: int,
+) -> Fit:
     """The last step, without damping, the derivatives and the cofactors."""
     x, held = stop_gradient((estimate, data))
     N, g = normal_equations(residuals, retract, x, held, unknowns)
@@ -104,6 +115,7 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     scaled = N * scale * scale[:, None]
     weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
     determined = weakest > SMALLEST_EIGENVALUE
+    # The inverse of a singular N is NaN, and so would be its derivatives, selected or not.
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
@@ -113,6 +125,7 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     x = retract(x, jnp.where(good, step, 0))
     still = jnp.zeros(unknowns, step.dtype)
     fixed = (residuals, retract, x)
+    # The step here is zero; it carries the derivatives of the minimum by the data.
     x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
     N, _ = normal_equations(residuals, retract, x, data, unknowns)
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
@@ -120,21 +133,34 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     return Fit(x, square(x, data), cofactor, weakest)
 
 
-def _half_gradient(delta, fixed, data):
+def _half_gradient(delta: Float[Array, " u"], fixed: tuple, data: tuple) -> Float[Array, " u"]:
     """∂(½vᵀv)/∂δ after a step δ from the estimate."""
     residuals, retract, x = fixed
     return jax.grad(lambda delta: 0.5 * jnp.sum(residuals(retract(x, delta), *data) ** 2))(delta)
 
 
-def normal_equations(residuals, retract, x, data, unknowns):
+def normal_equations(
+    residuals: Callable,
+    retract: Callable,
+    x: PyTree[Float[Array, "..."]],
+    data: tuple,
+    unknowns: int,
+) -> tuple[Float[Array, "u u"], Float[Array, " u"]]:
     """N = JᵀJ and Jᵀv at x."""
     return _linearise(residuals, retract, x, data, unknowns)[:2]
 
 
-def _linearise(residuals, retract, x, data, unknowns):
+def _linearise(
+    residuals: Callable,
+    retract: Callable,
+    x: PyTree[Float[Array, "..."]],
+    data: tuple,
+    unknowns: int,
+) -> tuple[Float[Array, "u u"], Float[Array, " u"], Float[Array, " n"]]:
     """N = JᵀJ, Jᵀv and v at x."""
 
-    def twice(delta):
+    # `has_aux` returns v beside J: one evaluation instead of two.
+    def twice(delta: Float[Array, " u"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         v = residuals(retract(x, delta), *data)
         return v, v
 
@@ -148,7 +174,7 @@ def inverse(N: Float[Array, "u u"]) -> Float[Array, "u u"]:
     return _solve(N, jnp.eye(N.shape[0], dtype=N.dtype))
 
 
-def _solve(N, g):
+def _solve(N: Float[Array, "u u"], g: Float[Array, "u *k"]) -> Float[Array, "u *k"]:
     """N⁻¹·g with N scaled to a unit diagonal; not finite if N is not positive definite."""
     diagonal = jnp.diag(N)
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))

@@ -5,15 +5,18 @@ descent computes the next one, and `stopping` decides. Residuals, Jacobian and n
 formed once per accepted point; a rejected step costs a factorisation and the residuals.
 """
 
+# Arguments that the interfaces of optimistix prescribe:
+# ruff: noqa: ARG002
+
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxbundle.leastsquares.equations.normal import (
     Normal,
@@ -26,9 +29,9 @@ from jaxbundle.leastsquares.equations.normal import (
 )
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
+    ChunkedData,
     Data,
     Declared,
-    Laid,
     Values,
     lay_out_data,
     residuals,
@@ -44,7 +47,9 @@ from jaxbundle.leastsquares.iterations.stopping import (
     LIMIT,
     NOT_FINITE,
     SETTLED,
+    STOPPING,
     Approach,
+    StoppingSettings,
     Tolerance,
 )
 from jaxbundle.system.programs import compile_once
@@ -57,7 +62,13 @@ class History(eqx.Module):
     damping: Float[Array, " steps"]
     accepted: Bool[Array, " steps"]
 
-    def with_row(self, i, cost, damping, accepted) -> "History":
+    def with_row(
+        self,
+        i: Int[Array, ""],
+        cost: Float[Array, ""],
+        damping: Float[Array, ""],
+        accepted: Bool[Array, ""],
+    ) -> "History":
         return History(
             self.cost.at[i].set(cost),
             self.damping.at[i].set(damping),
@@ -65,7 +76,7 @@ class History(eqx.Module):
         )
 
 
-class Known(eqx.Module):
+class Linearisation(eqx.Module):
     """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the next step."""
 
     cost: Float[Array, ""]
@@ -74,11 +85,11 @@ class Known(eqx.Module):
     damping: Float[Array, ""]
 
 
-class State(eqx.Module):
+class SolverState(eqx.Module):
     """The loop state besides the accepted unknowns: the quantities there, and the step to try."""
 
     first: Bool[Array, ""]
-    known: Known
+    known: Linearisation
     change: Tangent
     trial: Values
     step_size: Float[Array, ""]
@@ -96,7 +107,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     **Arguments:** `descent` and `search`: ours or optimistix's (those without memory of earlier
     points); `retract(plan, values, change)`: applies a change; `max_steps`: maximum evaluations,
     and `rows` of the history, which are compiled in; `progress(step, cost, λ)` is called on the
-    host after every evaluation.
+    host after every evaluation; `stopping`: when the damping is dropped.
     """
 
     declared: Declared
@@ -108,60 +119,82 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     max_steps: int | Int[Array, ""] = 100
     rows: int = eqx.field(static=True, default=128)
     progress: Callable | None = eqx.field(static=True, default=None)
+    stopping: StoppingSettings = eqx.field(static=True, default=STOPPING)
     rtol: ClassVar[float] = 0.0
     atol: ClassVar[float] = 0.0
     norm: ClassVar[Callable] = staticmethod(optx.max_norm)
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> State:
+    def init(
+        self,
+        fn: Callable[[Values, ChunkedData], Any],
+        y: Values,
+        args: ChunkedData,
+        options: dict[str, Any],
+        f_struct: PyTree[jax.ShapeDtypeStruct],
+        aux_struct: PyTree[jax.ShapeDtypeStruct],
+        tags: frozenset[object],
+    ) -> SolverState:
         struct = eqx.filter_eval_shape(self._linearise, y, args)
         info = eqx.filter_eval_shape(self._info, struct)
         zero, rows = zero_tangent(self.plan), self.rows
         nothing = jnp.full(rows, jnp.nan)
-        return State(
+        return SolverState(
             first=jnp.asarray(True),
-            known=_zeros(struct),
+            known=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct),
             change=zero,
             trial=y,
             step_size=jnp.asarray(jnp.inf),
             descent=self.descent.init(zero, info),
             search=self.search.init(zero, info),
-            approach=Approach.begin(),
+            approach=Approach.begin(self.stopping),
             termination=jnp.asarray(LIMIT),
             steps=jnp.asarray(0),
             history=History(nothing, nothing, jnp.zeros(rows, bool)),
         )
 
-    def step(self, fn, y, args, options, state: State, tags):
+    def step(
+        self,
+        fn: Callable[[Values, ChunkedData], Any],
+        y: Values,
+        args: ChunkedData,
+        options: dict[str, Any],
+        state: SolverState,
+        tags: frozenset[object],
+    ) -> tuple[Values, SolverState, Any]:
         before, zero = self._info(state.known), zero_tangent(self.plan)
         residual, aux = fn(state.trial, args)
+        # The residuals of the trial point alone: its Jacobian only if it is accepted.
         trial = optx.FunctionInfo.Eval(half_square(self.plan, residual))
         step_size, accept, _, search = self.search.step(
             state.first, zero, state.change, before, trial, state.search
         )
         predicted = predicted_decrease(before, state.change)
         ratio = gain_ratio(predicted, before.f - trial.f, before.noise)
-        y, known = self._accepted_point(accept, y, args, state)
+        # N is formed again at accepted points only: a rejected step costs residuals and a solution.
+        y, known = jax.lax.cond(
+            accept,
+            lambda: (state.trial, self._linearise(state.trial, args)),
+            lambda: (y, state.known),
+        )
         step_size, approach = state.approach.choose_step(
             step_size, state.step_size, state.first, accept, predicted, ratio, known.cost
         )
         change, finite = self._next_change(known, step_size, state.descent)
+        # d² = −gᵀδ; for an undamped step δᵀNδ.
+        costs = before.f, known.cost, trial.f
+        decrement = -dot(self.plan, known.gradient, change)
         termination, approach = approach.judge(
-            self.tolerance,
-            step_size,
-            finite,
-            -dot(self.plan, known.gradient, change),
-            state.first,
-            accept,
-            before.f,
-            known.cost,
-            trial.f,
+            self.tolerance, step_size, finite, decrement, state.first, accept, *costs
         )
         following = self.retract(self.plan, y, change)
+        # A settled step is taken without being tried: it moves nothing by more than `atol` σ, and
+        # its error is the square of that.
         y = jax.tree.map(lambda a, b: jnp.where(termination == SETTLED, b, a), y, following)
-        self._report(state, trial.f)
+        if self.progress is not None:
+            jax.debug.callback(self.progress, state.steps, trial.f, 1 / state.step_size)
         return (
             y,
-            State(
+            SolverState(
                 first=jnp.asarray(False),
                 known=dataclasses.replace(known, damping=1 / step_size),
                 change=change,
@@ -177,11 +210,29 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
             aux,
         )
 
-    def terminate(self, fn, y, args, options, state: State, tags):
+    def terminate(
+        self,
+        fn: Callable[[Values, ChunkedData], Any],
+        y: Values,
+        args: ChunkedData,
+        options: dict[str, Any],
+        state: SolverState,
+        tags: frozenset[object],
+    ) -> tuple[Bool[Array, ""], Any]:
         ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
         return ended, optx.RESULTS.successful
 
-    def postprocess(self, fn, y, aux, args, options, state: State, tags, result):
+    def postprocess(
+        self,
+        fn: Callable[[Values, ChunkedData], Any],
+        y: Values,
+        aux: Any,
+        args: ChunkedData,
+        options: dict[str, Any],
+        state: SolverState,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Values, Any, dict[str, Any]]:
         # optimistix ends the loop at non-finite unknowns before any step.
         termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
         stats = {
@@ -191,39 +242,33 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         }
         return y, aux, stats
 
-    def _linearise(self, values: Values, laid: Laid) -> Known:
+    def _linearise(self, values: Values, laid: ChunkedData) -> Linearisation:
         equations = normal_equations(self.declared, self.plan, values, laid)
-        return Known(*equations, damping=jnp.asarray(0.0))
+        return Linearisation(*equations, damping=jnp.asarray(0.0))
 
-    def _info(self, known: Known) -> Info:
+    def _info(self, known: Linearisation) -> Info:
         """The information passed to searches and descents."""
         normal, noise = Normal(self.plan, known.normal), self.tolerance.noise(known.cost)
         return Info(known.cost, known.gradient, normal, known.damping, noise)
 
-    def _accepted_point(self, accept, y, args, state: State):
-        """The last accepted point and its quantities: the one tried, or the old one."""
-        return jax.lax.cond(
-            accept,
-            lambda: (state.trial, self._linearise(state.trial, args)),
-            lambda: (y, state.known),
-        )
-
-    def _next_change(self, known: Known, step_size, descent_state):
+    def _next_change(
+        self, known: Linearisation, step_size: Float[Array, ""], descent_state: Any
+    ) -> tuple[Tangent, Bool[Array, ""]]:
         """The descent's step from the accepted point, zero if it cannot be computed."""
         asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
         change, _ = self.descent.step(step_size, asked)
+        # All devices must agree, or they take different branches and wait for each other forever.
         finite = total(self.plan, 1 - _all_finite(change).astype(int)) == 0
         return jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change), finite
-
-    def _report(self, state: State, cost):
-        if self.progress is not None:
-            jax.debug.callback(self.progress, state.steps, cost, 1 / state.step_size)
 
 
 class NoAdjoint(optx.AbstractAdjoint):
     """Run the loop without derivatives: they are attached to its result (`derivatives.py`)."""
 
-    def apply(self, primal_fn, rewrite_fn, inputs, tags):
+    def apply(
+        self, primal_fn: Callable, rewrite_fn: Callable, inputs: tuple, tags: frozenset[object]
+    ) -> Any:
+        # optimistix passes its own loop, which is bounded so that it can be differentiated.
         loop = lambda cond, body, init, max_steps: jax.lax.while_loop(cond, body, init)
         return primal_fn((*inputs, loop))
 
@@ -256,14 +301,10 @@ find = compile_once(minimise)
 """`minimise`, compiled once for all callers."""
 
 
-def half_square(plan: Plan, residual) -> Float[Array, ""]:
+def half_square(plan: Plan, residual: Iterable[Float[Array, "..."]]) -> Float[Array, ""]:
     """½·vᵀPv of all devices."""
     return total(plan, 0.5 * sum((jnp.vdot(r, r) for r in residual), jnp.zeros(())))
 
 
-def _zeros(struct):
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
-
-
-def _all_finite(tree) -> Bool[Array, ""]:
+def _all_finite(tree: PyTree) -> Bool[Array, ""]:
     return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()

@@ -13,7 +13,7 @@ problem that may float they refer to the datum by the S-transformation Q ← S·
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.datum.conditions import (
     contract,
@@ -21,10 +21,15 @@ from jaxbundle.leastsquares.datum.conditions import (
     s_transform_transposed,
     zeros_of_tables,
 )
-from jaxbundle.leastsquares.equations.elimination import Factor, solve, sum_over_pairs
+from jaxbundle.leastsquares.equations.elimination import (
+    Incident,
+    NormalFactor,
+    solve,
+    sum_over_pairs,
+)
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.equations.reduced import Reduced
-from jaxbundle.leastsquares.indexing.plan import Plan
+from jaxbundle.leastsquares.indexing.plan import IncidencePairs, Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.types import present
 
@@ -46,15 +51,21 @@ class Cofactors(eqx.Module):
 
 
 def cofactors(
-    declared: Declared, values: Values, factor: Factor, moves: Tangent | None = None
+    declared: Declared, values: Values, factor: NormalFactor, moves: Tangent | None = None
 ) -> Cofactors:
     """All cofactor blocks of a solved problem; `moves`: the generators, if known."""
     plan = factor.plan
-    Q = _without_held(plan, factor.inverse())
+    # Takahashi's blocks, or all of them where S is dense; the full Q of eliminated rows (3 × 22 106
+    # on BAL 16) is never formed.
+    Q = factor.inverse()
+    # Held unknowns had ones in S.
+    mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
+    Q = Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
     eliminated, coupled = None, {}
     own = dict(Q.own)
     if plan.eliminated is not None:
         K, L = _couplings(factor, Q), present(factor.lower_inverse)
+        # L⁻ᵀ·(1 + K·Zᵀ)·L⁻¹: V⁻¹, and what the uncertainty of the kept rows adds.
         inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():
             at = plan.incidences[g].eliminated.ravel()
@@ -69,13 +80,7 @@ def cofactors(
     return Cofactors(own, Q, eliminated, coupled, factor.lower_inverse)
 
 
-def _without_held(plan: Plan, Q: Reduced) -> Reduced:
-    """The inverse of S, with zeros for held unknowns, where S had ones."""
-    mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
-    return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
-
-
-def _couplings(factor: Factor, Q: Reduced):
+def _couplings(factor: NormalFactor, Q: Reduced) -> Incident:
     """K of every incidence."""
     plan, Z = factor.plan, factor.Z
     K = {g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()}
@@ -96,12 +101,26 @@ def _couplings(factor: Factor, Q: Reduced):
     return {g: flat[g].reshape(k.shape) for g, k in K.items()}
 
 
-def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
+def _spread(
+    pairs: IncidencePairs,
+    a: Float[Array, "places e w"],
+    b: Float[Array, "places e v"],
+    Q: Float[Array, "blocks w v"],
+    to_first: Float[Array, "places e w"],
+    to_second: Float[Array, "places e v"],
+    within: bool,
+) -> tuple[Float[Array, "places e w"], Float[Array, "places e v"]]:
     """Add b·Qᵀ to the first total for every partner b of its row, and a·Q to the second; Q is the
     block of each pair. `within`: the two totals are the same."""
     totals = (to_first,) if within else (to_first, to_second)
 
-    def add(totals, i, j, k):
+    def add(
+        totals: tuple[Array, ...],
+        i: Int[Array, "chunks length"],
+        j: Int[Array, "chunks length"],
+        k: Int[Array, " chunks"],
+    ) -> tuple[Array, ...]:
+        # Both incidences of a pair get the other's share: K_i gains Z_j·Qᵀ, K_j Z_i·Q.
         forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
         back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
         if within:
@@ -113,25 +132,35 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
     return totals[0], totals[0 if within else 1]
 
 
-def _in_datum(declared, values, factor, own, moves):
+def _in_datum(
+    declared: Declared, values: Values, factor: NormalFactor, own: Tangent, moves: Tangent | None
+) -> Tangent:
     """The diagonal blocks in the datum of the problem: S·Q·Sᵀ."""
     plan = factor.plan
     if plan.datum is None:
         return own
+    # S·Q·Sᵀ = Q − G·(M·BᵀQ) − (Q·B·Mᵀ)·Gᵀ + G·M·BᵀQB·Mᵀ·Gᵀ, M = (BᵀG)⁻¹: d solutions with the
+    # factor instead of the whole Q.
     G, B = datum_directions(declared, plan, values, moves)
     H = jax.vmap(lambda b: solve(factor, b), -1, -1)(B)
     M = jnp.linalg.inv(contract(plan, B, G))
     A = {g: h @ M.T for g, h in H.items()}
     C = M @ contract(plan, B, A)
 
-    def moved(Q, g, a):
+    def moved(
+        Q: Float[Array, "rows w w"],
+        g: Float[Array, "rows w defect"],
+        a: Float[Array, "rows w defect"],
+    ) -> Float[Array, "rows w w"]:
         cross = jnp.einsum("nik,njk->nij", g, a)
         return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
 
     return {name: moved(Q, G[name], A[name]) for name, Q in own.items()}
 
 
-def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
+def blocks_of_tables(
+    declared: Declared, plan: Plan, own: Tangent, values: Values
+) -> dict[str, Float[Array, "rows width width"]]:
     """`Cofactors.own` by table rows; zero for held unknowns."""
     empty = zeros_of_tables(declared, values)
     found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
@@ -143,7 +172,11 @@ def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
 
 
 def propagate(
-    declared: Declared, values: Values, factor: Factor, rows: Tangent, moves: Tangent | None = None
+    declared: Declared,
+    values: Values,
+    factor: NormalFactor,
+    rows: Tangent,
+    moves: Tangent | None = None,
 ) -> Float[Array, "f f"]:
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve per function."""

@@ -1,4 +1,4 @@
-"""Derivatives of the solution with respect to all data.
+"""The differentiable solution, `solve`: adjusted tables as a function of all data.
 
 At the minimum, g(y, θ) = ∂(½vᵀPv)/∂y = 0. By the implicit function theorem
 
@@ -19,12 +19,14 @@ depend on the order of differentiation and is refused. Weights enter it as in J�
 """
 
 import dataclasses
-from typing import Literal, get_args
+from collections.abc import Callable
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import integer, one_of, positive
 from jaxbundle.implicit import derivative_along, differentiable_once, implicit_root
@@ -63,7 +65,7 @@ def solve(
     sensitivity: Sensitivity = "exact",
     max_iterations: int = 100,
     atol: float = 1e-7,
-    **options,
+    **options: Any,
 ) -> Values:
     """Adjusted tables as a differentiable function of the observations and all other data.
 
@@ -99,7 +101,7 @@ def solve(
     return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), found)
 
 
-class Linearised(eqx.Module):
+class LinearisedSolution(eqx.Module):
     """The problem at a solution, as a constant for the derivative rules. `pins`: the penalty on
     changes of the kept unknowns, in units of g (none if nothing is open)."""
 
@@ -107,7 +109,7 @@ class Linearised(eqx.Module):
     plan: Plan
     values: Values
     data: Data
-    factor: elimination.Factor
+    factor: elimination.NormalFactor
     pins: Tangent
 
     def hold_given(self, data: Data) -> Values:
@@ -118,9 +120,10 @@ class Linearised(eqx.Module):
             for name, space in self.declared.named_spaces
         }
 
-    def residuals(self, change: Tangent, data: Data):
+    def residuals(self, change: Tangent, data: Data) -> tuple[Float[Array, "chunks length r"], ...]:
         """v/σ after a change of the unknowns."""
         plan, laid = fill_places(self.plan, lay_out_data(self.plan, data))
+        # Changes of held unknowns have no effect, so that their gradients are zero, not undefined.
         change = {name: x * plan.groups[name].free for name, x in change.items()}
         return residuals(self.declared, plan, self.move(change, data), laid)
 
@@ -153,7 +156,7 @@ def attach_derivatives(
 
 def linearise(
     declared: Declared, plan: Plan, values: Values, data: Data, exact: bool
-) -> Linearised:
+) -> LinearisedSolution:
     """With the factor of the exact Hessian, or of JᵀPJ."""
     equations = exact_equations if exact else normal_equations
     laid = lay_out_data(plan, data)
@@ -162,20 +165,22 @@ def linearise(
     datum = plan.datum if plan.reduction in FACTORS else None
     pins, own = {} if datum is None else datum.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
-    return Linearised(declared, plan, values, data, elimination.factorise(normal), pins)
+    return LinearisedSolution(declared, plan, values, data, elimination.factorise(normal), pins)
 
 
-def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def gradient_after(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
     """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
-    def penalised(change):
+    def penalised(change: Tangent) -> Float[Array, ""]:
+        # As many unknowns as the defect cannot change: H is regular; the motion into the datum
+        # follows.
         penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
         return half_square(at.plan, at.residuals(change, data)) + 0.5 * penalty
 
     return jax.grad(penalised)(change)
 
 
-def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
+def _solve_structured(times: Callable, at: LinearisedSolution, b: Tangent) -> Tangent:
     """H⁻¹·b by the factor, differentiable as the solution of H·x = b.
 
     Refined once with the residual, computed without N: like the corrected seminormal equations
@@ -187,7 +192,7 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
     flat = lambda tree: ravel_pytree(tree)[0]
     factor = lambda b: flat(elimination.solve(at.factor, unravel(b)))
 
-    def improved(times, b):
+    def improved(times: Callable, b: Float[Array, " n"]) -> Float[Array, " n"]:
         x = factor(b)
         return x + factor(b - times(x)) if at.plan.reduction in FACTORS else x
 
@@ -196,17 +201,17 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
 
 
 @eqx.filter_custom_jvp
-def _propagate(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def _propagate(change: Tangent, at: LinearisedSolution, data: Data) -> Tangent:
     """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
 
 @_propagate.def_jvp
-def _(primals, tangents):
+def _(primals: tuple, tangents: tuple) -> tuple[Tangent, Tangent]:
     change, at, data = primals
     data, still = differentiable_once(data, FIRST_ORDER_ONLY), zero_tangent(at.plan)
 
-    def right(data):
+    def right(data: Data) -> Tangent:
         # J is constant except for its weights.
         constant = dataclasses.replace(at.data, weight=data.weight)
         transposed = jax.vjp(lambda change: at.residuals(change, constant), still)[1]
@@ -219,7 +224,7 @@ def _(primals, tangents):
     return change, jax.tree.map(jnp.add, into, start)
 
 
-def _change_of_start(at: Linearised, data: Data) -> Tangent:
+def _change_of_start(at: LinearisedSolution, data: Data) -> Tangent:
     """The difference of the datum start values from those at the solution."""
     moved = datum.zeros_of_tables(at.declared, at.values)
     for name in () if at.plan.datum is None else at.plan.datum.weight:

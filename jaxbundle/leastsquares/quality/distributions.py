@@ -3,10 +3,11 @@
 import functools
 import importlib
 import math
+from types import ModuleType
 
 
 @functools.cache
-def _special():
+def _special() -> ModuleType:
     """scipy's functions, imported (a tenth of a second) only if needed."""
     return importlib.import_module("scipy.special")
 

@@ -60,7 +60,7 @@ def precision(
         raise InputError("precision: the problem is too large for its covariance; use a part of it")
     declared, plan, data = problem.declared, problem.plan, complete_data(problem, data)
 
-    def functions(change):
+    def functions(change: Tangent) -> Float[Array, " functions"]:
         return jnp.ravel(
             present(of)(without_filling(problem, retract(declared, plan, data.start, change)))
         )

@@ -19,54 +19,48 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.datum.conditions import attach_motion
-from jaxbundle.leastsquares.equations.elimination import Factor, solve
+from jaxbundle.leastsquares.equations.elimination import NormalFactor, solve
 from jaxbundle.leastsquares.equations.normal import Tangent, dot, zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, restore_order
 from jaxbundle.leastsquares.iterations.solver import half_square
-from jaxbundle.leastsquares.quality.derivatives import Linearised, gradient_after
+from jaxbundle.leastsquares.quality.derivatives import LinearisedSolution, gradient_after
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
-
-CHANGES_AT_ONCE = 16
-"""Changes handled by one call of the program."""
-REACHED, ENOUGH = 1e-11, 1e-6
-"""Relative residual (norm of N⁻¹) at which conjugate gradients stop, and that a result has."""
-MOST_STEPS = 50
 
 Change = Sequence[tuple[str, int, PyTree]]
 """A change of data: table, row, and the change of the row's value."""
 
 
-def follow(found: Solution, changes: Sequence[Change]) -> Iterator[Values]:
+def follow(found: Solution, changes: Sequence[Change], at_once: int = 16) -> Iterator[Values]:
     """The response of all tables to each change of held quantities: tangents of the values of every
-    row, [≤ AT_ONCE, rows, …], some changes at a time, exact to first order.
+    row, [≤ `at_once`, rows, …], some changes at a time, exact to first order.
+
+    One program handles `at_once` changes in turn, the last ones padded with zeros; more at once
+    save calls of milliseconds and need memory for the tables of each.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.given
+    declared, plan, values, data = found.arguments
     still = jax.tree.map(np.asarray, values)
-    for first in range(0, len(changes), CHANGES_AT_ONCE):
-        some = changes[first : first + CHANGES_AT_ONCE]
-        held = jax.tree.map(lambda x: np.zeros((CHANGES_AT_ONCE, *x.shape)), still)
+    for first in range(0, len(changes), at_once):
+        some = changes[first : first + at_once]
+        held = jax.tree.map(lambda x: np.zeros((at_once, *x.shape)), still)
         for k, change in enumerate(some):
             for table, row, amount in change:
-                jax.tree.map(lambda x, a, k=k, row=row: _add(x, k, row, a), held[table], amount)
+                add = lambda x, a, k=k, row=row: np.add.at(x, (k, row), a)
+                jax.tree.map(add, held[table], amount)
         followed, left = _follow(declared, plan, values, data, found.factor, held)
-        _require(left)
+        _require_converged(left)
         real = {t.name: np.s_[: len(some), : t.rows] for t in found.problem.tables}
         yield {
             name: jax.tree.map(lambda x, at=at: np.asarray(x)[at], followed[name])
             for name, at in real.items()
         }
-
-
-def _add(x, k, row, amount):
-    x[k, row] += amount
 
 
 def pull_back(
@@ -79,7 +73,7 @@ def pull_back(
     have one number per residual, the residual is changed.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
-    declared, plan, values, data = found.given
+    declared, plan, values, data = found.arguments
     problem, number = found.problem, len(next(iter(functions.values())))
     size = {t.name: problem.sizes["table", t.name] for t in problem.tables}
     wide = lambda t, x: np.pad(x, ((0, 0), (0, size[t] - x.shape[1]), (0, 0)))
@@ -90,7 +84,7 @@ def pull_back(
         )
         for k in range(number)
     ]
-    _require(np.array([left for _, _, left in pulled]))
+    _require_converged(np.array([left for _, _, left in pulled]))
     effects = {}
     for given in problem.observations:
         o = given.name
@@ -105,9 +99,11 @@ def pull_back(
     return effects
 
 
-def _require(left) -> None:
+def _require_converged(left: Float[AnyArray, " k"], max_residual: float = 1e-6) -> None:
+    """Refuse equations that were not solved: six digits are more than anyone reads of a
+    derivative, and a problem that is no clear minimum does not come near them."""
     worst = float(np.max(np.asarray(left), initial=0.0))
-    if not worst < ENOUGH:
+    if not worst < max_residual:
         raise NotSolvedError(
             "derivatives of the solution were not found: its residuals are so large, or so curved, "
             "that it is not a clear minimum"
@@ -115,35 +111,39 @@ def _require(left) -> None:
 
 
 @compile_once
-def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, held):
-    at = Linearised(declared, plan, values, data, factor, {})
+def _follow(
+    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, held: Values
+) -> tuple[Values, Float[Array, " changes"]]:
+    at = LinearisedSolution(declared, plan, values, data, factor, {})
     still = zero_tangent(plan)
 
-    def one(held):
+    def follow_one(held: Values) -> tuple[Values, Float[Array, ""]]:
         x, left = _solve(at, still, held)
         moved = lambda change, start: _in_datum(at, change, start)
         return jax.jvp(moved, (still, data.start), (x, held))[1], left
 
-    return jax.lax.map(one, held)
+    return jax.lax.map(follow_one, held)
 
 
 @compile_once
-def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
+def _pull_back(
+    declared: Declared, plan: Plan, values: Values, data: Data, factor: NormalFactor, rows: Tangent
+) -> tuple[PyTree, dict[str, Array], Float[Array, " f"]]:
     """Derivatives by measurements and by residuals, and the residual of the equations."""
-    at = Linearised(declared, plan, values, data, factor, {})
+    at = LinearisedSolution(declared, plan, values, data, factor, {})
     still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
-    def changes(change):
+    def changes(change: Tangent) -> Tangent:
         """The changes of all tables."""
         moved = _in_datum(at, change, data.start)
         of = lambda name, space: jax.vmap(space.difference)(moved[name], values[name])
         return {name: of(name, space) for name, space in declared.named_spaces}
 
-    def one(row):
+    def pull_back_one(row: Tangent) -> tuple[PyTree, dict[str, Array], Float[Array, ""]]:
         (row,) = jax.vjp(changes, still)[1](row)
         adjoint, left = _solve(at, row, unchanged)
 
-        def along(measured):
+        def along(measured: PyTree) -> Float[Array, ""]:
             """λᵀ·g."""
             given = dataclasses.replace(data, measured=measured)
             cost = lambda change: half_square(plan, at.residuals(change, given))
@@ -154,23 +154,33 @@ def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, facto
         of_parts = jax.jvp(residuals, (still,), (adjoint,))[1]
         return slopes, restore_order(plan, of_parts), left
 
-    return jax.lax.map(one, rows)
+    return jax.lax.map(pull_back_one, rows)
 
 
-def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
+def _in_datum(at: LinearisedSolution, change: Tangent, start: Values) -> Values:
     """The tables after a change, in the datum defined by `start`."""
     moved = at.move(change, dataclasses.replace(at.data, start=start))
     return attach_motion(at.declared, at.plan, moved, start)
 
 
-def _solve(at: Linearised, right: Tangent, held: Values) -> tuple[Tangent, Float[Array, ""]]:
-    """x of H·x = right − (∂g/∂θ)·held by conjugate gradients, and the relative residual.
+def _solve(
+    at: LinearisedSolution,
+    right: Tangent,
+    held: Values,
+    tolerance: float = 1e-11,
+    max_steps: int = 50,
+) -> tuple[Tangent, Float[Array, ""]]:
+    """x of H·x = right − (∂g/∂θ)·held by conjugate gradients, and the relative residual (norm of
+    N⁻¹).
 
-    The first pass of the loop computes the right-hand side, so that the program contains g once."""
+    The first pass of the loop computes the right-hand side, so that the program contains g once.
+    H is N and the curvature: with the factor of N the error falls in each step by about the ratio
+    of the two, so that some steps reach `tolerance`, just above rounding. Where `max_steps` do not,
+    the curvature is as large as N, and the point is no clear minimum."""
     plan, still, start = at.plan, zero_tangent(at.plan), at.data.start
     plus = lambda a, factor, b: jax.tree.map(lambda a, b: a + factor * b, a, b)
 
-    def product(x, share):
+    def product(x: Tangent, share: Float[Array, ""]) -> Tangent:
         """H·x + share·(∂g/∂θ)·held."""
         gradient = lambda change, start: gradient_after(
             change, at, dataclasses.replace(at.data, start=start)
@@ -178,13 +188,14 @@ def _solve(at: Linearised, right: Tangent, held: Values) -> tuple[Tangent, Float
         along = jax.tree.map(lambda d: share * d, held)
         return jax.jvp(gradient, (still, start), (x, along))[1]
 
-    def going(state):
+    def going(state: tuple) -> Bool[Array, ""]:
         *_, size, begin, count = state
-        open_ = (size > REACHED**2 * begin) & (count <= MOST_STEPS)
+        open_ = (size > tolerance**2 * begin) & (count <= max_steps)
         return (count == 0) | open_
 
-    def further(state):
+    def further(state: tuple) -> tuple:
         x, left, direction, size, begin, count = state
+        # Pass 0 has x = 0 and direction 0: its product is (∂g/∂θ)·held, the right-hand side.
         first = count == 0
         times = product(direction, jnp.where(first, 1.0, 0.0))
         curvature = dot(plan, direction, times)

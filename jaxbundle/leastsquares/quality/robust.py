@@ -34,13 +34,6 @@ from jaxbundle.leastsquares.quality.distributions import chi2_quantile, critical
 from jaxbundle.leastsquares.quality.snooping import Adjust, readjust
 from jaxbundle.leastsquares.solution import Solution
 
-LEAST_WEIGHT = 1e-6
-"""Smallest weight, so that the problem stays determined."""
-RESTING, NEARLY_RESTING = 1e-4, 1e-3
-"""Weights with a smaller RMS change have converged; the limit is looser for those that only start
-another estimator."""
-ROUNDS = 100
-
 
 def huber(t: Float[np.ndarray, " n"], k: float = 3.0) -> Float[np.ndarray, " n"]:
     """Weights of residual lengths t in units of their σ."""
@@ -56,6 +49,26 @@ def tukey(t: Float[np.ndarray, " n"], k: float = 5.1230) -> Float[np.ndarray, " 
     """Weights of residual lengths t in units of their σ."""
     return np.maximum(1 - np.minimum(t / k, 1.0) ** 2, 0.0) ** 2
 
+
+@dataclasses.dataclass(frozen=True)
+class ReweightingSettings:
+    """The iteration of the weights.
+
+    - `min_weight`: of an observation, so that the problem stays determined: σ a thousand times the
+      given one, which moves no other unknown.
+    - `converged_change`: weights with a smaller RMS change have converged: they then change no
+      unknown by more than about that fraction of its σ.
+    - `starting_change`: the same for Huber's weights that only start another estimator.
+    - `max_rounds`: convergence is linear; data that need more have no clear majority.
+    """
+
+    min_weight: float = 1e-6
+    converged_change: float = 1e-4
+    starting_change: float = 1e-3
+    max_rounds: int = 100
+
+
+REWEIGHTING = ReweightingSettings()
 
 _WEIGHT = {"huber": huber, "cauchy": cauchy, "tukey": tukey}
 
@@ -110,14 +123,23 @@ def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) 
     for o, t in lengths.items():
         weight = problem.weights(o)
         used = (weight > 0).any(1)
+        # Lengths of one, two or three residuals have different medians, √χ²₀.₅(k): divided by them
+        # they are comparable.
         normal.append(t[used] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
     counts = problem.counts
     share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
+    # 1e-3: with a thousand unknowns for one redundant observation the scale is no estimate.
     scale = np.median(np.concatenate(normal)) / math.sqrt(max(share, 1e-3))
     return max(float(scale), np.finfo(float).tiny)
 
 
-def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: str) -> Reweighted:
+def reweight(
+    problem: Problem,
+    values: Values,
+    adjust_from: Adjust,
+    estimator: str,
+    settings: ReweightingSettings = REWEIGHTING,
+) -> Reweighted:
     """Adjust with the weights of an estimator until they converge.
 
     **Arguments:** `adjust_from(problem, start)`: the solution of a changed problem; `estimator`:
@@ -131,24 +153,26 @@ def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: s
     t = residual_lengths(Solution(problem, values))
     weighted, w = problem, {o: np.ones(len(x)) for o, x in t.items()}
     move = lambda problem, values, adjust_from: adjust_from(problem, values)
+    # Redescending estimators (Cauchy, Tukey) have many solutions: from Huber's, which is unique,
+    # and with its scale, they find the one of the majority.
     for name in dict.fromkeys(("huber", estimator)):
-        resting = RESTING if name == estimator else NEARLY_RESTING
-        for _ in range(ROUNDS):
+        small = settings.converged_change if name == estimator else settings.starting_change
+        for _ in range(settings.max_rounds):
             scale = robust_scale(problem, t) if name == "huber" else scale
             before = w
-            w = {o: np.maximum(_WEIGHT[name](x / scale), LEAST_WEIGHT) for o, x in t.items()}
+            least = settings.min_weight
+            w = {o: np.maximum(_WEIGHT[name](x / scale), least) for o, x in t.items()}
             change = np.concatenate([w[o] - before[o] for o in w])
-            rests = bool(np.sqrt(np.mean(change**2)) < resting)
+            rests = bool(np.sqrt(np.mean(change**2)) < small)
             if rests:
                 break
-            weight = {o: np.asarray(p) * _root(w[o], p) if o in w else p for o, p in given.items()}
+            # `weight` is 1/σ, or L⁻¹ [n, r, r]: both times √w of the observation.
+            root = lambda o, p, w=w: np.sqrt(w[o]).reshape(-1, *(1,) * (np.ndim(p) - 1))
+            weight = {o: np.asarray(p) * root(o, p) if o in w else p for o, p in given.items()}
             weighted = with_data(problem, dataclasses.replace(problem.data, weight=weight))
             # The first start values may be far from a solution.
             values = move(weighted, values, adjust_from).values
             move, t = readjust, residual_lengths(Solution(problem, values))
+    # Single steps on the way; the last solution is iterated to the end.
     found = adjust_from(weighted, values)
     return Reweighted(found, w, scale, rests, {o: x / scale for o, x in t.items()})
-
-
-def _root(w, weight):
-    return np.sqrt(w).reshape(-1, *(1,) * (np.ndim(weight) - 1))

@@ -34,12 +34,15 @@ from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quan
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.weights import used, without_residual
+from jaxbundle.types import AnyArray
 
 REMOVED_TOGETHER = 0.5
-"""Observations are removed together with the worst if their test is at least this fraction of
-its."""
-STEPPING = 20_000
-"""Problems with at least this many observations take single steps between removals."""
+"""Observations are removed together with the worst if their test is at least this fraction of its.
+Larger: more rounds of adjustments; smaller: good observations are removed for the blunders of
+others, and must be found again by the last test."""
+SINGLE_STEPS_FROM = 20_000
+"""Problems with at least this many observations take single steps between removals: below, the
+iterations of an adjustment (0.5 µs an observation each) take less time than compiling the step."""
 
 Adjust = Callable[[Problem, Values], Solution]
 """The solution of a problem from start values; raises if there is none."""
@@ -76,7 +79,7 @@ def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
     """The solution of a problem with slightly changed weights. A large one takes a single
     Gauss–Newton step if this decreases vᵀPv, with an error of the square of the change; for a small
     one compiling the step would take longer. A final result must be adjusted once more."""
-    if sum(given.number for given in problem.observations) >= STEPPING:
+    if sum(given.number for given in problem.observations) >= SINGLE_STEPS_FROM:
         before = Solution(problem, values)
         after = Solution(problem, take_step(problem, values))
         if after.vtpv <= before.vtpv:
@@ -116,6 +119,7 @@ def snoop(
     touched, excluded = _Touched(whole), set()
     if removed:
         found = _solve(whole, removed, excluded, found.values, adjust_from)
+    # τ has f − 1 degrees of freedom.
     while found.problem.counts.redundancy >= 2:
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
@@ -128,6 +132,8 @@ def snoop(
         if worst:
             removed += worst
         else:
+            # What was restored once is not again: two that exclude each other would alternate
+            # forever.
             passing = _passing(whole, found, touched, removed, critical) - returned
             kept = list(_without_passing(removed, passing))
             if kept == removed:
@@ -143,7 +149,13 @@ def snoop(
     return found, removed
 
 
-def _solve(whole: Problem, removed, excluded: set[int], values, adjust_from: Adjust) -> Solution:
+def _solve(
+    whole: Problem,
+    removed: Sequence[Removed],
+    excluded: set[int],
+    values: Values,
+    adjust_from: Adjust,
+) -> Solution:
     """The solution without removed observations and `excluded` eliminated rows, to which those are
     added that the remaining observations do not determine."""
     while True:
@@ -187,16 +199,18 @@ class _Touched:
         return sum(int((w > 0).sum()) for w in weight)
 
 
-def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> list[Removed]:
+def _worst(
+    found: Solution, touched: _Touched, unit: float, critical: float, apart: float
+) -> list[Removed]:
     """The observations to remove now, the worst first; tests in `unit`.
 
     Observations of a row are separable if the test of the suspect exceeds `apart` without the
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [
-        Removed(o, *_place(tests[o]), float(tests[o].max()))
-        for o in touched.single
-        if tests[o].size
+        Removed(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
+        for o, t in ((o, tests[o]) for o in touched.single)
+        if t.size
     ]
     together, of, row = [], [], []
     for o in filter(lambda o: len(tests[o]), touched.whole):
@@ -210,6 +224,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     row = row.astype(int)
     worst = max(alone, key=lambda r: r.test, default=None)
     other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
+    # Observations without an eliminated row (control, distances) influence everything: alone.
     if worst and other > max(critical, largest):
         return [worst]
     at = np.flatnonzero(together > max(critical, other, REMOVED_TOGETHER * largest))
@@ -229,6 +244,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     others = {
         k: rays.alternatives(str(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
     }
+    # Those beyond doubt first: without them, some of the others may become separable.
     certain = [k for k in others if not others[k]]
     return [
         Removed(str(of[k]), int(row[k]), None, float(together[k]), others[k])
@@ -236,13 +252,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     ]
 
 
-def _place(tests):
-    """Row and residual of the largest."""
-    row, residual = np.unravel_index(tests.argmax(), tests.shape)
-    return int(row), int(residual)
-
-
-def _leverage(found: Solution):
+def _leverage(found: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """h̃/r of every observation, the largest of its residuals: h minus the part of its eliminated
     row alone."""
     tested, tiny = found.reliability, np.finfo(float).tiny
@@ -282,7 +292,9 @@ class _Neighbours:
         return tuple(rows[o][alternatives].tolist())
 
 
-def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
+def _passing(
+    whole: Problem, found: Solution, touched: _Touched, removed: Sequence[Removed], critical: float
+) -> set[tuple[str, int, int | None]]:
     """Sets, rows and residuals of removed observations that agree with the adjustment without
     them."""
     aside = np.zeros(0, bool)
@@ -299,7 +311,7 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
 
 
 def _with_tests(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
-    """The same with the tests of initially doubtful observations."""
+    """What was removed, with the tests of initially doubtful observations."""
     for r, tests in _test_removed(whole, found, removed):
         yield r if np.isfinite(r.test) else dataclasses.replace(r, test=tests[0])
 
@@ -338,7 +350,9 @@ def _remove(weight: Float[np.ndarray, "n ..."], removed: Removed) -> None:
         weight[rows] = [without_residual(weight[row], removed.residual) for row in rows]
 
 
-def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
+def _without_passing(
+    removed: Sequence[Removed], passing: set[tuple[str, int, int | None]]
+) -> Iterable[Removed]:
     """The observations that stay removed. If all inseparable ones pass individually, they still
     contradict each other and all stay removed."""
     for r in removed:
@@ -349,7 +363,7 @@ def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
             yield dataclasses.replace(r, row=stay[0], others=stay[1:])
 
 
-def _finite(tests) -> Float[np.ndarray, "..."]:
+def _finite(tests: Float[AnyArray, "..."]) -> Float[np.ndarray, "..."]:
     """|tests|, 0 if there is none."""
     tests = np.abs(np.asarray(tests))
     return np.where(np.isfinite(tests), tests, 0.0)
