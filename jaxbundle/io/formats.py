@@ -71,9 +71,6 @@ from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import is_plain
 
-FIRST_LINES = 100_000
-"""Characters of a file from which its format is recognised."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Format:
@@ -129,7 +126,8 @@ def _is_photo_list(path: Path) -> bool:
     if path.suffix.lower() != ".txt" or not is_plain(path):
         return False
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        first = next((line for line in file.read(FIRST_LINES).split("\n") if line.strip()), "")
+        # Empty lines may stand before the number; the limit bounds the memory for any other file.
+        first = next((line for line in file.read(100_000).split("\n") if line.strip()), "")
     try:
         float(first)
     except ValueError:
@@ -137,6 +135,8 @@ def _is_photo_list(path: Path) -> bool:
     return True
 
 
+# The order is that of recognition: a .toml is a project unless it maps columns, a .txt is a list of
+# photographs if its first line is one number, and so on. Each test reads only the beginning.
 FORMATS: dict[str, Format] = {
     "project": Format(
         _is_project, read_project, "a .toml file, or a folder with project.toml", names_models=True
@@ -213,6 +213,7 @@ def _is_bal_name(path: Path) -> bool:
     return path.suffix.lower() in (".txt", ".bal", *OPENERS)
 
 
+# The order is that of recognition; "project" takes any folder and stands last.
 TARGETS: dict[str, Target] = {
     "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
     "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
@@ -227,7 +228,7 @@ TARGETS: dict[str, Target] = {
         COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False,
+        lambda path: False,  # a folder is named as for "colmap": only --to asks for text
         partial(fill_colmap, text=True),
         "by --to only",
         COLMAP_MODELS,
@@ -387,7 +388,7 @@ def read_network(
     """
     path = Path(given_path("path", path))
     if isinstance(overrides, str) or not (
-        isinstance(overrides, Sequence) and all(isinstance(one, str) for one in overrides)
+        isinstance(overrides, Sequence) and all(isinstance(word, str) for word in overrides)
     ):
         raise InputError(
             f"overrides must be a list of texts, such as ['datum=inner'], but is {show(overrides)}"
@@ -410,12 +411,13 @@ def read_network(
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
-    given = None if control is None else read_control(control)
+    control_points = None if control is None else read_control(control)
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     network = FORMATS[format].read(path, overrides, *own)
-    if given is not None:
-        datum = any(one.partition("=")[0].strip() == "datum" for one in overrides)
-        return with_control(network, given, datum=not datum)
+    if control_points is not None:
+        # control becomes the datum unless the command line chose one
+        datum = any(override.partition("=")[0].strip() == "datum" for override in overrides)
+        return with_control(network, control_points, datum=not datum)
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
 
 

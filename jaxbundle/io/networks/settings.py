@@ -10,8 +10,9 @@ from typing import Any
 
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, did_you_mean, list_some, show
+from jaxbundle.network.columns import Columns, list_some, show
 from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import SIGMA_ORIGINS, STATED, Network
@@ -50,23 +51,19 @@ def apply_overrides(
         elif key.partition(".")[0] in SECTIONS:
             _override_section(document, key, text)
         elif key in keys:
-            document["project"][key] = _project_value(key, text)
+            value = _words(text) if key == "datum_points" else text
+            document["project"][key] = _number(key, text) if key == "sigma_image" else value
         else:
             known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
             raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
     return document
 
 
-def _project_value(key: str, text: str):
-    if key == "sigma_image":
-        return _number(key, text)
-    return _words(text) if key == "datum_points" else text
-
-
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
+    # the longest id first: "a.b" may be an id beside "a"
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
         if rest.startswith(f"{ids[c]}."):
             _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
@@ -150,8 +147,7 @@ def network_of(
 def check_settings(project: Mapping[str, Any], where: str) -> None:
     """Refuse unknown keys and impossible values of `[project]`."""
     for key, value in project.items():
-        if key not in (*SETTINGS, *TABLES):
-            raise InputError(f"{where}unknown key {key!r}{did_you_mean(key, (*SETTINGS, *TABLES))}")
+        refuse_unknown(key, (*SETTINGS, *TABLES), where)
         if key in (*TEXT, *TABLES) and not isinstance(value, str):
             raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
         if key in CHOICES:

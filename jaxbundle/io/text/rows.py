@@ -1,7 +1,7 @@
 """The lines of a text file as rows of words; errors name the file and the line."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,11 @@ from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.columns import show
 
 BLANKS = "; blanks separate columns, so that no name may have one"
+
+
+def join_numbers(values: Iterable[float], separator: str = " ") -> str:
+    """Numbers as text that reads back to the last bit (`repr` is the shortest such text)."""
+    return separator.join(repr(float(value)) for value in values)
 
 
 class Row:
@@ -52,6 +57,7 @@ class Row:
             numbers = np.array(self.words, float) if self.words else np.zeros(0)
         except ValueError:
             numbers = np.array([np.nan])
+        # Python and NumPy read "1_0" as ten; in a file it is a name, or a mistake.
         if not np.isfinite(numbers).all() or "_" in self.text:
             return np.array([self._number(word, what) for word in self.words])
         return numbers
@@ -59,8 +65,9 @@ class Row:
     def integer(self, k: int, what: str, least: int = 0) -> int:
         """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
-        sign = word.removeprefix("-")
-        if not (sign.isascii() and sign.isdigit() and len(sign) < 19) or int(word) < least:
+        digits = word.removeprefix("-")
+        # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
+        if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
             raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
         return int(word)
 
@@ -98,7 +105,7 @@ class Rows:
         self.separator = separator
         self.position = 0
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Row]:
         while self.more():
             yield self.take("a line")
 
