@@ -287,10 +287,10 @@ def _transform_into_frame(
         names = [control.id[k] for k in np.flatnonzero(known)]
         worst = (f"{names[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
         raise InputError(
-            f"{control.source.name}: the control fits no similarity of the start values of the input: its "
-            f"{count(len(off), 'point')} are within {spread:.3g} {network.object_unit} of their "
-            f"mean and {np.median(off):.3g} off (median), most of all "
-            f"{list_some(worst, 3, str)}; check names and units of the table, or leave out the "
+            f"{control.source.name}: the control fits no similarity of the start values of the "
+            f"input: its {count(len(off), 'point')} are within {spread:.3g} "
+            f"{network.object_unit} of their mean and {np.median(off):.3g} off (median), most of "
+            f"all {list_some(worst, 3, str)}; check names and units of the table, or leave out the "
             "start values of the input"
         )
     scale = float(np.cbrt(np.linalg.det(A)))  # A = scale·R, det R = 1
@@ -301,7 +301,8 @@ def _transform_into_frame(
             "as large as the start values: is one of them in mm, the other in m? The result is in "
             "the unit of the control"
         )
-    M = matrices_of(images.angles) @ (A / scale).T  # M·(X − X0) = M·Rᵀ·(X' − X0')/scale
+    # X' = scale·R·X + t   ⇒   M·(X − X0) ∝ M·Rᵀ·(X' − X0')
+    M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     return network.replace(
         images=Images(

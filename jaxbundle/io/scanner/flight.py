@@ -46,7 +46,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
 from jaxbundle.io.text.sections import Section, TomlFile, read_sections
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.noise import Noise, Sigma
 from jaxbundle.pushbroom.signals import KEYS
 from jaxbundle.pushbroom.simulate import Flight
 
@@ -95,25 +95,26 @@ def read_flight(path: str | Path) -> FlightFile:
         if rate <= 0:
             raise InputError(f"{instruments.where}{name} is {rate}; a positive number, in Hz")
     options |= {k: instruments.text(k) for k in METHODS if k in instruments}
+    noise = file.section("noise")
     flight = Flight(
         scanner.integer("lines"),
         pixels,
         period,
         optics_of(file, pixels),
-        _track(file, earth),
+        _read_track(file, earth),
         {
             k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
             for k, v in file.section("angles").values.items()
         },
         mounting_of(file),
-        noise=_noise(file),
+        noise=Noise(*(_sigma(noise, name, file.radians) for name in Noise._fields)),
         seed=int(file.section("simulation").number("seed", 0)),
         **options,
     )
     return FlightFile(file, flight, earth)
 
 
-def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
+def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     track = file.section("track")
     if earth is None:
         track.check_keys(LINE)
@@ -127,12 +128,7 @@ def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     return {"height": track.number("height"), **angles}
 
 
-def _noise(file: TomlFile) -> Noise:
-    section = file.section("noise")
-    return Noise(*(_sigma(section, name, file.radians) for name in Noise._fields))
-
-
-def _sigma(section: Section, name: str, radians: float):
+def _sigma(section: Section, name: str, radians: float) -> Sigma:
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
@@ -143,7 +139,7 @@ def _sigma(section: Section, name: str, radians: float):
     return unit * sigma
 
 
-def _signal(value: Any, unit: float, where: str):
+def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | list[Any]:
     """A signal with its angles in radians."""
     if isinstance(value, list):
         return [_signal(part, unit, where) for part in value]

@@ -32,10 +32,10 @@ def read_scanner(path: str | Path) -> Scanner:
         return check_against_rpc(_read_product(path), path)
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
-    return _of_product(file, scanner) if "source" in scanner else scanner_of(file)
+    return _read_source(file, scanner) if "source" in scanner else scanner_of(file)
 
 
-def _of_product(file: TomlFile, scanner: Section) -> Scanner:
+def _read_source(file: TomlFile, scanner: Section) -> Scanner:
     """The image of the source, with the name, interpolation and corrections of the file."""
     scanner.check_keys(("source", "name", "interpolation"))
     for name in file.document:
@@ -46,13 +46,14 @@ def _of_product(file: TomlFile, scanner: Section) -> Scanner:
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
     source = file.path.parent / scanner.text("source")
-    found = _read_product(source, choice)
+    product = _read_product(source, choice)
     switches = file.section("corrections")
-    corrections = {name: switches.switch(name) for name in switches.values}
-    given = found.image.corrections._replace(**corrections)
-    image = dataclasses.replace(found.image, corrections=given)
-    found = dataclasses.replace(found, image=image, name=scanner.text("name", found.name))
-    return check_against_rpc(found, source, choose=not corrections)
+    switched = {name: switches.switch(name) for name in switches.values}
+    corrections = product.image.corrections._replace(**switched)
+    image = dataclasses.replace(product.image, corrections=corrections)
+    product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
+    # what the user switched is compared, but not replaced
+    return check_against_rpc(product, source, choose=not switched)
 
 
 def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
@@ -69,7 +70,8 @@ def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
     return _read_xml(path)
 
 
-def _read_xml(path):
+def _read_xml(path: Path) -> Scanner:
+    """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
     if root.tag == "Dimap_Document":

@@ -38,6 +38,7 @@ attitude_rate = "held"
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -117,13 +118,13 @@ def read_refinement(path: str | Path) -> RefineFile:
         scanner = read_scanner(path.parent / scanners.text(id))
         warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
-        freedom = _freedom(Section(file, where, common | own.get(id, {})), radians)
+        freedom = _read_freedom(Section(file, where, common | own.get(id, {})), radians)
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
     earth = images[0].earth
-    for one in images:
-        if one.earth != earth:
+    for image in images:
+        if image.earth != earth:
             raise InputError(
-                f"{path}, [images]: {images[0].id!r} and {one.id!r} have different ellipsoids or "
+                f"{path}, [images]: {images[0].id!r} and {image.id!r} have different ellipsoids or "
                 "frames; points can be in one only"
             )
     frames = None
@@ -134,13 +135,13 @@ def read_refinement(path: str | Path) -> RefineFile:
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
-        ids |= {
-            id: k for k, id in enumerate((id for id in frames.points.id if id not in ids), len(ids))
-        }
+        # points that only photographs show follow those of the table
+        more = (id for id in frames.points.id if id not in ids)
+        ids |= {id: k for k, id in enumerate(more, len(ids))}
     observations = _observations(
         read_csv(path.parent / section.text("observations")),
         ids,
-        [one.id for one in images],
+        [image.id for image in images],
         section,
         str(path),
     )
@@ -155,27 +156,27 @@ def read_refinement(path: str | Path) -> RefineFile:
     return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
 
 
-def _freedom(section: Section, radians: float) -> Freedom:
+def _read_freedom(section: Section, radians: float) -> Freedom:
     fields = {f.name for f in dataclasses.fields(Freedom)}
     section.check_keys(tuple(sorted(fields)))
-    found: dict[str, Any] = {}
+    values_read: dict[str, Any] = {}
     for key, value in section.values.items():
         factor = radians if key in TURNING else 1.0
         if key == "knot_spacing":
-            found[key] = section.number(key)
-            if found[key] <= 0:
+            values_read[key] = section.number(key)
+            if values_read[key] <= 0:
                 raise InputError(f"{section.where}{key} must be positive, in seconds")
         elif key == "focal_length":
-            found[key] = _sigma(section, key, value)
+            values_read[key] = _sigma(section, key, value)
         elif key in LISTS:
             values = value if isinstance(value, list) else [value]
-            found[key] = tuple(_sigma(section, key, v) for v in values)
+            values_read[key] = tuple(_sigma(section, key, v) for v in values)
         else:
             values = value if isinstance(value, list) else [value] * 3
             if len(values) != 3:
                 raise InputError(f"{section.where}{key} is {show(value)}; one value or three")
-            found[key] = tuple(factor * _sigma(section, key, v) for v in values)
-    return Freedom(**found)
+            values_read[key] = tuple(factor * _sigma(section, key, v) for v in values)
+    return Freedom(**values_read)
 
 
 def _sigma(section: Section, key: str, value: Any) -> float:
@@ -203,7 +204,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
                 f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
                 "earth; give X, Y, Z"
             )
-        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12
+        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12  # some thousand eps, as of 100 gon
         if beyond.any():
             row = int(beyond.argmax())
             raise InputError(
@@ -231,13 +232,15 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
     )
 
 
-def _observations(table, ids, images, section, where) -> Observations:
+def _observations(
+    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: Section, where: str
+) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
     sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
-    given = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
-    lacking = np.isnan(given)
+    stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
+    lacking = np.isnan(stated_sigma)
     if not stated and lacking.any() and not lacking.all():
         row = int(lacking.any(1).argmax())
         raise InputError(
@@ -248,7 +251,7 @@ def _observations(table, ids, images, section, where) -> Observations:
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
         table.indices("point", "point", ids, section.text("points")),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, given),
+        np.where(lacking, sigma, stated_sigma),
         table.source,
         STATED if stated or not lacking.any() else UNIT,
     )

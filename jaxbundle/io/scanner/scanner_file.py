@@ -82,7 +82,6 @@ from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
 
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
-MOST_ROWS = 1_000_000
 INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
 KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
@@ -252,10 +251,11 @@ def _orbit(
     """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
-    if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
+    most = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
+    if not (step > 0 and 0 < (end - start) / step <= most):
         raise InputError(
             f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
-            f"{MOST_ROWS} steps forward are expected"
+            f"{most} steps forward are expected"
         )
     t = np.arange(start, end, step)
     if kind == "tle":
@@ -266,14 +266,14 @@ def _orbit(
         P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
     elif kind == "state":
         frame = _frame(section, earth, frames.FRAMES)
-        at = section.number("at", 0.0)
+        time = section.number("at", 0.0)
         state = section.numbers("state", 6)[None]
         P, V = state[:, :3], state[:, 3:]
         if frame != "ITRF":
-            R = frames.to_earth(frame, _epoch(file), np.array([at]), _orientation(file))
+            R = frames.to_earth(frame, _epoch(file), np.array([time]), _orientation(file))
             P, V = frames.turn_positions(R, P, V, _orientation(file))
         try:
-            P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)
+            P, V = state_orbit(t, P[0], V[0], time, section.switch("j2") or "j2" not in section)
         except InputError as error:
             raise InputError(f"{section.where}{error}") from None
     else:
@@ -342,13 +342,13 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
     try:
         model = get_model(section.text("model", "brown"))
         section.check_keys(("model", "pitch", "middle", "row", *model.parameters))
-        given = {name: section.number(name) for name in model.parameters if name in section}
-        check_parameters(model, given)
+        parameters = {name: section.number(name) for name in model.parameters if name in section}
+        check_parameters(model, parameters)
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{section.where}{error}") from None
-    values = default_parameters(model) | given
+    values = default_parameters(model) | parameters
     pitch = section.number("pitch")
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")

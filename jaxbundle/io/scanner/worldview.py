@@ -18,8 +18,11 @@ unless the RPC of the file say otherwise (`own_rpc`). Optical distortion, decrea
 products resampled to a map are refused.
 """
 
+import xml.etree.ElementTree as ET
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
@@ -37,8 +40,6 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 LEVELS = ("basic1b", "stereo1b")
-EPHEMERIS, ATTITUDE = 7, 5
-"""Numbers of a row that are used: index, position, velocity; index, quaternion."""
 CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
 """Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
 all three, to 0.7 m without refraction."""
@@ -62,8 +63,9 @@ def read_worldview(file: XmlFields) -> Scanner:
     lines, pixels = int(lines), int(pixels)
     epoch = file.time("IMD/IMAGE/TLCTIME")
     times = _line_times(file, lines)
-    t, P, _ = _table(file, "EPH", "EPHEMLIST", EPHEMERIS, epoch)
-    rows, values, source = _table(file, "ATT", "ATTLIST", ATTITUDE, epoch)
+    # of a row are used: index, position, velocity; index, quaternion. Covariances follow.
+    t, P, _ = _table(file, "EPH", "EPHEMLIST", 7, epoch)
+    rows, values, source = _table(file, "ATT", "ATTLIST", 5, epoch)
     values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
@@ -92,7 +94,7 @@ def read_worldview(file: XmlFields) -> Scanner:
     return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
 
-def _line_times(file, lines):
+def _line_times(file: XmlFields, lines: int) -> LineTimes:
     pairs = file.elements("IMD/IMAGE/TLCLISTList/TLCLIST")
     pairs = np.array([_numbers(file, e, "TLCLIST", 2) for e in pairs])
     if len(pairs) == 1:
@@ -110,6 +112,7 @@ def _line_times(file, lines):
             f"{file.path}: the times of TLCLIST, AVGLINERATE, SCANDIRECTION go backwards; the "
             "first line must be the first in time"
         )
+    # 1e-9 of the period, as the file rounds its times: one rate, which needs no table
     if np.ptp(slope) <= 1e-9 * slope[0]:
         start = np.ravel(t)[0] - slope[0] * np.ravel(first)[0]
         return LineTimes(jnp.asarray(start), jnp.asarray(slope[0]))
@@ -118,7 +121,9 @@ def _line_times(file, lines):
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t[k] + slope[k] * (l - first[k])))
 
 
-def _table(file, group, name, used, epoch):
+def _table(
+    file: XmlFields, group: str, name: str, used: int, epoch: np.datetime64
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows n"], Source]:
     """Seconds since the epoch, the values of the rows, and the source of the table."""
     rows = file.elements(f"{group}/{name}List/{name}")
     values = np.array([_numbers(file, e, f"{name} {k}", used) for k, e in enumerate(rows, 1)])
@@ -131,7 +136,7 @@ def _table(file, group, name, used, epoch):
     return t, values[:, 1:], source
 
 
-def _numbers(file, element, name, used):
+def _numbers(file: XmlFields, element: ET.Element, name: str, used: int) -> list[float]:
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
     if len(words) < used:
@@ -139,7 +144,9 @@ def _numbers(file, element, name, used):
     return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
 
 
-def _detectors(file):
+def _detectors(
+    file: XmlFields,
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], tuple[str, ...]]:
     """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
     for name in ("ALIST", "BLIST"):
         found = file.find(f"GEO/OPTICAL_DISTORTION/{name}List")

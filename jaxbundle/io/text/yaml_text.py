@@ -15,7 +15,9 @@ from typing import Any
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
 
-DEEPEST_NESTING = 32
+MAX_NESTING = 32
+"""Levels of blocks and of brackets: calibration files have four; Python's own limit, a thousand
+calls, would be reached at some 300 levels and end in a RecursionError."""
 KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s*:(?:\s+(.*))?""")
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
@@ -88,8 +90,8 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
 
 def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
     """The value of the lines of one indentation, and the lines after it."""
-    if depth > DEEPEST_NESTING:
-        raise lines[0].error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
+    if depth > MAX_NESTING:
+        raise lines[0].error(f"nested too deeply: more than {MAX_NESTING} levels")
     read = _items if _is_item(lines[0]) else _keys
     return read(lines, indent, depth)
 
@@ -98,10 +100,11 @@ def _is_item(line: Line) -> bool:
     return line.text == "-" or line.text.startswith("- ")
 
 
-def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]]:
+def _items(lines: list[Line], indent: int, depth: int) -> tuple[list[Any], list[Line]]:
     values = []
     while lines and lines[0].indent == indent and _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
+        # "- key: value" is a block whose indentation is that of the key
         inner = Line(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
         if inner.text and not _is_item(inner) and not KEY.fullmatch(inner.text):
             values.append(_value(inner, inner.text))
@@ -114,7 +117,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]
     return values, lines
 
 
-def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]:
+def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict[str, Any], list[Line]]:
     values: dict[str, Any] = {}
     while lines and lines[0].indent == indent and not _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
@@ -149,7 +152,7 @@ def _value(line: Line, text: str) -> Any:
         raise line.error(f"{show(text)}: {NOT_READ[text[0]]} is not read here")
     if not text.startswith("["):
         return _scalar(text)
-    stack: list[list] = [[]]
+    stack: list[list[Any]] = [[]]  # the lists that are open, the outermost a holder of one list
     for part in re.findall(r"\[|\]|\"[^\"]*\"|'[^']*'|[^][,\"']+", text):
         if part == "[":
             stack.append([])
@@ -158,7 +161,7 @@ def _value(line: Line, text: str) -> Any:
             stack.pop()
         elif part.strip():
             stack[-1].append(_scalar(part.strip()))
-        if not stack or len(stack) > DEEPEST_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
+        if not stack or len(stack) > MAX_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
             raise line.error(f"{show(text)}: brackets that do not match")
     return stack[0][0]
 

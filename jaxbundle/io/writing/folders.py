@@ -35,8 +35,6 @@ from jaxbundle.system.temporaries import defer_interrupts, temporary
 
 MARKER, INSIDE = ".jaxbundle", ".jaxbundle.work"
 NEW, READY, OLD = "new", "ready", "old"
-MOST_NAMED = 40
-"""Maximum number of files named by a refusal."""
 
 
 class Marker(NamedTuple):
@@ -101,7 +99,7 @@ def replace_folder(
             with defer_interrupts():
                 work = until.enter_context(temporary(_make_work(real), content=False))
             new = work / NEW
-            until.enter_context(_held(folder, work))
+            until.enter_context(_hold_work(folder, work))
             until.enter_context(temporary(new)).mkdir()
             yield new
             _replace(folder, real, work, by, tuple(names), force)
@@ -119,7 +117,7 @@ def recover(folder: str | Path) -> None:
     for work in _works(real):
         if work.is_dir() and not work.is_symlink():
             try:
-                with _held(folder, work):
+                with _hold_work(folder, work):
                     _settle(work, real)
             except OSError as error:
                 raise unwritable(folder, error) from None
@@ -164,7 +162,10 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         return
     own = marker.files if marker else {}
     taken = [str(folder / name) for name in _list_taken(real, names, own)]
-    listed = list_some(taken, MOST_NAMED, str)
+    most = (
+        40  # names in a message: those of a project or a result in full, not of a thousand figures
+    )
+    listed = list_some(taken, most, str)
     way = "give a new folder, or --force (force=True in Python) to"
     if marker is None and taken:
         raise InputError(
@@ -180,12 +181,12 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         there = [str(folder / name) for name in own if os.path.lexists(real / name)]
         raise InputError(
             f"{said}: a folder of jaxbundle {marker.by}, not {by}; {way} replace "
-            f"{list_some([*there, *taken], MOST_NAMED, str)}"
+            f"{list_some([*there, *taken], most, str)}"
         )
     changed = [str(folder / n) for n, d in own.items() if _digest(real / n) not in (None, d)]
     if changed or taken:
         raise InputError(
-            f"{said}: {list_some([*changed, *taken], MOST_NAMED, str)}: already there, and not as "
+            f"{said}: {list_some([*changed, *taken], most, str)}: already there, and not as "
             f"jaxbundle {by} wrote it; {way} replace it"
         )
 
@@ -235,7 +236,8 @@ def _make_work(real: Path) -> Path:
     return beside
 
 
-def _held(folder: str | Path, work: Path) -> AbstractContextManager[None]:
+def _hold_work(folder: str | Path, work: Path) -> AbstractContextManager[None]:
+    # without locks (some network disks) two commands on one folder are the user's risk
     return hold_lock(work / "run", folder, needed=False)
 
 
@@ -273,7 +275,7 @@ def _replace(
 def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]) -> None:
     """Replace old files by the new ones, all or none."""
     new, old = work / READY, work / OLD
-    os.rename(work / NEW, new)
+    os.rename(work / NEW, new)  # from here on `recover` knows that the new files are complete
     if not real.exists():
         os.rename(new, real)
         return
