@@ -60,7 +60,7 @@ class Converted:
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
-def convert(
+def convert(  # noqa: PLR0913, as the options of the command
     input: str | Path,
     output: str | Path,
     *,
@@ -94,7 +94,7 @@ def convert(
     **Raises:** `InputError`; nothing is written then.
     """
     input, output = Path(given_path("input", input)), Path(given_path("output", output))
-    kind = _kind(output, to)
+    kind = _choose_kind(output, to)
     _check_path(output, kind)
     model = None if model is None else key_of(model)
     models = check_own_models(models)
@@ -117,15 +117,18 @@ def convert(
     _keep_input(input, network, output, kind, control)
     _keep_others(output, kind, force)
     if kind in CAMERA_KINDS:
+        costs = None
         if model is not None and measured:
+            # the fit over the measurements needs the network; then there is nothing to convert
             network, costs = convert_cameras(network, model, measured=True)
-            made = _convert_cameras(input, network.cameras, output, kind, None, camera)
-            # of the fit over the measurements; the second pass converted nothing
-            made = dataclasses.replace(made, conversions=costs)
-        else:
-            made = _convert_cameras(input, network.cameras, output, kind, model, camera)
+            model = None
+        made = _convert_cameras(input, network.cameras, output, kind, model, camera)
         return dataclasses.replace(
-            made, lost=("images and points",), warnings=network.warnings, notes=network.notes
+            made,
+            conversions=made.conversions if costs is None else costs,
+            lost=("images and points",),
+            warnings=network.warnings,
+            notes=network.notes,
         )
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
@@ -150,7 +153,7 @@ def _convert_network(
     return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes)
 
 
-def _kind(output: Path, to: str | None) -> str:
+def _choose_kind(output: Path, to: str | None) -> str:
     kinds = {name: target.looks for name, target in (*TARGETS.items(), *CAMERA_KINDS.items())}
     if to is not None:
         if to not in kinds:

@@ -53,6 +53,7 @@ from jaxbundle.io.networks.rig_result import (
     read_rig_line,
     read_rig_result,
 )
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
     fill_ros_stereo,
@@ -228,7 +229,7 @@ TARGETS: dict[str, Target] = {
         COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False,  # a folder is named as for "colmap": only --to asks for text
+        lambda _: False,  # a folder is named as for "colmap": only --to asks for text
         partial(fill_colmap, text=True),
         "by --to only",
         COLMAP_MODELS,
@@ -415,9 +416,7 @@ def read_network(
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     network = FORMATS[format].read(path, overrides, *own)
     if control_points is not None:
-        # control becomes the datum unless the command line chose one
-        datum = any(override.partition("=")[0].strip() == "datum" for override in overrides)
-        return with_control(network, control_points, datum=not datum)
+        return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
 
 

@@ -28,7 +28,7 @@ from jaxtyping import Float
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
-from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.assemble import all_parameters, foreign_document
 from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import (
     angles_of,
@@ -78,24 +78,16 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
                 f"{path}, line {row + 2}: {what} {index[row]:g} does not exist; the first line "
                 f"announces {count}, counted from 0"
             )
-    document = {
-        "project": {
-            "name": path.name.split(".")[0],
-            "datum": "inner",
-            "image_unit": "px",
-            "residuals": "measured",
-            "object_unit": "model",
-        },
-        "camera": [
-            {
-                "id": str(c),
-                "model": MODEL.name,
-                "free": list(MODEL.parameters),
-                **dict(zip(MODEL.parameters, map(float, row))),
-            }
-            for c, row in enumerate(poses[:, 6:])
-        ],
-    }
+    camera_entries = [
+        {
+            "id": str(c),
+            "model": MODEL.name,
+            "free": list(MODEL.parameters),
+            **dict(zip(MODEL.parameters, map(float, row))),
+        }
+        for c, row in enumerate(poses[:, 6:])
+    ]
+    document = foreign_document(path.name.split(".")[0], camera_entries)
     document = apply_overrides(document, overrides)
     project = document["project"]
     check_settings(project, f"{path}: ")

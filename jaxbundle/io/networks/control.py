@@ -261,7 +261,7 @@ def _transform_into_frame(
     """The network with start values transformed so that its points in the rows `places` are at the
     control points.
 
-    **Raises:** `InputError` if they fit no similarity: then it would not be in that frame."""
+    **Raises:** `InputError` if they fit no similarity."""
     images, points, target = network.images, network.points, control.position
     # Observed orientations are in the frame of the control already; without orientations there is
     # nothing to transform.
@@ -282,17 +282,9 @@ def _transform_into_frame(
         return network
     A, t = transformation
     off = np.linalg.norm(source @ A.T + t - target, axis=1)
-    spread = np.sqrt(np.square(target - target.mean(0)).sum(1).mean())
-    if np.median(off) > settings.max_misfit * spread:
-        names = [control.id[k] for k in np.flatnonzero(known)]
-        worst = (f"{names[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
-        raise InputError(
-            f"{control.source.name}: the control fits no similarity of the start values of the "
-            f"input: its {count(len(off), 'point')} are within {spread:.3g} "
-            f"{network.object_unit} of their mean and {np.median(off):.3g} off (median), most of "
-            f"all {list_some(worst, 3, str)}; check names and units of the table, or leave out the "
-            "start values of the input"
-        )
+    _check_similarity(
+        off, control.take(np.flatnonzero(known)), settings.max_misfit, network.object_unit
+    )
     scale = float(np.cbrt(np.linalg.det(A)))  # A = scale·R, det R = 1
     if abs(abs(np.log(scale)) - np.log(1000)) < np.log(1 + settings.thousand_tolerance):
         times = "a thousand times" if scale > 1 else "a thousandth"
@@ -318,6 +310,22 @@ def _transform_into_frame(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
     )
+
+
+def _check_similarity(
+    off: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
+) -> None:
+    """Refuse control that is `off` the similarity by more than `max_misfit` of its spread: the
+    network would not be in its frame."""
+    spread = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
+    if np.median(off) > max_misfit * spread:
+        worst = (f"{control.id[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
+        raise InputError(
+            f"{control.source.name}: the control fits no similarity of the start values of the "
+            f"input: its {count(len(off), 'point')} are within {spread:.3g} {unit} of their mean "
+            f"and {np.median(off):.3g} off (median), most of all {list_some(worst, 3, str)}; check "
+            "names and units of the table, or leave out the start values of the input"
+        )
 
 
 def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

@@ -47,6 +47,7 @@ from jaxbundle.io.networks.metashape_camera import (
     sensor_camera,
 )
 from jaxbundle.io.networks.poses import check_rotations
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.xml_fields import number_in, read_xml
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Points, Source
@@ -101,8 +102,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{what}: {list_some(left)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
-        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
-        network = with_control(network, control, datum=not datum)
+        network = with_control(network, control, datum=not choose_datum(overrides))
     return network.warn(*told, *_about_references(chunk, control))
 
 

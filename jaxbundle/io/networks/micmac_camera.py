@@ -183,7 +183,7 @@ def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 
 # Twelve iterations, as in `cameras.fisheye_prism`: Newton's method starts at the point itself and
 # converges quadratically; more only take time.
-_from_world = implicit_inverse(_distort, lambda p, x, y: (x, y), 12)
+_from_world = implicit_inverse(_distort, lambda _, x, y: (x, y), 12)
 
 
 def _image(

@@ -55,6 +55,7 @@ from jaxbundle.io.networks.losses import (
     size_of,
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.network.columns import Columns, count, list_some
@@ -112,18 +113,6 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     views = {key: view for key, view in views.items() if key in posed or key in seen}
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
-    told = [
-        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
-        for ids, why in (
-            (left, "of spherical cameras or without intrinsics"),
-            (lost, "without pose and image points"),
-        )
-        if ids
-    ]
-    if any(view.get("use_pose_center_prior") for view in views.values()):
-        told.append("priors of projection centres (use_pose_center_prior) are not read")
-    if mirror is MIRROR:
-        told.append("the scene of spherical cameras is a mirror image: its Y is negated")
     labels = unique_labels([_name(view) for view in views.values()], list(views))
     image_ids = dict(zip(views, labels))
     network = assemble(
@@ -140,22 +129,35 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             },
             Source(str(path), None, "observation"),
         ),
-        told,
+        _describe_unread(views, left, lost, mirror is MIRROR),
     )
-    if control and len(network.points):
-        at = stack_rows(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
-        at = at * mirror
-        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
-        unknown = np.full((len(control), 3), np.nan)
-        table = Points(
-            tuple(names.values()),
-            ("control",) * len(control),
-            at,
-            unknown,
-            Source(str(path), None, "control point"),
+    if not control or not len(network.points):
+        return network
+    place = lambda k: (f"{path}, control_points[{k}]", "X")
+    X = stack_rows(list(control.values()), 3, place) * mirror
+    unknown = np.full((len(control), 3), np.nan)
+    source = Source(str(path), None, "control point")
+    table = Points(tuple(names.values()), ("control",) * len(control), X, unknown, source)
+    return with_control(network, table, datum=not choose_datum(overrides))
+
+
+def _describe_unread(
+    views: Mapping[int, JsonFields], left: Sequence[str], lost: Sequence[str], mirrored: bool
+) -> list[str]:
+    """Messages about what is not read, and about a mirrored scene."""
+    messages = [
+        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
+        for ids, why in (
+            (left, "of spherical cameras or without intrinsics"),
+            (lost, "without pose and image points"),
         )
-        network = with_control(network, table, datum=not datum)
-    return network
+        if ids
+    ]
+    if any(view.get("use_pose_center_prior") for view in views.values()):
+        messages.append("priors of projection centres (use_pose_center_prior) are not read")
+    if mirrored:
+        messages.append("the scene of spherical cameras is a mirror image: its Y is negated")
+    return messages
 
 
 def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
@@ -310,28 +312,6 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     need_values(network)
     images, points, rays = network.images, network.points, network.observations
-    sizes = [network.cameras[c].image_size or (0, 0) for c in images.camera.tolist()]
-    views = [
-        _entry(
-            i,
-            {
-                "polymorphic_id": DECLARED_CLASS,
-                "ptr_wrapper": {
-                    "id": NEW_NUMBER + i + 1,
-                    "data": {
-                        "local_path": "",
-                        "filename": id,
-                        "width": w,
-                        "height": h,
-                        "id_view": i,
-                        "id_intrinsic": c,
-                        "id_pose": i,
-                    },
-                },
-            },
-        )
-        for i, (id, c, (w, h)) in enumerate(zip(images.id, images.camera.tolist(), sizes))
-    ]
     R = flip_rows(matrices_of(images.angles))
     extrinsics = [
         _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
@@ -354,7 +334,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     scene = {
         "sfm_data_version": "0.3",
         "root_path": "",
-        "views": views,
+        "views": _view_entries(network),
         "intrinsics": _intrinsics(network.cameras, NEW_NUMBER + len(images) + 1),
         "extrinsics": extrinsics,
         "structure": tables[0],
@@ -364,6 +344,18 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     lost = [what for what in describe_losses(network) if not what.startswith("roles")]
     lost += ["σ of control points, check points"] if held.any() or "check" in points.role else []
     return (*lost, *(("names of points",) if list(map(str, numbers)) != list(points.id) else ()))
+
+
+def _view_entries(network: Network) -> list[dict[str, Any]]:
+    """The entries of the images; their pointers are numbered from 1."""
+    entries = []
+    for i, (id, c) in enumerate(zip(network.images.id, network.images.camera.tolist())):
+        w, h = network.cameras[c].image_size or (0, 0)
+        data = {"local_path": "", "filename": id, "width": w, "height": h}
+        data |= {"id_view": i, "id_intrinsic": c, "id_pose": i}
+        pointer = {"id": NEW_NUMBER + i + 1, "data": data}
+        entries.append(_entry(i, {"polymorphic_id": DECLARED_CLASS, "ptr_wrapper": pointer}))
+    return entries
 
 
 def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:

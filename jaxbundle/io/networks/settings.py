@@ -30,6 +30,12 @@ ALL = "*"
 Document = dict[str, Any]
 
 
+def choose_datum(overrides: Sequence[str]) -> bool:
+    """Whether the settings of the command line choose the datum: then control of a file does not
+    become the datum by itself."""
+    return any(override.partition("=")[0].strip() == "datum" for override in overrides)
+
+
 def apply_overrides(
     document: Document, overrides: Sequence[str], keys: Sequence[str] = SETTINGS
 ) -> Document:

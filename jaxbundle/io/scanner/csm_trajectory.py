@@ -162,9 +162,9 @@ def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation
         if len(t) > 1
         for warning in warn_of_extrapolation(t, lines, isd.source(key))
     ]
-    # At least 25 rows, so that the eight rows of the polynomial lie close about every line of a short
-    # image, of which the file may have two states. Hermite's cubic between states h seconds apart
-    # errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
+    # At least 25 rows, so that the eight rows of the polynomial lie close about every line of a
+    # short image, of which the file may have two states. Hermite's cubic between states h seconds
+    # apart errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
     t = np.linspace(position_times[0], position_times[-1], max(25, len(position_times)))
     P = body(t).apply(_positions(isd, position_times)(t))
     if interpolation == "usgscsm":

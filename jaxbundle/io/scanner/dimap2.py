@@ -134,8 +134,8 @@ def _polynomial(file: XmlFields, epoch: np.datetime64, last: float, source: Sour
     scale = file.number(f"{key}/SCALE")
     if scale == 0:
         raise InputError(f"{file.path}: SCALE of Polynomial_Quaternions is 0")
-    # Through eight rows Lagrange's polynomial of degree 7 follows polynomials of low degree exactly;
-    # the division by their length, which is no polynomial, is why there are more rows.
+    # Through eight rows Lagrange's polynomial of degree 7 is exact for those of low degree;
+    # the division by their length is no polynomial, and the reason for more rows.
     rows = np.linspace(-1.0, last + 1.0, 65)
     parts = [file.numbers(f"{key}/Q{k}/COEFFICIENTS") for k in range(4)]
     values = np.stack([np.polyval(c[::-1], (rows - offset) / scale) for c in parts], 1)

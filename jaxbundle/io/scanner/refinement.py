@@ -49,7 +49,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.io.text.sections import Section, read_sections
+from jaxbundle.io.text.sections import Section, TomlFile, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
@@ -101,36 +101,11 @@ def read_refinement(path: str | Path) -> RefineFile:
     if unit not in ANGLE_UNITS:
         raise InputError(f"{section.where}angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
     radians = ANGLE_UNITS[unit]
-    scanners = file.section("images")
-    if not scanners.values:
-        raise InputError(f'{path}, [images]: no image; give id = "scanner.toml"')
-    sensors, unknowns = file.section("sensors"), file.section("unknowns")
-    sensors.check_keys(tuple(scanners.values))
-    own = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
-    common = {k: v for k, v in unknowns.values.items() if k not in own}
-    for id in own:
-        if id not in scanners.values:
-            raise InputError(
-                f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
-            )
-    images, warnings = [], []
-    for id in scanners.values:
-        scanner = read_scanner(path.parent / scanners.text(id))
-        warnings += scanner.warnings
-        where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
-        freedom = _read_freedom(Section(file, where, common | own.get(id, {})), radians)
-        images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
-    earth = images[0].earth
-    for image in images:
-        if image.earth != earth:
-            raise InputError(
-                f"{path}, [images]: {images[0].id!r} and {image.id!r} have different ellipsoids or "
-                "frames; points can be in one only"
-            )
+    images, warnings = _read_images(file, radians)
     frames = None
     if "frames" in section:
         frames = read_network(path.parent / section.text("frames"))
-    points = _points(read_csv(path.parent / section.text("points")), earth, radians)
+    points = _points(read_csv(path.parent / section.text("points")), images[0].earth, radians)
     # checked first: the ids of observations are looked up in it
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
@@ -154,6 +129,36 @@ def read_refinement(path: str | Path) -> RefineFile:
             f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
         )
     return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
+
+
+def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], list[str]]:
+    """The images with their unknowns, and warnings of their readers."""
+    path, scanners = file.path, file.section("images")
+    if not scanners.values:
+        raise InputError(f'{path}, [images]: no image; give id = "scanner.toml"')
+    sensors, unknowns = file.section("sensors"), file.section("unknowns")
+    sensors.check_keys(tuple(scanners.values))
+    own = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
+    common = {k: v for k, v in unknowns.values.items() if k not in own}
+    for id in own:
+        if id not in scanners.values:
+            raise InputError(
+                f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
+            )
+    images, warnings = [], []
+    for id in scanners.values:
+        scanner = read_scanner(path.parent / scanners.text(id))
+        warnings += scanner.warnings
+        where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
+        freedom = _read_freedom(Section(file, where, common | own.get(id, {})), radians)
+        images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
+    for image in images:
+        if image.earth != images[0].earth:
+            raise InputError(
+                f"{path}, [images]: {images[0].id!r} and {image.id!r} have different ellipsoids or "
+                "frames; points can be in one only"
+            )
+    return images, warnings
 
 
 def _read_freedom(section: Section, radians: float) -> Freedom:
