@@ -16,7 +16,7 @@ from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.fingerprints import files_read
 from jaxbundle.network.columns import Columns
@@ -61,7 +61,7 @@ def surface_of(
     return Height(level=height, earth=earth)
 
 
-def open_scanner(path: Path) -> Scanner:
+def open_scanner(path: Path) -> ScannerInput:
     """A scanner file; its warnings go to standard error."""
     file = read_scanner(path)
     for warning in file.warnings:

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count, list_some
@@ -40,7 +40,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     """
     path, number = Path(path), len(require_board(board).ids)
     legend, views, reduced = None, {}, {}
-    for row in Rows(path):
+    for row in TextRows(path):
         # vnlog: the first line of one # is the legend, those of ## and #! are comments
         if row.text.startswith("#"):
             if legend is None and not row.text.startswith(("##", "#!")):
@@ -91,15 +91,15 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     )
 
 
-def _point(row: Row, cells: dict[str, str]) -> tuple[float, float]:
+def _point(row: TextRow, cells: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
     if NO_COORDINATE in (cells["x"], cells["y"]):
         return np.nan, np.nan
     # the columns may stand in any order and apart: as a row of their own they get its messages
-    x, y = Row(row.path, row.number, f"{cells['x']} {cells['y']}").numbers(("x", "y"))
+    x, y = TextRow(row.path, row.number, f"{cells['x']} {cells['y']}").numbers(("x", "y"))
     for name in QUALITY:
         if cells.get(name, NO_COORDINATE) != NO_COORDINATE:
-            (value,) = Row(row.path, row.number, cells[name]).numbers((name,))
+            (value,) = TextRow(row.path, row.number, cells[name]).numbers((name,))
             if value < 0 or (name == "weight" and value == 0):
                 return np.nan, np.nan
     return float(x), float(y)

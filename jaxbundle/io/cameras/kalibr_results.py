@@ -21,7 +21,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.kalibr import MODELS
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.rows import Row
+from jaxbundle.io.text.rows import TextRow
 from jaxbundle.network.build import make_cameras
 from jaxbundle.system.file_content import beginning
 
@@ -87,7 +87,7 @@ def _values(
         words = part.replace(",", " ").split()
         if len(words) != len(names):
             raise InputError(f"{where}: {what} has {len(words)} numbers; {len(names)} are expected")
-        row = Row(Path(where), 0, " ".join(words))
+        row = TextRow(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))
         except InputError:

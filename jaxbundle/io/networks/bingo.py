@@ -35,7 +35,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import assemble, foreign_document
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows
 from jaxbundle.network.columns import Columns, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
@@ -112,7 +112,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _find_camera(
-    photo: str, camera: str | None, row: Row, cameras: Mapping[str, dict], file: Path
+    photo: str, camera: str | None, row: TextRow, cameras: Mapping[str, dict], file: Path
 ) -> str:
     """The camera that a photograph names, or the only one."""
     if camera is None and len(cameras) == 1:
@@ -125,12 +125,12 @@ def _find_camera(
     return camera
 
 
-def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, Row]], Columns]:
+def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, TextRow]], Columns]:
     """Photographs (id, camera or None, line) and the table of image points."""
-    photos: list[tuple[str, str | None, Row]] = []
+    photos: list[tuple[str, str | None, TextRow]] = []
     images, points, values, lines = [], [], [], []
     begun = False  # −99 ends a photograph, after which a point has none
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
         if row.words[0] == END:
@@ -158,7 +158,7 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
     """Cameras by name, rows of points, and the skipped statements."""
     cameras: dict[str, dict] = {}
     points, skipped = [], {}
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
         keyword = row.words[0].upper()
@@ -193,7 +193,7 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
     return cameras, points, list(skipped)
 
 
-def _camera(row: Row) -> dict[str, Any]:
+def _camera(row: TextRow) -> dict[str, Any]:
     key = row.integer(1, "the key of CAPA")
     if len(row) not in (6, 9):
         raise row.error("CAPA key CAMERA c xH yH [σc σx σy] is expected")
@@ -207,5 +207,5 @@ def _camera(row: Row) -> dict[str, Any]:
     return camera
 
 
-def _is_comment(row: Row) -> bool:
+def _is_comment(row: TextRow) -> bool:
     return row.words[0] in ("C", "*") or row.words[0].startswith("*")

@@ -29,7 +29,7 @@ from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_doc
 from jaxbundle.io.networks.losses import GREY, are_numbered_from_0, describe_losses, need_values
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.rows import Rows, join_numbers
+from jaxbundle.io.text.rows import TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Source
@@ -53,7 +53,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    rows = Rows(path)
+    rows = TextRows(path)
     head = rows.take(f"{HEAD!r}")
     if " ".join(head.words) != HEAD:
         raise head.error(f"{HEAD!r} is expected; other versions are not known")
@@ -104,7 +104,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _cameras(
-    rows: Rows, number: int
+    rows: TextRows, number: int
 ) -> tuple[
     Float[np.ndarray, "cameras 3"],
     Float[np.ndarray, "cameras 3 3"],
@@ -132,7 +132,7 @@ def _cameras(
 
 
 def _points(
-    rows: Rows, number: int, cameras: int
+    rows: TextRows, number: int, cameras: int
 ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"], Float[np.ndarray, "rays 5"]]:
     """Coordinates; lines; and (camera, point, x, y, line) of all rays."""
     position, lines, rays = [], [], []

@@ -28,7 +28,7 @@ from jaxbundle.io.networks.colmap_models import (
     to_colmap,
 )
 from jaxbundle.io.networks.losses import GREY, size_of
-from jaxbundle.io.text.rows import Row, Rows, join_numbers
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
 from jaxbundle.network.tables import Camera, Source
 
 QT = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
@@ -45,7 +45,7 @@ def read_text_model(folder: Path) -> ColmapModel:
 def read_text_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.txt by number."""
     cameras: dict[int, Camera] = {}
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         number = row.integer(0, "CAMERA_ID")
         if number in cameras:
             raise row.error(f"camera {number} occurs twice")
@@ -59,7 +59,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 def _images(path: Path) -> list[ColmapImage]:
     # comments are skipped only before heads: the line of image points may be empty
-    rows = Rows(path, "#", blank=True)
+    rows = TextRows(path, "#", blank=True)
     images = []
     while rows.more():
         head = rows.take("an image")
@@ -71,7 +71,7 @@ def _images(path: Path) -> list[ColmapImage]:
                 f"{', '.join(QT)}, CAMERA_ID, NAME"
             )
         pose = head.numbers(QT, 1, more=True)
-        points = rows.take("the image points of an image") if rows.more() else Row(path, 0, "")
+        points = rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
         numbers = points.all_numbers("an image point")
         if len(numbers) % 3:
             raise points.error(
@@ -103,7 +103,7 @@ def _points(
     """Numbers and coordinates of the points, and their lines; tracks are only checked, since the
     image points name their object points."""
     ids, positions, lines = [], [], []
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         ids.append(row.integer(0, "POINT3D_ID"))
         positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
         lines.append(row.number)

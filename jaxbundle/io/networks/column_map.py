@@ -52,7 +52,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.poses import angles_of, apply_in_batches, are_rotations
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import Network, Source
@@ -159,7 +159,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         raise InputError(f"{where}: comment is {show(comment)}; text is expected")
     texts: dict[str, list[str]] = {name: [] for name in used}
     lines = []
-    for row in Rows(folder / file, comment, separator=_separator(where, entry)):
+    for row in TextRows(folder / file, comment, separator=_separator(where, entry)):
         if row.number <= skip:
             continue
         if len(row) < len(names) or (len(row) > len(names) and not more):

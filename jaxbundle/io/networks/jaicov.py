@@ -29,7 +29,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
 from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import matrices_of
-from jaxbundle.io.text.rows import Row, Rows, join_numbers
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Distances, Network, Source
@@ -96,7 +96,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 def _cameras(file: Path) -> dict[str, dict]:
     """The entries of cameras by number."""
-    rows, cameras = Rows(file, comment="#"), {}
+    rows, cameras = TextRows(file, comment="#"), {}
     while rows.more():
         entry, first = {}, None
         for names in INTERIOR:
@@ -135,7 +135,7 @@ def _images(
     """Row of each image, angles, positions, cameras, and messages."""
     images: dict[str, int] = {}
     angles, position, camera, other = [], [], [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
+    for row in TextRows(file, comment="#") if file.is_file() else ():
         names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
         entry = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
         if entry["active"] == 0:
@@ -164,7 +164,7 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     """Row of each point, coordinates, and the ids of the datum."""
     points: dict[str, int] = {}
     coordinates, datum = [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
+    for row in TextRows(file, comment="#") if file.is_file() else ():
         values = row.numbers(("X", "Y", "Z"), 1, more=True)
         # short rows, of coordinates alone or with σ, are active points outside the datum
         if len(row) >= 11 and row.words[8] == "0":
@@ -176,7 +176,7 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     return points, np.reshape(coordinates, (-1, 3)), datum
 
 
-def _number_row(row: Row, table: dict[str, int], thing: str) -> None:
+def _number_row(row: TextRow, table: dict[str, int], thing: str) -> None:
     if row.words[0] in table:
         raise row.error(f"{thing} {row.words[0]} occurs twice")
     table[row.words[0]] = len(table)
@@ -189,7 +189,7 @@ def _rays(
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y", "sx", "sy")}
     lines, unknown = [], []
     names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
-    for row in Rows(file, comment="#"):
+    for row in TextRows(file, comment="#"):
         values = row.numbers(names, 2, more=True)
         image, point = row.words[:2]
         if values[-1] <= 0:
@@ -211,9 +211,9 @@ def _with_distances(network: Network, file: Path) -> Network:
     """The network with the active distances of a file between its points."""
     index, lines = {id: k for k, id in enumerate(network.points.id)}, []
     ends, values = [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
+    for row in TextRows(file, comment="#") if file.is_file() else ():
         # the name stands in quotes and may have blanks
-        rest = Row(
+        rest = TextRow(
             row.path,
             row.number,
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),

@@ -61,7 +61,7 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
-from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.further import Antennas
@@ -308,7 +308,7 @@ def _tracks(
         return None, 0
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
     lines, missing = [], 0
-    for row in Rows(file, separator="\t"):
+    for row in TextRows(file, separator="\t"):
         if row.text.startswith(HEAD):
             version = row.text.removeprefix(HEAD).strip()
             if version not in ("1", "2", "3"):

@@ -57,10 +57,15 @@ from jaxbundle.io.networks.photomodeler_camera import (
     photo_camera,
     rounding_warnings,
 )
-from jaxbundle.io.networks.photomodeler_points import Block, point_table, ray_table, renumber_smart
+from jaxbundle.io.networks.photomodeler_points import (
+    PhotoModelerBlock,
+    point_table,
+    ray_table,
+    renumber_smart,
+)
 from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.io.networks.settings import Document, apply_overrides
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
@@ -86,7 +91,7 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     **Raises:** `InputError` naming file and line, or that the image size is missing.
     """
     path = Path(path)
-    rows = Rows(path, blank=True, fallback="latin-1")
+    rows = TextRows(path, blank=True, fallback="latin-1")
     while rows.more() and not rows.next_words():
         rows.take("the title")
     rows.take("the title")
@@ -181,7 +186,7 @@ class Photo:
     half_unit: Inner
 
 
-def _photos(rows: Rows, header: tuple[Inner, Inner] | None) -> list[Photo]:
+def _photos(rows: TextRows, header: tuple[Inner, Inner] | None) -> list[Photo]:
     photos: list[Photo] = []
     while rows.next_words():
         row = rows.take("a photograph")
@@ -200,23 +205,23 @@ def _photos(rows: Rows, header: tuple[Inner, Inner] | None) -> list[Photo]:
     return photos
 
 
-def _read_numbered(rows: Rows, number: int, what: str) -> Row:
+def _read_numbered(rows: TextRows, number: int, what: str) -> TextRow:
     row = _take(rows, f"{what} of photograph {number}")
     if row.integer(0, f"the number of the photograph before {what}") != number:
         raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
     return row
 
 
-def _points(rows: Rows, what: str) -> Block:
+def _points(rows: TextRows, what: str) -> PhotoModelerBlock:
     ids, values, lines = [], [], []
     for row in _block(rows):
         ids.append(str(row.integer(0, f"the number of one of the {what}")))
         values.append(row.numbers(POINT, 1))
         lines.append(row.number)
-    return Block(ids, np.array(values).reshape(-1, 6), lines)
+    return PhotoModelerBlock(ids, np.array(values).reshape(-1, 6), lines)
 
 
-def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
+def _marks(rows: TextRows, names: Mapping[int, str]) -> PhotoModelerBlock:
     ids, values, lines, photos = [], [], [], []
     for row in _block(rows):
         photo = row.integer(0, "the number of a photograph")
@@ -229,10 +234,10 @@ def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
         ids.append(str(row.integer(1, "the number of a point")))
         values.append(row.numbers(RAY, 2))
         lines.append(row.number)
-    return Block(ids, np.array(values).reshape(-1, 4), lines, photos)
+    return PhotoModelerBlock(ids, np.array(values).reshape(-1, 4), lines, photos)
 
 
-def _block(rows: Rows) -> Iterator[Row]:
+def _block(rows: TextRows) -> Iterator[TextRow]:
     """Lines to the next empty one; without it the file is truncated."""
     while True:
         row = _take(rows, "an empty line after the last of a block")
@@ -241,10 +246,10 @@ def _block(rows: Rows) -> Iterator[Row]:
         yield row
 
 
-def _take(rows: Rows, what: str) -> Row:
+def _take(rows: TextRows, what: str) -> TextRow:
     """The next line of numbers, a decimal comma read as a point."""
     row = rows.take(what)
-    return Row(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
+    return TextRow(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
 
 
 def _names(files: Sequence[str]) -> list[str]:

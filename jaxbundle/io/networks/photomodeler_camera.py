@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.io.text.rows import Row
+from jaxbundle.io.text.rows import TextRow
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
@@ -26,12 +26,12 @@ INNER = ("c", "xp", "yp", "xs", "ys", "K1", "K2", "K3", "P1", "P2")
 Inner = Float[np.ndarray, "10"]
 
 
-def header_camera(row: Row) -> tuple[Inner, Inner] | None:
+def header_camera(row: TextRow) -> tuple[Inner, Inner] | None:
     """The default camera, and half a unit of its last decimals; None without ten numbers."""
     return (row.numbers(INNER), _half_units(row.words)) if len(row) == len(INNER) else None
 
 
-def photo_camera(row: Row, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
+def photo_camera(row: TextRow, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
     """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
     the header's if it is the same."""
     own, half = row.numbers(INNER, 1), _half_units(row.words[1:])

@@ -25,7 +25,7 @@ from jaxbundle.network.tables import Source
 
 
 @dataclasses.dataclass
-class Block:
+class PhotoModelerBlock:
     """Rows of a block: ids, numbers, lines, and for image points the photograph's number."""
 
     id: list[str]
@@ -37,7 +37,7 @@ class Block:
         return len(self.id)
 
 
-def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
+def renumber_smart(path: Path, objects: PhotoModelerBlock, marks: PhotoModelerBlock) -> str:
     """Give smart points with the id of another point new ids, in place.
 
     **Returns:** a message about renumbered points; empty if none was.
@@ -68,7 +68,7 @@ def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
 
 def _find_smart_rows(
     path: Path,
-    objects: Block,
+    objects: PhotoModelerBlock,
     listed: Mapping[str, Sequence[int]],
     repeated: set[str],
     of_smart: set[str],
@@ -116,7 +116,9 @@ def _find_smart_rows(
     return smart_rows
 
 
-def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -> Columns:
+def point_table(
+    path: Path, control: PhotoModelerBlock, objects: PhotoModelerBlock, marked: list[str]
+) -> Columns:
     """Control points as given, then the other object points, then points marked in
     photographs without coordinates."""
     taken = set(control.id)
@@ -139,7 +141,7 @@ def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -
     return Columns(columns, Source(str(path), np.array(lines, np.int64), "line"))
 
 
-def ray_table(path: Path, marks: Block, names: dict[int, str]) -> Columns:
+def ray_table(path: Path, marks: PhotoModelerBlock, names: dict[int, str]) -> Columns:
     """The image points, from the centre of the first pixel; σ 0 becomes the default."""
     if not len(marks):
         raise InputError(f"{path}: there are no image points")

@@ -19,7 +19,7 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 
 
-class Scene(NamedTuple):
+class SceneRaster(NamedTuple):
     """Bands, their type, and `place(X)`, the row and column of points of the ground."""
 
     bands: Float[np.ndarray, "bands rows columns"]
@@ -27,7 +27,7 @@ class Scene(NamedTuple):
     place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
+def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     """A raster in any coordinate system; for a local frame its coordinates are X and Y."""
     package = rasterio()
     try:
@@ -51,7 +51,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
         row = back.d * x + back.e * y + back.f
         return row - 0.5, column - 0.5
 
-    return Scene(bands, dtype, place)
+    return SceneRaster(bands, dtype, place)
 
 
 def write_taken(

@@ -28,7 +28,7 @@ from jaxbundle.io.scanner.csm_trajectory import (
     unit_of,
     view_directions,
 )
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.network.columns import show
@@ -38,7 +38,7 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 
-def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
+def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
     """The pushbroom image of an ISD or a model state.
 
     **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
@@ -66,7 +66,7 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
         sources=states.sources,
     )
     name = str(isd.get("name_sensor") or Path(path).stem)
-    return Scanner(name, image, _earth(isd), states.warnings)
+    return ScannerInput(name, image, _earth(isd), states.warnings)
 
 
 def _read_support_data(path: Path) -> tuple[JsonFields, int]:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm_trajectory import LAGRANGE_ORDER
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.xml_fields import XmlFields
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
@@ -38,7 +38,7 @@ from jaxbundle.pushbroom.scanner import AngleTable, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
 
 
-def read_dimap(file: XmlFields) -> Scanner:
+def read_dimap(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
 
     **Raises:** `InputError` naming file, element and its number: a missing one, an invalid number
@@ -88,7 +88,7 @@ def read_dimap(file: XmlFields) -> Scanner:
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
     name = file.text("Dataset_Id/DATASET_NAME", path.stem)
-    return Scanner(name, image, WGS84, warnings)
+    return ScannerInput(name, image, WGS84, warnings)
 
 
 def _extrapolate(

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.tables import Source
@@ -38,7 +38,7 @@ PROFILES = {"PHR": 1e-3, "PNEO": 1e-6, "S6": 1e-6, "S7": 1e-6}
 """Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them."""
 
 
-def read_dimap2(file: XmlFields) -> Scanner:
+def read_dimap2(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a DIMAP 2 file of sensor level.
 
     **Raises:** `InputError` naming file and element: a missing one, an invalid number or time,
@@ -78,7 +78,7 @@ def read_dimap2(file: XmlFields) -> Scanner:
         sources=(positions, attitude),
     )
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
-    return Scanner(name, image, WGS84, (*lengths, *warnings, *told))
+    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *told))
 
 
 def _period(file: XmlFields, lines: int, epoch: np.datetime64) -> float:

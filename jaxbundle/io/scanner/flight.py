@@ -44,7 +44,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
-from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.pushbroom.noise import Noise, Sigma
 from jaxbundle.pushbroom.signals import KEYS
@@ -128,7 +128,7 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     return {"height": track.number("height"), **angles}
 
 
-def _sigma(section: Section, name: str, radians: float) -> Sigma:
+def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
@@ -150,7 +150,7 @@ def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | lis
     kind = value.get("kind", "constant")
     if kind not in KEYS:
         raise InputError(f"{where}unknown signal {kind!r}{did_you_mean(str(kind), KEYS)}")
-    section = Section(None, where, dict(value))
+    section = TomlSection(None, where, dict(value))
     section.check_keys(("kind", *KEYS[kind]))
     scaled: dict[str, Any] = {"kind": kind}
     for key in value:

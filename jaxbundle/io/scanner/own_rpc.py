@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.rpc import read_rpc
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -37,7 +37,7 @@ from jaxbundle.pushbroom.rpc_agreement import (
 RANDOM_ERROR = re.compile(r"(?i)<ERRRAND>\s*([-+.\de]+)|\berrRand\s*=\s*([-+.\de]+)")
 
 
-def check_against_rpc(scanner: Scanner, path: Path, choose: bool = True) -> Scanner:
+def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) -> ScannerInput:
     """The image of a product, compared with its RPC if there are any: with corrections that agree
     and a warning if they are not the usual ones (`choose`), and a warning if none agree."""
     file = _find_rpc_file(path)
@@ -118,5 +118,5 @@ def _names(corrections: Corrections) -> str:
     return on[0] if len(on) == 1 else f"{', '.join(on[:-1])} and {on[-1]}"
 
 
-def _warn(scanner: Scanner, message: str) -> Scanner:
+def _warn(scanner: ScannerInput, message: str) -> ScannerInput:
     return dataclasses.replace(scanner, warnings=(*scanner.warnings, message))

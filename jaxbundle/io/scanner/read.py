@@ -9,10 +9,10 @@ from jaxbundle.io.scanner.dimap import read_dimap
 from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
 from jaxbundle.io.scanner.own_rpc import check_against_rpc
 from jaxbundle.io.scanner.pvl import read_support_data
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
 from jaxbundle.io.scanner.worldview import read_worldview
-from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 
 PRODUCTS = (".json", ".dim", ".xml", ".imd")
@@ -20,7 +20,7 @@ PRODUCTS = (".json", ".dim", ".xml", ".imd")
 WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 
-def read_scanner(path: str | Path) -> Scanner:
+def read_scanner(path: str | Path) -> ScannerInput:
     """The pushbroom image of a scanner file, `.toml`, or of a product; one that has RPC too is
     compared with them (`own_rpc`).
 
@@ -35,7 +35,7 @@ def read_scanner(path: str | Path) -> Scanner:
     return _read_source(file, scanner) if "source" in scanner else scanner_of(file)
 
 
-def _read_source(file: TomlFile, scanner: Section) -> Scanner:
+def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     """The image of the source, with the name, interpolation and corrections of the file."""
     scanner.check_keys(("source", "name", "interpolation"))
     for name in file.document:
@@ -56,7 +56,7 @@ def _read_source(file: TomlFile, scanner: Section) -> Scanner:
     return check_against_rpc(product, source, choose=not switched)
 
 
-def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
+def _read_product(path: Path, interpolation: str | None = None) -> ScannerInput:
     """The image of a product; `interpolation` applies to CSM files only."""
     suffix = path.suffix.lower()
     if suffix not in PRODUCTS:
@@ -70,7 +70,7 @@ def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
     return _read_xml(path)
 
 
-def _read_xml(path: Path) -> Scanner:
+def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None

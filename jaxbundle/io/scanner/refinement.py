@@ -49,7 +49,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
@@ -150,7 +150,7 @@ def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], li
         scanner = read_scanner(path.parent / scanners.text(id))
         warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
-        freedom = _read_freedom(Section(file, where, common | own.get(id, {})), radians)
+        freedom = _read_freedom(TomlSection(file, where, common | own.get(id, {})), radians)
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
     for image in images:
         if image.earth != images[0].earth:
@@ -161,7 +161,7 @@ def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], li
     return images, warnings
 
 
-def _read_freedom(section: Section, radians: float) -> Freedom:
+def _read_freedom(section: TomlSection, radians: float) -> Freedom:
     fields = {f.name for f in dataclasses.fields(Freedom)}
     section.check_keys(tuple(sorted(fields)))
     values_read: dict[str, Any] = {}
@@ -184,7 +184,7 @@ def _read_freedom(section: Section, radians: float) -> Freedom:
     return Freedom(**values_read)
 
 
-def _sigma(section: Section, key: str, value: Any) -> float:
+def _sigma(section: TomlSection, key: str, value: Any) -> float:
     if isinstance(value, str) and value in WORDS:
         return WORDS[value]
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
@@ -238,7 +238,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
 
 
 def _observations(
-    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: Section, where: str
+    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: TomlSection, where: str
 ) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
     sigma, stated = section.number("sigma", 1.0), "sigma" in section.values

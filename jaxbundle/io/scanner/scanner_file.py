@@ -62,8 +62,8 @@ import numpy as np
 from jaxbundle.cameras import check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
-from jaxbundle.io.scanner.scanner import Scanner
-from jaxbundle.io.text.sections import Section, TomlFile
+from jaxbundle.io.scanner.scanner import ScannerInput
+from jaxbundle.io.text.sections import TomlFile, TomlSection
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
@@ -106,7 +106,7 @@ SECTIONS = {
 REQUIRED_FIELDS = ("scanner", "times", "position", "attitude", "optics")
 
 
-def scanner_of(file: TomlFile) -> Scanner:
+def scanner_of(file: TomlFile) -> ScannerInput:
     """The pushbroom image that the sections of a scanner file describe.
 
     **Raises:** `InputError` naming file, section and key, or table and line.
@@ -133,7 +133,7 @@ def scanner_of(file: TomlFile) -> Scanner:
         corrections,
         (positions, attitudes),
     )
-    return Scanner(scanner.text("name", file.path.stem), image, earth, lengths)
+    return ScannerInput(scanner.text("name", file.path.stem), image, earth, lengths)
 
 
 def _orientation(file: TomlFile) -> frames.EarthOrientation:
@@ -152,7 +152,7 @@ def _epoch(file: TomlFile) -> str:
     return str(epoch)
 
 
-def _options(section: Section, method: str) -> dict[str, Any]:
+def _options(section: TomlSection, method: str) -> dict[str, Any]:
     """Interpolation, order, gap, extrapolation."""
     options: dict[str, Any] = {"method": section.text("interpolation", method)}
     if "order" in section:
@@ -176,7 +176,7 @@ def mounting_of(file: TomlFile) -> tuple[float, float, float]:
     return pitch, roll, yaw
 
 
-def earth_of(scanner: Section) -> Ellipsoid | None:
+def earth_of(scanner: TomlSection) -> Ellipsoid | None:
     """The ellipsoid of [scanner] earth; None for a local frame."""
     value = scanner.values.get("earth", "WGS84")
     if isinstance(value, list):
@@ -211,7 +211,7 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
 
-def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> str:
+def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) -> str:
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
@@ -246,7 +246,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
 
 
 def _orbit(
-    file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
+    file: TomlFile, section: TomlSection, kind: str, earth: Ellipsoid | None
 ) -> tuple[Table, Source]:
     """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
@@ -277,7 +277,7 @@ def _orbit(
         except InputError as error:
             raise InputError(f"{section.where}{error}") from None
     else:
-        circle = Section(file, f"{section.where}circle: ", section.values["circle"])
+        circle = TomlSection(file, f"{section.where}circle: ", section.values["circle"])
         angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
         angles = [file.radians * angle for angle in angles]
         P, V = frames.circular_orbit(t, circle.number("height"), *angles)

@@ -29,7 +29,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm_trajectory import slerp
 from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.columns import show
@@ -45,7 +45,7 @@ CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
 all three, to 0.7 m without refraction."""
 
 
-def read_worldview(file: XmlFields) -> Scanner:
+def read_worldview(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a DigitalGlobe XML file.
 
     **Raises:** `InputError` naming file and element: missing, not a number, a product of
@@ -91,7 +91,7 @@ def read_worldview(file: XmlFields) -> Scanner:
         sources=(tables.positions, tables.attitude),
     )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
+    return ScannerInput(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
 
 def _line_times(file: XmlFields, lines: int) -> LineTimes:

@@ -19,7 +19,7 @@ def join_numbers(values: Iterable[float], separator: str = " ") -> str:
     return separator.join(repr(float(value)) for value in values)
 
 
-class Row:
+class TextRow:
     """A line of a file: its place, text, and words."""
 
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
@@ -81,7 +81,7 @@ class Row:
         return number
 
 
-class Rows:
+class TextRows:
     """The lines of a file in sequence.
 
     **Arguments:** `comment` begins lines to skip; `blank` whether empty lines count;
@@ -105,7 +105,7 @@ class Rows:
         self.separator = separator
         self.position = 0
 
-    def __iter__(self) -> Iterator[Row]:
+    def __iter__(self) -> Iterator[TextRow]:
         while self.more():
             yield self.take("a line")
 
@@ -113,7 +113,7 @@ class Rows:
         """Whether there is another line."""
         return self.position < len(self.lines)
 
-    def take(self, what: str) -> Row:
+    def take(self, what: str) -> TextRow:
         """The next line; `what` names the expected content in messages.
 
         **Raises:** `InputError` if the file has ended.
@@ -123,7 +123,7 @@ class Rows:
             raise InputError(f"{self.path}: the file ends after line {last}; {what} is expected")
         number, text = self.lines[self.position]
         self.position += 1
-        return Row(self.path, number, text, self.separator)
+        return TextRow(self.path, number, text, self.separator)
 
     def next_words(self) -> list[str]:
         """The words of the next line without taking it; none at the end of the file."""

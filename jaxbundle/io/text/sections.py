@@ -34,9 +34,9 @@ class TomlFile:
     path: Path
     document: dict[str, Any]
 
-    def section(self, name: str) -> "Section":
+    def section(self, name: str) -> "TomlSection":
         """A section, empty if it is missing."""
-        return Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
+        return TomlSection(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
 
     def require(self, names: Sequence[str]) -> None:
         """Refuse a file that lacks one of these sections."""
@@ -66,14 +66,14 @@ def read_sections(
         if not isinstance(value, dict):
             raise InputError(f"{path}: {key} must be a section, [{key}]")
         if sections[key]:
-            Section(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
+            TomlSection(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
     file = TomlFile(path, document)
     file.require(needed)
     return file
 
 
 @dataclasses.dataclass(frozen=True)
-class Section:
+class TomlSection:
     """One section; every getter refuses missing entries and other types."""
 
     file: TomlFile | None

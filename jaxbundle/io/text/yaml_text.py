@@ -33,7 +33,7 @@ NOT_READ = {
 }
 
 
-class Line:
+class YamlLine:
     """A line with content: its number, its indentation, and the rest."""
 
     def __init__(self, path: str | Path, number: int, text: str, lenient: bool = False):
@@ -62,9 +62,9 @@ def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[st
     return value
 
 
-def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
+def _lines(path: str | Path, text: str, lenient: bool) -> list[YamlLine]:
     """The lines without comments; content in brackets or braces becomes one line."""
-    lines: list[Line] = []
+    lines: list[YamlLine] = []
     open_brackets, ended = 0, 0
     for number, raw in enumerate(text.splitlines(), 1):
         found = COMMENT.match(raw)
@@ -80,7 +80,7 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
         if open_brackets:
             lines[-1].text += " " + bare.strip()
         else:
-            lines.append(Line(path, number, bare, lenient))
+            lines.append(YamlLine(path, number, bare, lenient))
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
         open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
     if open_brackets:
@@ -88,7 +88,7 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
     return lines
 
 
-def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _block(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
     """The value of the lines of one indentation, and the lines after it."""
     if depth > MAX_NESTING:
         raise lines[0].error(f"nested too deeply: more than {MAX_NESTING} levels")
@@ -96,16 +96,16 @@ def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]
     return read(lines, indent, depth)
 
 
-def _is_item(line: Line) -> bool:
+def _is_item(line: YamlLine) -> bool:
     return line.text == "-" or line.text.startswith("- ")
 
 
-def _items(lines: list[Line], indent: int, depth: int) -> tuple[list[Any], list[Line]]:
+def _items(lines: list[YamlLine], indent: int, depth: int) -> tuple[list[Any], list[YamlLine]]:
     values = []
     while lines and lines[0].indent == indent and _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
         # "- key: value" is a block whose indentation is that of the key
-        inner = Line(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
+        inner = YamlLine(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
         if inner.text and not _is_item(inner) and not KEY.fullmatch(inner.text):
             values.append(_value(inner, inner.text))
         elif inner.text:
@@ -117,7 +117,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list[Any], list[
     return values, lines
 
 
-def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict[str, Any], list[Line]]:
+def _keys(lines: list[YamlLine], indent: int, depth: int) -> tuple[dict[str, Any], list[YamlLine]]:
     values: dict[str, Any] = {}
     while lines and lines[0].indent == indent and not _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
@@ -134,7 +134,7 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict[str, Any], l
     return values, lines
 
 
-def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _parse_nested(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
     """The value below a key or the dash of a list; a list may have the indentation of its key."""
     if not lines or lines[0].indent < indent:
         return None, lines
@@ -143,7 +143,7 @@ def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list
     return _block(lines, lines[0].indent, depth + 1)
 
 
-def _value(line: Line, text: str) -> Any:
+def _value(line: YamlLine, text: str) -> Any:
     """A scalar, or a list in brackets."""
     text = text.strip()
     if text[:1] in NOT_READ and line.lenient:
