@@ -321,7 +321,9 @@ class NetworkView:
         drawings = {"network-data": self._scene, "frames": describe_frames(found)}
         title = f"{clean(found.network.name) or 'network'}: explorer"
         shown_first = give_verdict(
-            found.verdict.findings, found.warnings, facts(row for row in summary(found) if row[0] != "Note")
+            found.verdict.findings,
+            found.warnings,
+            facts(row for row in summary(found) if row[0] != "Note"),
         )
         sections = [
             shown_first,

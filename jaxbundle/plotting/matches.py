@@ -1,6 +1,7 @@
 """Common points of photographs: the match graph, the overlap, tracks in a photograph."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
@@ -20,16 +21,21 @@ from jaxbundle.plotting.style import (
     title,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxbundle.bundle.result import Adjustment
+
 KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
 """Colour and line of a pair that a relative orientation, a plane, a rotation explains."""
-WIDEST_LINE = 4.0
-"""Width of the line of the pair with the most matches, points."""
 
 Pairs = Sequence[tuple[str, str, int, int, str]]
 """Two photographs, matches found, matches verified, kind."""
 
 
-def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax=None):
+def match_graph(
+    names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax: "Axes | None" = None
+) -> "Axes":
     """Photographs on a circle, in their order, and a line for every verified pair, wider for
     more matches; those in no part (`alone`) are coloured.
 
@@ -48,7 +54,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
             line,
             color=colour,
             alpha=0.25 + 0.6 * share,
-            linewidth=WIDEST_LINE * max(share, 0.1),
+            linewidth=4.0 * max(share, 0.1),  # below 0.4 points a line vanishes
             label="" if kind in drawn else kind,
             zorder=2,
         )
@@ -83,7 +89,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
     return ax
 
 
-def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
+def overlap_matrix(names: Sequence[str], pairs: Pairs, ax: "Axes | None" = None) -> "Axes":
     """The number of verified matches of every two photographs, as a matrix.
 
     **Returns:** matplotlib `Axes`.
@@ -116,7 +122,12 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
     return ax
 
 
-def tracks_in_photograph(adjustment, image: str, picture: UInt8[np.ndarray, "r c"], ax=None):
+def tracks_in_photograph(
+    adjustment: "Adjustment",
+    image: str,
+    picture: UInt8[np.ndarray, "r c"],
+    ax: "Axes | None" = None,
+) -> "Axes":
     """The measurements of a photograph in its picture, coloured by the number of photographs of the
     point; removed ones as crosses.
 

@@ -61,7 +61,7 @@ YAML = (".yaml", ".yml")
 SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
-OF_A_MESSAGE = b"distortion_model"
+MESSAGE_KEY = b"distortion_model"
 """Required in addition to a lone `k` in a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
@@ -73,7 +73,7 @@ FISHEYE = ("equidistant", "fisheye")
 def is_opencv(path: Path) -> bool:
     """Whether a file has a name of this kind and mentions a camera matrix."""
     text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    names = MATRIX if OF_A_MESSAGE in text else MATRIX[:-1]
+    names = MATRIX if MESSAGE_KEY in text else MATRIX[:-1]
     return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in names)
 
 

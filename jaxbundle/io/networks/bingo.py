@@ -40,9 +40,9 @@ from jaxbundle.network.columns import Columns, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 IMAGE, GEO = "image.dat", "geoin.dat"
-END = "-99"
-SKIPPED = ("RADI", "ADPA")
-KNOWN = ("CAPA", "CONT", "CHCK", *SKIPPED)
+END_OF_PHOTOGRAPH = "-99"
+SKIPPED_STATEMENTS = ("RADI", "ADPA")
+STATEMENTS = ("CAPA", "CONT", "CHCK", *SKIPPED_STATEMENTS)
 INTERIOR = ("c", "x0", "y0")
 ROLES = {"CONT": "fixed", "CHCK": "check"}
 
@@ -133,7 +133,7 @@ def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, TextRow]
     for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
-        if row.words[0] == END:
+        if row.words[0] == END_OF_PHOTOGRAPH:
             begun = False
         elif len(row) <= 2:
             photos.append((row.words[0], row.words[1] if len(row) == 2 else None, row))
@@ -162,7 +162,7 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
         if _is_comment(row):
             continue
         keyword = row.words[0].upper()
-        if keyword in SKIPPED:
+        if keyword in SKIPPED_STATEMENTS:
             skipped[keyword] = True
         elif keyword == "CAPA":
             camera = _camera(row)
@@ -184,9 +184,10 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
                 }
             )
         else:
+            hint = did_you_mean(keyword, STATEMENTS)
             raise row.error(
-                f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "
-                "remove it if the network does not need it"
+                f"the statement {row.words[0][:20]!r} is not known{hint}; remove it if the network "
+                "does not need it"
             )
     if not cameras:
         raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")

@@ -36,7 +36,7 @@ from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-NONE = np.uint64(2**64 - 1)
+NO_POINT_ID = np.uint64(2**64 - 1)
 
 
 class _Bytes:
@@ -129,7 +129,7 @@ def _images(path: Path) -> list[ColmapImage]:
         points = np.frombuffer(file.raw(24 * file.count("image points", 24)), POINT2D)
         if not np.isfinite(points["xy"]).all():
             raise file.error("an image point is not a finite number")
-        none = points["point"] == NONE
+        none = points["point"] == NO_POINT_ID
         if (points["point"][~none] >= 2**63).any():
             raise file.error("an image point has an impossible object point")
         point = np.where(none, 0, points["point"]).astype(np.int64) - none  # NO_POINT: −1

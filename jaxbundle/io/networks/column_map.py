@@ -71,7 +71,7 @@ KEYS = (
     "rotation",
 )
 SEPARATORS = {"blanks": None, "tab": "\t"}
-UNUSED, REST = "-", "..."
+UNUSED_COLUMN, ANY_FURTHER = "-", "..."
 IDS = ("id", "camera", "role", "image", "point", "from", "to")
 MATRIX = tuple(f"m{i}{k}" for i in "123" for k in "123")
 ROTATIONS: dict[str, tuple[tuple[str, ...], Callable | None]] = {
@@ -138,10 +138,10 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         raise InputError(f"{where}: file is {show(file)}; the name of a file is expected")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
-    more = bool(names) and names[-1] == REST
+    more = bool(names) and names[-1] == ANY_FURTHER
     names = names[:-1] if more else names
-    used = {name: k for k, name in enumerate(names) if name != UNUSED}
-    if len(used) + names.count(UNUSED) < len(names):
+    used = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
+    if len(used) + names.count(UNUSED_COLUMN) < len(names):
         raise InputError(f"{where}: a column occurs twice")
     scale, constant = (_table(where, entry, key) for key in ("scale", "constant"))
     for name, factor in scale.items():

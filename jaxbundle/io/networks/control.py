@@ -32,9 +32,9 @@ from jaxbundle.network.unit_mistakes import name_degrees
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.network import find_start_values
 
-PLAIN = ("id", *AXES, *POINT_SIGMAS)
+BARE_COLUMNS = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
-NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
+NAMES = {name.lower(): name for name in (*BARE_COLUMNS, "role", "name", *POINT_ERRORS)}
 EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
 """A selection of check points, such as `every 3rd`."""
 
@@ -76,7 +76,9 @@ def read_control(path: str | Path) -> Points:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not lines:
-        raise InputError(f"{path}: the file is empty; rows of {', '.join(PLAIN[:4])} are expected")
+        raise InputError(
+            f"{path}: the file is empty; rows of {', '.join(BARE_COLUMNS[:4])} are expected"
+        )
     separator = _separator(lines[0][1])
     try:
         rows = [_cells(line, separator) for _, line in lines]
@@ -88,10 +90,10 @@ def read_control(path: str | Path) -> Points:
     elif len(rows[0]) not in (4, 7):
         raise InputError(
             f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
-            f"{', '.join(PLAIN[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+            f"{', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
             f"{_split_name(rows[0], separator)}"
         )
-    header = header or PLAIN[: len(rows[0])]
+    header = header or BARE_COLUMNS[: len(rows[0])]
     for (number, _), row in zip(lines, rows):
         if len(row) != len(header):
             raise InputError(

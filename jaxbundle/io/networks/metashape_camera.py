@@ -42,7 +42,7 @@ from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import show
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-OLD = ("fx", "fy", "skew")
+OLD_COEFFICIENTS = ("fx", "fy", "skew")
 FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye", "equisolid", "equisolid_fisheye")
 TYPES = ("frame", *FISHEYE)
 PIXEL = ("pixel_width", "pixel_height")
@@ -115,18 +115,18 @@ def _coefficients(
 ) -> tuple[dict[str, float], str]:
     """All coefficients in the current form, and the names of unknown ones that are not 0."""
     tags = [element.tag for element in calibration]
-    twice = next((tag for tag in (*COEFFICIENTS, *OLD) if tags.count(tag) > 1), None)
+    twice = next((tag for tag in (*COEFFICIENTS, *OLD_COEFFICIENTS) if tags.count(tag) > 1), None)
     if twice:
         raise InputError(f"{where}: <{twice}> occurs twice")
     values = {
         element.tag: number_in(element.text or "", f"{where}, {element.tag}")
         for element in calibration
         # k5 and the like are unknown here, but must not be dropped in silence
-        if element.tag in (*COEFFICIENTS, *OLD)
+        if element.tag in (*COEFFICIENTS, *OLD_COEFFICIENTS)
         or (re.fullmatch(r"[a-z]\d+", element.tag) and not len(element))
     }
     old = "f" not in values and "fy" in values
-    known = {*COEFFICIENTS, *OLD} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
+    known = {*COEFFICIENTS, *OLD_COEFFICIENTS} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
     ignored = [f"{tag} {value:g}" for tag, value in values.items() if tag not in known and value]
     p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in values.items() if k in known}
     if old:

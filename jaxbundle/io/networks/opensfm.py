@@ -77,15 +77,15 @@ RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
 )
 FILES = (RECONSTRUCTION, TRACKS, MODELS)
 HEAD = "OPENSFM_TRACKS_VERSION_v"
-ONE = ("focal",)
-TWO = ("focal_x", "focal_y")
+ONE_FOCAL_LENGTH = ("focal",)
+TWO_FOCAL_LENGTHS = ("focal_x", "focal_y")
 KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
-    "perspective": ("opencv", ONE, ("k1", "k2")),
-    "simple_radial": ("opencv", TWO, ("k1",)),
-    "radial": ("opencv", TWO, ("k1", "k2")),
-    "brown": ("opencv", TWO, ("k1", "k2", "k3", "p1", "p2")),
-    "fisheye": ("kannala-brandt", ONE, ("k1", "k2")),
-    "fisheye_opencv": ("kannala-brandt", TWO, ("k1", "k2", "k3", "k4")),
+    "perspective": ("opencv", ONE_FOCAL_LENGTH, ("k1", "k2")),
+    "simple_radial": ("opencv", TWO_FOCAL_LENGTHS, ("k1",)),
+    "radial": ("opencv", TWO_FOCAL_LENGTHS, ("k1", "k2")),
+    "brown": ("opencv", TWO_FOCAL_LENGTHS, ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("kannala-brandt", ONE_FOCAL_LENGTH, ("k1", "k2")),
+    "fisheye_opencv": ("kannala-brandt", TWO_FOCAL_LENGTHS, ("k1", "k2", "k3", "k4")),
 }
 """Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
@@ -216,7 +216,10 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         known = ", ".join((*KINDS, *FITTED, *SPHERICAL))
         raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
-    f = [max(size) * fields.number(name) for name in (ONE * 2 if single else TWO)]
+    f = [
+        max(size) * fields.number(name)
+        for name in (ONE_FOCAL_LENGTH * 2 if single else TWO_FOCAL_LENGTHS)
+    ]
     c = [
         max(size) * (0.0 if single else fields.number(name, 0.0)) + (n - 1) / 2
         for name, n in zip(("c_x", "c_y"), size)
@@ -424,11 +427,11 @@ def _camera_fields(camera: Camera) -> dict[str, Any]:
     name = next(
         name
         for name, (focal, names) in kinds.items()
-        if (centred or focal == TWO) and not any(p[k] for k in most if k not in names)
+        if (centred or focal == TWO_FOCAL_LENGTHS) and not any(p[k] for k in most if k not in names)
     )
     focal, names = kinds[name]
     fields = {"projection_type": name, "width": w, "height": h}
-    if focal == ONE:
+    if focal == ONE_FOCAL_LENGTH:
         fields["focal"] = one_focal_length(camera, "OpenSfM") / s
     else:
         fields |= {"focal_x": p["fx"] / s, "focal_y": p["fy"] / s, "c_x": c[0], "c_y": c[1]}

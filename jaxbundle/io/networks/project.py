@@ -84,7 +84,10 @@ INLINE = {
 }
 """The tables and the name of one of their rows in the TOML file."""
 
-WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "x", "y")}
+OPTIONAL_WHERE_ORIENTED = {
+    "points": ("id", "role", *AXES),
+    "observations": ("image", "point", "x", "y"),
+}
 """Tables not required for oriented images, and their columns."""
 
 
@@ -108,9 +111,9 @@ def read_project(
     tables = {
         table: _read_table(document, table, path)
         for table in TABLES
-        if not (oriented and table in WITHOUT and _is_absent(document, table))
+        if not (oriented and table in OPTIONAL_WHERE_ORIENTED and _is_absent(document, table))
     }
-    for table, columns in WITHOUT.items() if oriented else ():
+    for table, columns in OPTIONAL_WHERE_ORIENTED.items() if oriented else ():
         found = tables.get(table)
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))

@@ -24,7 +24,7 @@ SETTINGS = (*TEXT, "sigma_image", "sigma_origin", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
 )
-ALL = "*"
+ALL_CAMERAS = "*"
 """Means all cameras, unless one has this id."""
 
 Document = dict[str, Any]
@@ -51,7 +51,7 @@ def apply_overrides(
         if not equals:
             raise InputError(f"--set {override}: expected KEY=VALUE")
         if key == "free":
-            _override_cameras(document["camera"], f"camera.{ALL}.free", text)
+            _override_cameras(document["camera"], f"camera.{ALL_CAMERAS}.free", text)
         elif key.startswith("camera."):
             _override_cameras(document["camera"], key, text)
         elif key.partition(".")[0] in SECTIONS:
@@ -74,13 +74,13 @@ def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
         if rest.startswith(f"{ids[c]}."):
             _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
             return
-    if not rest.startswith(f"{ALL}."):
+    if not rest.startswith(f"{ALL_CAMERAS}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
-            f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL)), 12, str)}"
+            f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL_CAMERAS)), 12, str)}"
         )
     for camera in cameras:
-        _override_camera(camera, key, rest.removeprefix(f"{ALL}."), text)
+        _override_camera(camera, key, rest.removeprefix(f"{ALL_CAMERAS}."), text)
 
 
 def _override_camera(camera: dict, key: str, field: str, text: str) -> None:

@@ -49,7 +49,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
 ROS_FILES = ("*.yaml",)
-OF_A_FISHEYE = "fisheye_model", "distortion_model"
+FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
 NAMES = (
     ("M1", "D1", "M2", "D2"),
     ("K1", "D1", "K2", "D2"),
@@ -146,7 +146,7 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
-        entries |= {name: own[name] for name in OF_A_FISHEYE if name in own}
+        entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
     rectified = rectify(cameras, R, T)
     entries |= {"R": (3, 3, R.ravel()), "T": (3, 1, T)}
     entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
@@ -173,7 +173,7 @@ def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Netwo
     cameras = []
     for k in (1, 2):
         matrix, coefficients = names[2 * k - 2 : 2 * k]
-        own = {name: entries[name] for name in OF_A_FISHEYE if name in entries}
+        own = {name: entries[name] for name in FISHEYE_ENTRIES if name in entries}
         for size in ("image_width", "image_height"):
             if (value := entries.get(f"{size}_{k}", entries.get(size))) is not None:
                 own[size] = value

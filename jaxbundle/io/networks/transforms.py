@@ -54,7 +54,7 @@ INTRINSICS = (
     *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y"),
     *("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
 )
-UNDONE = ("applied_transform", "applied_scale", "scale", "offset")
+APPLIED_TRANSFORMATIONS = ("applied_transform", "applied_scale", "scale", "offset")
 
 
 def is_transforms(path: Path) -> bool:
@@ -98,7 +98,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if twice:
         raise InputError(f"{path}: two frames have the file_path {twice!r}")
     told = [f"{why}; left out {count(len(lost), 'frame')}: {list_some(lost)}"] if lost else []
-    undone = [name for name in UNDONE if file.get(name) is not None]
+    undone = [name for name in APPLIED_TRANSFORMATIONS if file.get(name) is not None]
     if undone:
         told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
     images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))

@@ -53,7 +53,7 @@ class MapSystem:
         x, y = (np.asarray(v) for v in self.transformer.transform(*degrees))
         return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
 
-    def around(self, x: np.ndarray, middle: float) -> np.ndarray:
+    def unwrap(self, x: np.ndarray, middle: float) -> np.ndarray:
         """The longitudes shifted by full turns to within half a turn of the middle."""
         return x if self.turn is None else x - self.turn * np.round((x - middle) / self.turn)
 
@@ -107,7 +107,7 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     if not len(seen):
         return x
     middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
-    x = system.around(x, float(middle))
+    x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:
         steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
         longest = np.nanmax(np.concatenate([np.zeros(1), *steps]))

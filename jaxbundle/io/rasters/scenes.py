@@ -46,7 +46,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
         X: Float[np.ndarray, "3 *shape"],
     ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
         x, y = system.from_ground(X)
-        x = system.around(x, middle)
+        x = system.unwrap(x, middle)
         column = back.a * x + back.b * y + back.c
         row = back.d * x + back.e * y + back.f
         return row - 0.5, column - 0.5

@@ -17,7 +17,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import list_some, show
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
-KNOWN = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")
+DISTORTIONS = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")
 
 
 def optics_of(
@@ -104,9 +104,9 @@ def _distortion(
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
             return kind, _transverse(isd, a, b, x, y)
+    known = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; {', '.join(KNOWN[:-1])} "
-        f"or {KNOWN[-1]} is expected"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; {known} is expected"
     )
 
 

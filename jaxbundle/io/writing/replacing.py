@@ -10,7 +10,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import defer_interrupts, temporary
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def unwritable(path: str | Path, error: OSError) -> InputError:
     """Why a file or folder cannot be written, in one line; a full disk is named."""
     why = error.strerror or " ".join(str(error).split())
     return InputError(
-        f"{path}: cannot be written: {why}{disk_of(path) if error.errno in FULL else ''}"
+        f"{path}: cannot be written: {why}{disk_of(path) if error.errno in DISK_FULL else ''}"
     )
 
 

@@ -1,7 +1,7 @@
 """The page of an adjustment, and of a command based on one."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.report import head
@@ -15,6 +15,9 @@ from jaxbundle.report.page.scene import describe_frames, describe_network
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
 from jaxbundle.report.verdict import Finding, Verdict, conclude
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 A_POSTERIORI = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
@@ -40,7 +43,7 @@ class Addition(NamedTuple):
     tables: Mapping[str, Listing] = NOTHING
     name: str = ""
 
-    def conclude(self, adjustment) -> Verdict:
+    def conclude(self, adjustment: "Adjustment") -> Verdict:
         """The verdict of the command on its adjustment."""
         return conclude(adjustment, self.findings, self.without, len(self.warnings))
 
@@ -51,7 +54,11 @@ REPEATED_LINES = ("Note", "Verdict", "Redundancy", "σ0", "Image precision", "χ
 
 
 def compose(
-    adjustment, origin: Origin = UNKNOWN, *, date: str | None = None, also: Addition = ALONE
+    adjustment: "Adjustment",
+    origin: Origin = UNKNOWN,
+    *,
+    date: str | None = None,
+    also: Addition = ALONE,
 ) -> Iterator[str]:
     """The page of an adjustment as HTML, in pieces; for an unsolved one, the reason.
 
@@ -74,7 +81,7 @@ def compose_failure(
     yield from write(Page(f"no result: {kind}", [first], origin))
 
 
-def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
+def describe(adjustment: "Adjustment", origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
     """The page of an adjustment, as a `Page`."""
     name = clean(also.name or adjustment.network.name) or "network"
     title = f"{name}: {also.kind}" if also.kind else name
@@ -95,7 +102,7 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
     return Page(title, shown, origin, settings, tables, drawings)
 
 
-def _whole(adjustment) -> list[str]:
+def _whole(adjustment: "Adjustment") -> list[str]:
     """Summary numbers."""
     return [
         "<h3>Result</h3>\n",

@@ -82,7 +82,7 @@ def _holds(kind: str, low: int, high: int) -> bool:
     return np.iinfo(kind).min <= low and high <= np.iinfo(kind).max
 
 
-def script_text(value) -> str:
+def script_text(value: Any) -> str:
     """JSON that is safe in a script element: ASCII without `<`."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 

@@ -160,7 +160,7 @@ def _css_text(words: str) -> str:
     return "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in words)
 
 
-def _data(id: str, value) -> str:
+def _data(id: str, value: Any) -> str:
     return f'<script type="application/json" id="{id}">{script_text(value)}</script>\n'
 
 
