@@ -24,7 +24,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 
 
 @app.command(example="examples/convergent4/project.toml --out out/convergent4", once=True)
-def adjust(
+def adjust(  # noqa: PLR0913 - the options of the command
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     out: Annotated[

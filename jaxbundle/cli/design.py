@@ -14,7 +14,7 @@ SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
 
 @app.command(example="PROJECT.toml --distance 1,6 --out out/designed")
-def design(
+def design(  # noqa: PLR0913 - the options of the command
     project: Annotated[Path, typer.Argument(help="cameras, targets and start stations")],
     aim: Annotated[str, choice(AIMS, "quantity to minimise")] = "mean",
     of: Annotated[

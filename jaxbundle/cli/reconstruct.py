@@ -14,7 +14,7 @@ from jaxbundle.system.interrupts import advise
 
 
 @app.command(name="reconstruct", example="PHOTOS --control gcp_list.txt --out out/block")
-def reconstruct_command(
+def reconstruct_command(  # noqa: PLR0913 - the options of the command
     photos: Annotated[list[Path], typer.Argument(help="photographs, or folders of them")],
     out: Annotated[Path, typer.Option(help="folder for report, page, JSON, tables, COLMAP model")],
     camera: Annotated[

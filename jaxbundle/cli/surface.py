@@ -29,7 +29,7 @@ EXAMPLE = (
 
 
 @app.command(example=EXAMPLE)
-def surface(
+def surface(  # noqa: PLR0913 - the options of the command
     input: Annotated[
         list[Path],
         typer.Argument(

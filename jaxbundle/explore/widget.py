@@ -15,19 +15,17 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.server import Refused, page_file, respond
 from jaxbundle.explore.view import View
 
-LOWEST, HIGHEST = 200, 4000
-"""Pixels of the frame."""
-
 
 def show(view: View, *, height: int = 800) -> Any:
     """A widget that shows a view (`NetworkView`, `CameraView`, `ScannerView`) and answers its
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
-    height = integer("height", height, LOWEST, HIGHEST)
+    # lower than its controls, or higher than any screen, a frame is of no use
+    height = integer("height", height, 200, 4000)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
-    widget.on_msg(lambda one, content, buffers: one.send(*reply(view, content)))
+    widget.on_msg(lambda one, content, _: one.send(*reply(view, content)))
     return widget
 
 

@@ -129,7 +129,7 @@ def write_rows(
             print(",".join(map(str, row)))
 
 
-def _plain(values):
+def _plain(values: Column) -> list:
     return values.tolist() if isinstance(values, np.ndarray) else list(values)
 
 
