@@ -164,6 +164,7 @@ def batch(  # noqa: PLR0913 - the options of the command
             set,
         )
         if not first:
+            # only the first process writes, though all compute
             html, table, summary, asked, quiet = "", None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
@@ -190,6 +191,7 @@ def batch(  # noqa: PLR0913 - the options of the command
         )
     if asked:
         found = Population(result_rows(inputs, json_lines))
+        # read again, for the keys that now have results
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         write_outputs(found, beside, table, summary)
     if html:

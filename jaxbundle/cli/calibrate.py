@@ -245,6 +245,7 @@ def _check_names(cameras: Iterable[str]) -> None:
 
     folders: dict[str, str] = {}
     for name in cameras:
+        # some systems do not tell the letters of a name from capitals
         other = folders.setdefault(file_name(name).casefold(), name)
         if other != name:
             raise InputError(

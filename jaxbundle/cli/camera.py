@@ -51,6 +51,7 @@ def camera(
             )
         tables.append(table_of(given, reach, width, about_origin))
         print_camera(given, extent, size, pitch, tables[-1])
+        # two files may have cameras of one name
         name = given.id if given.id not in curves else f"{given.id} ({file})"
         curves[name] = table_of(given, reach, reach / points, about_origin)
         units.add(unit)

@@ -33,6 +33,7 @@ def completion(shell: Annotated[str, choice(SHELLS, argument=True)]) -> None:
     zsh a file that ~/.zshrc sources after compinit, of fish
     ~/.config/fish/completions/jaxbundle.fish.
     """
+    # a command registers itself when its file is imported
     for command in COMMANDS:
         importlib.import_module(f"jaxbundle.cli.{command}")
     parser = typer.main.get_command(app)

@@ -47,6 +47,7 @@ def recognise(input: str) -> str:
         return SCANNER
     if path.suffix.lower() in (".dim", ".imd"):
         return SCANNER
+    # before the networks, since its folder contains one
     if is_of_calibrate(path):
         return CAMERA
     if recognise_format(path) is not None:

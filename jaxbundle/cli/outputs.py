@@ -222,12 +222,14 @@ def write_result(
                     write_text(new / PAGE, page())
                 if (name := name_inside(html, out)) not in (None, PAGE):
                     write_bytes(new / name, (new / PAGE).read_bytes())
+    # only now: if the folder could not be written, neither is the rest
     if json not in ("", "-"):
         write_text(Path(json), text)
     if page is not None and html and name_inside(html, out) is None:
         if out is None:
             write_text(Path(html), page())
         else:
+            # a copy: the page of a large result takes seconds to make
             write_bytes(Path(html), (out / PAGE).read_bytes())
 
 

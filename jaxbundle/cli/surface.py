@@ -103,6 +103,7 @@ def surface(  # noqa: PLR0913 - the options of the command
         raise InputError(f"--dsm {dsm}: a positive size is expected")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
+    # read before matching, which takes minutes: its errors come at once
     given = read_cloud(check).X if check else np.zeros((0, 3))
     check_folder(out, "surface", FILES, input, force)
     with counting(quiet or json == "-") as bar:

@@ -160,6 +160,7 @@ class NetworkView:
         """The adjusted values with the stations at their new places."""
         values = self.adjustment.values
         position, rotation = (np.array(x) for x in (values.position, values.rotation))
+        # positions of the engine are relative to the origin of the network
         for row, centre, M in moves:
             position[row] = centre - self.problem.origin
             rotation[row] = np.asarray(quaternion_from_matrix(jnp.asarray(M)))

@@ -53,4 +53,5 @@ def _widget_class() -> Any:
         raise ImportError("widgets need anywidget: pip install 'jaxbundle[widgets]'") from error
     script = files("jaxbundle.explore.page").joinpath("widget.js").read_text(encoding="utf-8")
     traits = {"page": traitlets.Unicode().tag(sync=True), "height": traitlets.Int().tag(sync=True)}
+    # made here, not at the top: its base class may not be installed
     return type("Explorer", (anywidget.AnyWidget,), {"_esm": script, **traits})

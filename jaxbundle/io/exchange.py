@@ -99,6 +99,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     model = None if model is None else key_of(model)
     models = check_own_models(models)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
+        # real paths: one of them may be a link
         _refuse_overlap({os.path.realpath(input)}, {os.path.realpath(output)}, output)
         _keep_others(output, kind, force)
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
@@ -245,6 +246,7 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
+    # files that a writer adds to the one that is named
     beside = {
         "csv": [images_path(output)],
         "bundler": [output.parent / LIST],

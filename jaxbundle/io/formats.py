@@ -347,6 +347,7 @@ def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
 def recognise_target(path: Path) -> str | None:
     """The kind of an output, from its name."""
     kinds = (
+        # the narrow names of cameras first, the broad ones after the networks
         *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
         *TARGETS.items(),
         *CAMERA_KINDS.items(),
@@ -412,7 +413,9 @@ def read_network(
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
+    # read before the network, which may take long: its errors come at once
     control_points = None if control is None else read_control(control)
+    # other formats have names of their own for their models
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     network = FORMATS[format].read(path, overrides, *own)
     if control_points is not None:

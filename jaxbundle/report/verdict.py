@@ -88,6 +88,7 @@ def conclude(
 ) -> Verdict:
     """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
     those of the adjustment, and with further `warnings`."""
+    # those of the command first: they are about its own question
     found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
     return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
 
@@ -255,6 +256,7 @@ def _blunders(adjustment: "Adjustment") -> Finding:
     if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
+    # more than chance explains, but none that stands out: σ of some are too small
     many = over > explained_by_chance(len(tau))
     return Finding("Blunders", NOTED if many else GOOD, words, count(over, "large residual"))
 

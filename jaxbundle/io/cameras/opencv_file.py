@@ -237,6 +237,7 @@ def ros_text(
     fisheye = camera.model == "kannala-brandt"
     names = ("k1", "k2", "k3", "k4") if fisheye else ORDER[:8]
     p, (w, h) = check_others_zero(camera, "ROS", names), size_of(camera, "ROS")
+    # plumb_bob, with five coefficients, is the usual one: if they suffice
     rational = any(p[name] for name in names[5:])
     kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
     values = [p[name] for name in (names if fisheye or rational else names[:5])]

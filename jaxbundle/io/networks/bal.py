@@ -190,6 +190,7 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
             text = file.read(most + 1)
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
+    # a file that goes on is read no further
     if len(text) > most:
         raise InputError(
             f"{path}: holds more than {most} characters, too many for the {expected} numbers that "

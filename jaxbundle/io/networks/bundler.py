@@ -165,6 +165,7 @@ def _names(path: Path, number: int) -> list[str]:
     if path.is_file():
         lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
         names = [words[0].removeprefix("./") for words in lines]
+        # a list of other photographs, or with one twice, names nothing
         if len(names) == number and len(set(names)) == number:
             return names
     return [str(k) for k in range(number)]

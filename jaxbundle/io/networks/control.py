@@ -102,6 +102,7 @@ def read_control(path: str | Path) -> Points:
             )
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
+    # then a comma is the decimal sign; ids and names keep theirs
     if separator != ",":
         columns = {
             name: column
@@ -140,6 +141,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
     """The names of the columns; None if the first line is not a header."""
     if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
         return None
+    # other programs call a σ by these names
     names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
     for name, cell in zip(names, cells):
         if name not in NAMES:

@@ -219,6 +219,7 @@ def _with_distances(network: Network, file: Path) -> Network:
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
         )
         length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
+        # an end that was left out above leaves nothing to measure
         if active == 0 or not {*rest.words[:2]} <= {*index}:
             continue
         if not (length > 0 and sigma > 0):
@@ -247,6 +248,7 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
     if any(character.isspace() or character in '"#' for id in points.id for character in id):
         raise InputError(f"{path}: names of points cannot have blanks, quotes or #")
     image_ids, camera_ids = _numbers(images.id), _numbers([c.id for c in network.cameras])
+    # without a choice the inner datum is that of all tie points
     datum = {*network.datum_points} or {id for id, r in zip(points.id, points.role) if r == "tie"}
     number = np.bincount(rays.point, minlength=len(points)).tolist()
     content = {
@@ -293,6 +295,7 @@ def _interior(id: str, camera: Camera) -> list[str]:
     p, (w, h) = all_parameters(camera), size_of(camera, "AICON")
     if camera.pixel_size is None:
         raise InputError(f"camera {camera.id!r}: AICON needs the sensor's size; give pixel_size")
+    # in files of AICON c is negative
     values = p | {"c": -p["c"]}
     lines = [join_numbers(values[name] for name in names if name in p) for names in INTERIOR[:4]]
     sensor = join_numbers((w * camera.pixel_size[0], h * camera.pixel_size[1]))

@@ -234,6 +234,7 @@ def mountings_of(
         row = {id: i for i, id in enumerate(images.id)}
         for rig, epoch, image in zip(rigs.rig, rigs.epoch, rigs.image):
             moments.setdefault((rig, epoch), []).append(row[image])
+    # one image of every camera, as a file of cameras is read, is a moment too
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
     whole = [
@@ -243,6 +244,7 @@ def mountings_of(
     ]
     if not whole or not np.isfinite(images.position[whole[0]]).all():
         return None, ["mountings of the cameras"]
+    # only the orientations that are written must be there
     need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
     rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
     R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])

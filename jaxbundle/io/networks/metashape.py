@@ -187,6 +187,7 @@ def _markers(
             seen[id] = None
     if not rows:
         return None, None, None
+    # labels may repeat, ids may not
     names = dict(zip(seen, unique_labels([label_of(markers[id]) for id in seen], list(seen))))
     none = [None] * len(seen)
     image, point, x, y = zip(*rows)

@@ -67,6 +67,7 @@ def unified_camera(
         )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
+    # coefficients that are missing are 0
     V = (V + [0.0] * most)[:most]
     fisheye, start = "FishEye" in kind, dict(core)
     if fisheye:
@@ -135,6 +136,7 @@ def _fisheye(
     equisolid: bool, p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar
 ) -> Float[Array, "2"]:
     V, F = p["V"], p["S"][0]
+    # homogeneous: a ray of 90° and beyond has Z ≤ 0
     a = p["fx"] * X + (p["cx"] - V[0]) * Z
     b = p["fy"] * Y + (p["cy"] - V[1]) * Z
     tangent = root(a * a + b * b)

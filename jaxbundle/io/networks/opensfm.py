@@ -320,6 +320,7 @@ def _tracks(
         if len(row) < 5:
             raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
         image, point = row.words[:2]
+        # of a photograph without orientation, or of a camera that was refused
         if image not in shots:
             continue
         if point not in points:

@@ -198,6 +198,7 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
     texts = [ros_text(camera, *part) for camera, part in zip(cameras, parts)]
     names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
+    # some systems do not tell the letters of a name from capitals
     if len({name.casefold() for name in names}) < 2:
         raise InputError(f"{folder}: the names of the cameras give the same file {names[0]}.yaml")
     folder.mkdir(exist_ok=True)
@@ -234,6 +235,7 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         shift = np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0])
         name = entries.get("camera_name")
         parts.append((read_opencv(file, entries, str(name or file.stem)), R, shift))
+    # the one without a shift is the first, whatever the files are called
     parts.sort(key=lambda part: bool(part[2].any()))
     (left, R1, none), (right, R2, shift) = parts
     if none.any() or not shift.any():

@@ -77,6 +77,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     why = None
     for frame in file.rows("frames"):
         name, fields = frame.text("file_path"), _intrinsics(file, frame)
+        # frames may repeat the intrinsics, in any order of the keys
         key = json.dumps(fields.document, sort_keys=True)
         try:
             if key not in cameras:
@@ -90,6 +91,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
         used.append(cameras[key].id)
+        # the file has camera → world, M world → camera
         M.append(T[:3, :3].T)
         X0.append(T[:3, 3])
     if not names:

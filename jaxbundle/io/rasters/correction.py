@@ -134,6 +134,7 @@ def _values(
     values = np.full((bands.count, *line.shape), np.nan)
     # 2²² values of all bands are 32 MB of doubles in memory for each of the two workers.
     for part, window in _parts(line, pixel, image, 2**22 / bands.count):
+        # only reading is locked, the other worker computes meanwhile
         with reading:
             seen = bands.read(window=window)
         # Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
@@ -167,6 +168,7 @@ def _parts(
         for v, size in zip(seen, (image.lines, image.pixels))
     )
     side = part[0].stop - part[0].start
+    # a single place cannot be halved, whatever it needs
     if side == 1 or (window[0][1] - window[0][0]) * (window[1][1] - window[1][0]) <= most:
         yield part, window
         return

@@ -51,6 +51,7 @@ class MapSystem:
         if not self.transformer:
             return degrees
         x, y = (np.asarray(v) for v in self.transformer.transform(*degrees))
+        # pyproj gives infinity
         return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
 
     def unwrap(self, x: np.ndarray, middle: float) -> np.ndarray:
@@ -106,6 +107,7 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     seen = np.flatnonzero(np.isfinite(x))
     if not len(seen):
         return x
+    # the one nearest to the middle of the lattice that has a place
     middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
     x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:

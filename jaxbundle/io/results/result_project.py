@@ -140,6 +140,7 @@ def _given_points(adjustment: "Adjustment") -> Points:
     position[control] = np.where(weight > 0, given, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
+    # a tie point has no observed coordinates
     sigma[roles == "tie"] = np.nan
     return Points(points.id, tuple(roles.tolist()), position, sigma, points.source)
 

@@ -129,6 +129,7 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
+    # attitudes are given in the unit of angles, positions in metres
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
@@ -157,5 +158,6 @@ def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | lis
         if key in ("times", "values"):
             scaled[key] = (unit if key == "values" else 1.0) * section.numbers(key)
         elif key != "kind":
+            # times are no angles
             scaled[key] = (1.0 if key in ("period", "step") else unit) * section.number(key)
     return scaled

@@ -151,6 +151,7 @@ def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], li
         warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
         freedom = _read_freedom(TomlSection(file, where, common | own.get(id, {})), radians)
+        # without an entry an image is a sensor of its own
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
     for image in images:
         if image.earth != images[0].earth:
@@ -224,6 +225,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
             1,
         )
         known = np.isfinite(X).all(1)
+        # an unknown place has no east and north: its σ are of the axes
         for k in np.flatnonzero(known):
             axes[k] = east_north_up(earth, X[k])
     return GroundPoints(

@@ -169,6 +169,7 @@ def _from_rpb(path: Path, text: str) -> dict[str, Any]:
     for field, (_, key) in FIELDS.items():
         value, where = value_of(key)
         numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
+        # a bracket that was cut off gives fewer
         if len(numbers) != TERMS:
             raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
         values[field] = [number_in(part, where) for part in numbers]
@@ -212,6 +213,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
         with replace_file(path) as temporary:
+            # the tags of the copy change: after a failure the raster is as it was
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)

@@ -215,6 +215,7 @@ def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) 
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
+    # attitudes against the orbit are given without an Earth, too
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
             f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
@@ -350,6 +351,7 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         raise InputError(f"{section.where}{error}") from None
     values = default_parameters(model) | parameters
     pitch = section.number("pitch")
+    # a negative one counts the pixels the other way
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
     return FocalLine(

@@ -50,6 +50,7 @@ class StoredRows:
     def __getitem__(self, rows: int | Sequence[int] | Int[np.ndarray, "..."]) -> np.ndarray:
         """A row, or the rows of a list of numbers."""
         wanted = np.atleast_1d(np.asarray(rows, int))
+        # one array: a list of rows would be copied once more
         found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
         # consecutive rows are read together
@@ -86,6 +87,7 @@ def find_stored_rows(path: str | Path, name: str, smallest: int = 2**20) -> Stor
             shape, by_columns, dtype = READERS[version](stream)
             head = stream.tell()
             whole = head + int(np.prod(shape)) * dtype.itemsize
+            # rows that do not lie in one piece, objects, or trailing bytes
             if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
                 return None
             if member.compress_type != zipfile.ZIP_STORED:
@@ -109,6 +111,7 @@ def _unpack(stream: IO[bytes]) -> BinaryIO:
     unpacked = tempfile.TemporaryFile()
     try:
         shutil.copyfileobj(stream, unpacked, 2**20)  # a megabyte at a time
+        # fromfile reads by the descriptor, past the buffer of Python
         unpacked.flush()
     except BaseException:
         unpacked.close()

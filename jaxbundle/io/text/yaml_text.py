@@ -78,9 +78,11 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[YamlLine]:
         if "\t" in bare[: len(bare) - len(bare.lstrip())] and not open_brackets:
             raise InputError(f"{path}, line {number}: indentation by tabs; YAML has blanks")
         if open_brackets:
+            # a list over several lines is read as one line
             lines[-1].text += " " + bare.strip()
         else:
             lines.append(YamlLine(path, number, bare, lenient))
+        # brackets in texts open nothing
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
         open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
     if open_brackets:
