@@ -59,6 +59,7 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     critical_t = 2.0
     rows, held = [], []
     for name, found in entry["parameters"].items():
+        # held ones follow in one line
         if not found["free"]:
             held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
@@ -118,6 +119,7 @@ def _many_cameras(adjustment: "Adjustment") -> list[str]:
             ]
             rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
         lines += [*_equations(model), ""]
+        # six columns of values fit in the width of a page
         for start in range(0, len(names), 6):
             part = slice(start, start + 6)
             header = ("camera", *names[part])
@@ -209,6 +211,7 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
     free = adjustment.problem.system.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
+    # points at infinity have no coordinates whose σ could be counted
     free &= adjustment.located[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]

@@ -71,6 +71,7 @@ def assemble(
     document = apply_overrides(document, overrides, keys)
     project = dict(document["project"])
     check_settings(project, f"{path}: ")
+    # the tables are in radians; the unit is one of the output
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")
     if points is not None and len(points) and observations is not None and len(observations):

@@ -91,6 +91,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
                 f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
             )
+        # of any other length, it is normalised
         if not np.any(image.q):
             raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
     names = [image.name for image in images]

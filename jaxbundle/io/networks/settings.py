@@ -45,6 +45,7 @@ def apply_overrides(
     cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
     observations.
     """
+    # the document of the caller stays as the file has it
     document = copy.deepcopy(document)
     for override in overrides:
         key, equals, text = (part.strip() for part in override.partition("="))
@@ -119,6 +120,7 @@ def _override_section(document: Document, key: str, text: str) -> None:
         values = [float(word) for word in words]
     except ValueError:
         values = words
+    # a list of one is still a list
     several = name == "free" or text.startswith("[") or len(values) != 1
     settings[name] = values if several else values[0]
 

@@ -132,6 +132,7 @@ def _cut(
     (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
     rows, columns = source.shape
     bounds = source.bounds
+    # rows count from the north, or from the south
     y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
     top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
     turn = 360 / abs(dx)

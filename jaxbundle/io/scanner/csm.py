@@ -74,6 +74,7 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     text = read_text(path)
     name, brace, _ = text.partition("{")
     name = name.strip()
+    # a state has the name of its model before the braces
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
             raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
@@ -108,6 +109,7 @@ def _line_times(isd: JsonFields, lines: int) -> LineTimes:
     l = np.arange(lines)
     row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
     t = start[row] + period[row] * (l + 1 - first[row])
+    # one rate: times follow from it, and need no table
     if (row == row[0]).all():
         return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]]))
     check_times(t, Source(f"{isd.path}, line_scan_rate", None, "line"))

@@ -30,6 +30,7 @@ def read_scanner(path: str | Path) -> ScannerInput:
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
         return check_against_rpc(_read_product(path), path)
+    # a file with a source needs no other section
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
     return _read_source(file, scanner) if "source" in scanner else scanner_of(file)

@@ -122,6 +122,7 @@ def _from_dimap(file: XmlFields) -> dict[str, Any]:
             values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     for axis in ("line", "sample"):
+        # the first pixel is (1, 1) or (0, 0) by the profile of the product
         values[f"{axis}_offset"] -= DIMAP_ORIGIN.get(profile, DIMAP_OTHER[inverse])
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]

@@ -69,6 +69,7 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
+    # ephemerides are those of the satellite, lines of sight begin in its camera
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
     lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
     (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
@@ -97,6 +98,7 @@ def read_worldview(file: XmlFields) -> ScannerInput:
 def _line_times(file: XmlFields, lines: int) -> LineTimes:
     pairs = file.elements("IMD/IMAGE/TLCLISTList/TLCLIST")
     pairs = np.array([_numbers(file, e, "TLCLIST", 2) for e in pairs])
+    # one pair gives only where the lines begin
     if len(pairs) == 1:
         rate = file.number("IMD/IMAGE/AVGLINERATE")
         if file.text("IMD/IMAGE/SCANDIRECTION", "Forward").lower() != "forward":

@@ -64,6 +64,7 @@ def _image_points(result: Refinement) -> list[ImagePoint]:
     xy = lambda of_scanner: np.asarray(
         given.observations.xy if of_scanner else given.frames.observations.xy
     )
+    # the parts of the equations are in another order than the images
     measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [
