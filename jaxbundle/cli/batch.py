@@ -16,7 +16,7 @@ from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
 
-WITH_REASON = ("bad input", "not solved", "failed")
+STATUSES_WITH_REASON = ("bad input", "not solved", "failed")
 """Statuses of networks whose lines have an `error`."""
 
 
@@ -219,7 +219,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     total, solved = counts.total(), sum(counts[status] for status in SOLVED)
     if not quiet:
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
-        if any(counts[status] for status in WITH_REASON):
+        if any(counts[status] for status in STATUSES_WITH_REASON):
             _print_reasons(inputs, json_lines)
     if first and total and not solved:
         raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")

@@ -35,11 +35,11 @@ def compare(
 ) -> None:
     """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
     common unknowns, with a test of each difference."""
-    from jaxbundle.cli.outputs import SAVED
+    from jaxbundle.cli.outputs import SAVED_ADJUSTMENT
     from jaxbundle.system.file_content import beginning
 
     # no camera file begins like an archive
-    saved = [SAVED.match(beginning(name, 4)) is not None for name in (a, b)]
+    saved = [SAVED_ADJUSTMENT.match(beginning(name, 4)) is not None for name in (a, b)]
     if any(saved):
         if not all(saved):
             one, other = (a, b) if saved[0] else (b, a)

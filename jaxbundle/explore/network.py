@@ -148,7 +148,8 @@ class NetworkView:
         if not len(seen):
             return M
         middle = self.adjustment.point_values[seen].mean(0)
-        old, new = (_normalise(middle - X) for X in (given[:3], centre))
+        rays = (middle - X for X in (given[:3], centre))
+        old, new = (ray / (np.linalg.norm(ray) or 1.0) for ray in rays)
         axis = np.cross(old, new)
         sine, cosine = np.linalg.norm(axis), old @ new
         if sine == 0:
@@ -391,10 +392,6 @@ def _selection() -> Section:
         '<div id="chosen" class="scroll" aria-live="polite"></div>\n',
     ]
     return Section("chosen-section", "What is chosen", "".join(parts), "What is chosen")
-
-
-def _normalise(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    return v / (np.linalg.norm(v) or 1.0)
 
 
 def _ratio(

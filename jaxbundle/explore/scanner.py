@@ -77,7 +77,7 @@ from jaxbundle.report.page.markup import figure, grid, paragraph
 
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
 """The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
-POSITIVE = ("altitude", "speed", "height")
+POSITIVE_KEYS = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
@@ -181,7 +181,7 @@ class ScannerView:
         found: dict[str, Any] = {}
         for one in self.controls:
             if isinstance(one, Number):
-                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE else -np.inf
+                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE_KEYS else -np.inf
                 found[one.key] = number(given, one.key, one.value, lowest)
                 if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
                     raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")

@@ -23,7 +23,7 @@ from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov, write_jaicov
-from jaxbundle.io.networks.kalibr import OFFERED as KALIBR_MODELS
+from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
 from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr, write_kalibr
 from jaxbundle.io.networks.losses import PIXEL_MODELS
 from jaxbundle.io.networks.metashape import is_metashape, read_metashape
@@ -32,7 +32,7 @@ from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
 from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
 from jaxbundle.io.networks.micmac_camera import write_autocal
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
-from jaxbundle.io.networks.mrcal import OFFERED as MRCAL_MODELS
+from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
 from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
 from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
 from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
@@ -210,17 +210,15 @@ def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera],
     return lambda cameras, path: write(cameras[0], path)
 
 
-def _is_bal_name(path: Path) -> bool:
-    return path.suffix.lower() in (".txt", ".bal", *OPENERS)
-
-
 # The order is that of recognition; "project" takes any folder and stands last.
 TARGETS: dict[str, Target] = {
     "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
     "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
     "csv": Target(_ends(".csv"), write_coordinates, "NAME.csv"),
     "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
-    "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
+    "bal": Target(
+        _ends(".txt", ".bal", *OPENERS), write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)
+    ),
     "colmap": Target(
         _folder_of("colmap", "sparse"),
         partial(fill_colmap, text=False),

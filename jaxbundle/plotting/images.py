@@ -13,7 +13,7 @@ from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
+    MAX_LABELS,
     RUST,
     axes,
     label,
@@ -59,7 +59,7 @@ def residual_vectors(
     _draw_arrows(ax, xy, v, np.where(large, RUST, BLUE), factor, (bar, f"{scale * bar:g} {unit}"))
     if known:
         _draw_frame(ax, low, high)
-    if len(points) <= LABELLED // 2:
+    if len(points) <= MAX_LABELS // 2:
         _write_names(ax, points, xy)
     centre = principal_point(adjustment, given.id)
     if (low <= centre).all() and (centre <= high).all():

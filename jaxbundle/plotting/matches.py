@@ -11,7 +11,7 @@ from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
+    MAX_LABELS,
     RUST,
     axes,
     image_axes,
@@ -62,7 +62,7 @@ def match_graph(
     at = np.array(list(place.values()))
     lonely = np.isin(names, list(alone))
     ax.scatter(*at.T, s=36, color=np.where(lonely, RUST, INK), zorder=3)
-    if len(names) <= LABELLED:
+    if len(names) <= MAX_LABELS:
         for name, angle in zip(names, turn):
             c, s = 1.06 * np.cos(angle), 1.06 * np.sin(angle)
             ax.text(
@@ -102,10 +102,10 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax: "Axes | None" = None)
         number[i, j] = number[j, i] = verified
     shown = ax.imshow(number, cmap="Blues", vmin=0)
     ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="verified matches")
-    if len(names) <= LABELLED:
+    if len(names) <= MAX_LABELS:
         ax.set_xticks(range(len(names)), map(plain, names), rotation=90, parse_math=False)
         ax.set_yticks(range(len(names)), map(plain, names), parse_math=False)
-    if len(names) <= LABELLED // 3:
+    if len(names) <= MAX_LABELS // 3:
         for i, j in np.argwhere(np.isfinite(number)):
             dark = number[i, j] > 0.6 * np.nanmax(number)
             ax.text(

@@ -17,7 +17,7 @@ from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
+    MAX_LABELS,
     ROLE_STYLE,
     axes,
     axes_3d,
@@ -87,12 +87,12 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     away = centres - pyramids[:, 1:].mean(1)
     upper_right = np.full((len(points["id"]), 2), 0.7)
     ids = []
-    if len(centres) <= LABELLED // 2:
+    if len(centres) <= MAX_LABELS // 2:
         ids.append((adjustment.images["id"], centres, INK, away[:, :2] / size))
-    if len(points["id"]) <= LABELLED:
+    if len(points["id"]) <= MAX_LABELS:
         ids.append((points["id"], points["xyz"], BLUE, upper_right))
     # beyond some thousands of dots an id finds no room in any case
-    places = np.concatenate([centres, points["xyz"][: 50 * LABELLED]])[:, :2]
+    places = np.concatenate([centres, points["xyz"][: 50 * MAX_LABELS]])[:, :2]
     _write_ids(ax, ids, places)
     return ax
 

@@ -111,7 +111,10 @@ def write_rows(
     columns: Mapping[str, Column], csv: Path | None, json_: str, head: Mapping | None = None
 ) -> None:
     """A table as CSV or JSON, in a file or on standard output."""
-    columns = {name: _plain(values) for name, values in columns.items()}
+    columns = {
+        name: values.tolist() if isinstance(values, np.ndarray) else list(values)
+        for name, values in columns.items()
+    }
     rows = list(zip(*columns.values()))
     if json_:
         rows = [dict(zip(columns, row)) for row in rows]
@@ -127,10 +130,6 @@ def write_rows(
         print(",".join(columns))
         for row in rows:
             print(",".join(map(str, row)))
-
-
-def _plain(values: Column) -> list:
-    return values.tolist() if isinstance(values, np.ndarray) else list(values)
 
 
 def warn(message: str) -> None:

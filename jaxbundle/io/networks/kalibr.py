@@ -62,7 +62,7 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
 }
 """Our model, intrinsics and coefficients; the first of a model is written."""
-OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
+OFFERED_MODELS = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
 
 
 def is_kalibr(path: Path) -> bool:

@@ -77,7 +77,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 CAHVOR = ("alpha", "beta", "r0", "r1", "r2")
 SPLINE = re.compile(r"SPLINED_STEREOGRAPHIC_order=3_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
 OUR_SPLINE = re.compile(r"spline-(\d+)x(\d+)-(\d+(?:\.\d+)?)")
-OFFERED = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
+OFFERED_MODELS = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
 
 
 def is_mrcal(path: Path) -> bool:

@@ -89,7 +89,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
-FITTED = ("fisheye62", "fisheye624", "dual")
+FITTED_KINDS = ("fisheye62", "fisheye624", "dual")
 SPHERICAL = ("spherical", "equirectangular")
 
 
@@ -212,8 +212,8 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         f = max(size) / (2 * np.pi)
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
-    if kind not in (*KINDS, *FITTED):
-        known = ", ".join((*KINDS, *FITTED, *SPHERICAL))
+    if kind not in (*KINDS, *FITTED_KINDS):
+        known = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
         raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
     f = [

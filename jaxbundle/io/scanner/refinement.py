@@ -73,8 +73,8 @@ SECTIONS = {
 }
 REQUIRED_FIELDS = ("refine", "images", "unknowns")
 WORDS = {"free": math.inf, "held": 0.0}
-TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
-LISTS = ("look_across", "look_along")
+ANGULAR_UNKNOWNS = ("attitude", "attitude_rate", "jitter", "mounting")
+LISTED_UNKNOWNS = ("look_across", "look_along")
 
 
 class RefineFile(NamedTuple):
@@ -167,14 +167,14 @@ def _read_freedom(section: TomlSection, radians: float) -> Freedom:
     section.check_keys(tuple(sorted(fields)))
     values_read: dict[str, Any] = {}
     for key, value in section.values.items():
-        factor = radians if key in TURNING else 1.0
+        factor = radians if key in ANGULAR_UNKNOWNS else 1.0
         if key == "knot_spacing":
             values_read[key] = section.number(key)
             if values_read[key] <= 0:
                 raise InputError(f"{section.where}{key} must be positive, in seconds")
         elif key == "focal_length":
             values_read[key] = _sigma(section, key, value)
-        elif key in LISTS:
+        elif key in LISTED_UNKNOWNS:
             values = value if isinstance(value, list) else [value]
             values_read[key] = tuple(_sigma(section, key, v) for v in values)
         else:

@@ -45,7 +45,7 @@ UNITS = {
     "latitude": "degrees",
     "height": "meters",
 }
-ACCEPTED = {
+UNIT_WORDS = {
     "pixels": {"pixels", "pixel"},
     "degrees": {"degrees", "degree", "deg"},
     "meters": {"meters", "metres", "meter", "metre", "m"},
@@ -122,7 +122,7 @@ def _from_text(path: Path, text: str) -> dict[str, Any]:
             raise InputError(f"{path}: {name} is missing; an RPC00B text file is expected")
         words, line = entries[name]
         value = number_in(words[0] if words else "", f"{path}, line {line}: {name}")
-        if unit and len(words) > 1 and words[1].lower() not in ACCEPTED[unit]:
+        if unit and len(words) > 1 and words[1].lower() not in UNIT_WORDS[unit]:
             raise InputError(f"{path}, line {line}: {name} is in {words[1]}; {unit} are expected")
         return value
 

@@ -22,9 +22,9 @@ KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
 TAG = re.compile(r"!\S*\s*")
-OPEN, CLOSE = re.compile(r"[\[{]"), re.compile(r"[\]}]")
+OPEN_BRACKET, CLOSE_BRACKET = re.compile(r"[\[{]"), re.compile(r"[\]}]")
 WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
-NOT_READ = {
+UNREAD_KINDS = {
     "{": "a dictionary in braces",
     "&": "an anchor",
     "*": "an alias",
@@ -84,7 +84,9 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[YamlLine]:
             lines.append(YamlLine(path, number, bare, lenient))
         # brackets in texts open nothing
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
-        open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
+        open_brackets = max(
+            0, open_brackets + len(OPEN_BRACKET.findall(plain)) - len(CLOSE_BRACKET.findall(plain))
+        )
     if open_brackets:
         raise lines[-1].error(f"the list {show(lines[-1].text)} has no end")
     return lines
@@ -148,10 +150,10 @@ def _parse_nested(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, 
 def _value(line: YamlLine, text: str) -> Any:
     """A scalar, or a list in brackets."""
     text = text.strip()
-    if text[:1] in NOT_READ and line.lenient:
+    if text[:1] in UNREAD_KINDS and line.lenient:
         return None
-    if text[:1] in NOT_READ:
-        raise line.error(f"{show(text)}: {NOT_READ[text[0]]} is not read here")
+    if text[:1] in UNREAD_KINDS:
+        raise line.error(f"{show(text)}: {UNREAD_KINDS[text[0]]} is not read here")
     if not text.startswith("["):
         return _scalar(text)
     stack: list[list[Any]] = [[]]  # the lists that are open, the outermost a holder of one list

@@ -19,7 +19,7 @@ from jaxbundle.report.verdict import Finding, Verdict, conclude
 if TYPE_CHECKING:
     from jaxbundle.bundle.result import Adjustment
 
-A_POSTERIORI = (
+SIGMA_NOTE = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
     "said to be a priori."
 )
@@ -48,7 +48,7 @@ class Addition(NamedTuple):
         return conclude(adjustment, self.findings, self.without, len(self.warnings))
 
 
-ALONE = Addition()
+NO_ADDITION = Addition()
 REPEATED_LINES = ("Note", "Verdict", "Redundancy", "σ0", "Image precision", "χ² test")
 """Lines of the summary that are repeated below it."""
 
@@ -58,7 +58,7 @@ def compose(
     origin: Origin = UNKNOWN,
     *,
     date: str | None = None,
-    also: Addition = ALONE,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of an adjustment as HTML, in pieces; for an unsolved one, the reason.
 
@@ -73,7 +73,7 @@ def compose(
 
 
 def compose_failure(
-    error: NotSolvedError, origin: Origin = UNKNOWN, kind: str = ALONE.kind
+    error: NotSolvedError, origin: Origin = UNKNOWN, kind: str = NO_ADDITION.kind
 ) -> Iterator[str]:
     """The page of an adjustment that ended before there was a result."""
     rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
@@ -81,7 +81,9 @@ def compose_failure(
     yield from write(Page(f"no result: {kind}", [first], origin))
 
 
-def describe(adjustment: "Adjustment", origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
+def describe(
+    adjustment: "Adjustment", origin: Origin = UNKNOWN, also: Addition = NO_ADDITION
+) -> Page:
     """The page of an adjustment, as a `Page`."""
     name = clean(also.name or adjustment.network.name) or "network"
     title = f"{name}: {also.kind}" if also.kind else name
@@ -111,5 +113,5 @@ def _whole(adjustment: "Adjustment") -> list[str]:
         facts(head.variance_facts(adjustment)),
         "<h3>Counts</h3>\n",
         grid(("", "", ""), head.count_rows(adjustment), "words"),
-        paragraph(A_POSTERIORI),
+        paragraph(SIGMA_NOTE),
     ]

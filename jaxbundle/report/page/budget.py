@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from jaxbundle.report.budget import HEADER, LEGEND, TITLE, select_rows
-from jaxbundle.report.page.adjustment import ALONE, Addition
+from jaxbundle.report.page.adjustment import NO_ADDITION, Addition
 from jaxbundle.report.page.document import Section
 from jaxbundle.report.page.markup import grid, paragraph
 
@@ -14,6 +14,6 @@ if TYPE_CHECKING:
 def describe_budget(budget: "Budget | None") -> Addition:
     """The error budget on the page of an adjustment, if there is one."""
     if budget is None:
-        return ALONE
+        return NO_ADDITION
     content = grid(HEADER, select_rows(budget)[0], "words") + paragraph(LEGEND)
     return Addition(sections=(Section("budget", TITLE, content, "Budget"),))
