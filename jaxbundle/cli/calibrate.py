@@ -189,6 +189,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
                     **options,
                 )
         except NotSolvedError as error:
+            # a failure makes no folder, unless a file that was asked for belongs in it
             place = out if name_inside(json, out) or name_inside(html, out) else None
             page = partial(compose_failure, error, origin, KIND)
             with write_result(json, unsolved_text(error), place, COMMAND, names, force, html, page):

@@ -137,6 +137,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
             raise InputError(f"{option} {file}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
+    # by real paths: an input may be named through a link
     if any(str(real) == os.path.realpath(given) for given in inputs):
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
 
@@ -155,6 +156,7 @@ def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, w
         return
     try:
         with path.open("rb") as stream:
+            # enough for blanks before the first sign
             head = stream.read(4096)
     except OSError as error:
         raise InputError(f"{option} {file}: cannot be read: {error.strerror}") from None

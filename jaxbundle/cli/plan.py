@@ -61,6 +61,7 @@ def plan(  # noqa: PLR0913 - the options of the command
     )
     view = field_of_view(c, image_format)
     degrees = ", ".join(f"{np.degrees(angle):.2f}°" for angle in view)
+    # of 1 % of the flying height, so that other heights follow by proportion
     relief = relief_displacement(image_format[1] / 2, 0.01 * design.height, design.height)
     ground = "" if design.pixel_on_ground is None else f"  pixel {design.pixel_on_ground:.4g} m"
     lines = [

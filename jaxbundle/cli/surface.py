@@ -108,6 +108,7 @@ def surface(  # noqa: PLR0913 - the options of the command
     check_folder(out, "surface", FILES, input, force)
     with counting(quiet or json == "-") as bar:
         options = {"points": points, "step": step, "dense": dense, "progress": report_stages(bar)}
+        # photographs come in one folder, scanner and RPC images one by one
         if len(input) > 1 or is_ground_image(input[0]):
             made = make_of_ground(input, photos, heights, pairs, crs, options)
         else:

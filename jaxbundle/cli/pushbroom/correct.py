@@ -61,6 +61,7 @@ def correct(  # noqa: PLR0913 - the options of the command
         _check_target("--error-map", error_map, image)
         if error_map.absolute() == out.absolute():
             raise InputError(f"--error-map {error_map} is also --out; give another name")
+    # an ellipsoid hides nothing of itself where an image looks down
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_scanner(scanner)

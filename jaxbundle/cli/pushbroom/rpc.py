@@ -163,6 +163,7 @@ def compensate(
     )
     changed, left = apply_bias(given, found.bias)
     write_rpc(out, changed)
+    # the same terms in lines and in samples
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
     values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]

@@ -123,6 +123,7 @@ def write_rows(
             write_json(text)
         else:
             write_text(Path(json_), text)
+    # NaN, which is not equal to itself, is an empty cell
     rows = [["" if v != v else v for v in row] for row in zip(*columns.values())]
     if csv is not None and str(csv) != "-":
         write_csv(csv, list(columns), rows)
