@@ -274,7 +274,7 @@ def _cameras(photos: Sequence[str] | None, named: Sequence[str] | None) -> dict[
                 "give each camera its own name and one folder or pattern"
             )
         cameras[name] = [pattern]
-    return cameras or {"cam": list(photos)}
+    return cameras or {"cam": list(photos or ())}
 
 
 def _words(text: str) -> list[str]:

@@ -42,7 +42,7 @@ def camera(
         given = camera_given(file)
         size, pitch = sizes_of(file, given, *sizes)
         unit = get_model(given.model).unit
-        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch)
+        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch).tolist()
         reach = float(np.hypot(*extent) / 2)
         width = reach / rows if step is None else step
         if width * max_rows < reach:

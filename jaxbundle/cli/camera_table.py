@@ -1,9 +1,8 @@
 """The output of `jaxbundle camera`: parameters, field of view, distortion."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.distortion_table import distortion_table
@@ -50,7 +49,7 @@ def table_of(given: Camera, reach: float, step: float, about_origin: bool) -> di
 
 def print_camera(
     given: Camera,
-    extent: Float[np.ndarray, "2"],
+    extent: Sequence[float],
     size: Pair,
     pitch: Pair | None,
     table: Mapping[str, np.ndarray],

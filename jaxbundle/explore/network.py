@@ -50,6 +50,7 @@ from jaxbundle.report.page.sections import photographs
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
 from jaxbundle.statistics.precision import Precision, precision
+from jaxbundle.types import AnyArray
 
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
@@ -395,7 +396,7 @@ def _selection() -> Section:
 
 
 def _ratio(
-    before: Float[np.ndarray, "points 3"], after: Float[np.ndarray, "points 3"]
+    before: Float[AnyArray, "points 3"], after: Float[AnyArray, "points 3"]
 ) -> Float[np.ndarray, " points"]:
     """Ratio of the means of σ² of points."""
     a, b = (np.sqrt(np.mean(s**2, 1)) for s in (before, after))

@@ -42,7 +42,7 @@ def network_view(
     **Arguments:** `camera_size`: length of the edges of a camera relative to the network.
 
     **Returns:** matplotlib 3D `Axes`, in the object unit."""
-    ax = axes_3d(ax, (7.5, 6.5))
+    view = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     both = designed.before.network, designed.after.network
@@ -55,28 +55,28 @@ def network_view(
     for chosen, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
         if chosen.any():
             lines = camera_lines(network, camera_size * size)[chosen].reshape(-1, 2, 3)
-            ax.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
-            ax.scatter(
+            view.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
+            view.scatter(
                 *network.images.position[chosen].T, s=9, color=colour, label=name, depthshade=False
             )
     steps = [step.position for step in designed.path if len(step.position)]
     if after and designed.order == "first" and steps:
         for way in np.stack(steps, 1):
-            ax.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
-    ax.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
+            view.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
+    view.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
     for box in boxes:
-        ax.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
+        view.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
     low, high = everything.min(0), everything.max(0)
     half = 0.55 * max((high - low).max(), size * camera_size)
     for name, middle in zip("xyz", (low + high) / 2):
-        getattr(ax, f"set_{name}lim")(middle - half, middle + half)
-        label(ax, name, name.upper(), network.object_unit)
-    quiet_3d(ax)
-    ax.set_box_aspect((1, 1, 1), zoom=0.95)
+        getattr(view, f"set_{name}lim")(middle - half, middle + half)
+        label(view, name, name.upper(), network.object_unit)
+    quiet_3d(view)
+    view.set_box_aspect((1, 1, 1), zoom=0.95)
     state = designed.after if after else designed.before
-    title(ax, "after" if after else "before", f"{designed.aim}: {state.aim:.3g}")
-    legend(ax, frameon=False, loc="upper right")
-    return ax
+    title(view, "after" if after else "before", f"{designed.aim}: {state.aim:.3g}")
+    legend(view, frameon=False, loc="upper right")
+    return view
 
 
 def camera_lines(network: Network, size: float) -> np.ndarray:

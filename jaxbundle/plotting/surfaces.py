@@ -26,16 +26,16 @@ def cloud_perspective(
 
     **Returns:** matplotlib `Axes3D`, in the object unit.
     """
-    ax = axes_3d(ax, (7.5, 6.0))
+    view = axes_3d(ax, (7.5, 6.0))
     few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
     sigma = few.sigma[:, "XYZ".index(axis)]
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
-    drawn = ax.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
-    ax.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
-    ax.figure.colorbar(drawn, ax=ax, label=f"σ{axis}", shrink=0.6)
+    drawn = view.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
+    view.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
+    view.figure.colorbar(drawn, view=view, label=f"σ{axis}", shrink=0.6)
     for name in "xyz":
-        label_coordinates(ax, name, "")
-    return ax
+        label_coordinates(view, name, "")
+    return view
 
 
 def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.cameras import get_model, image_ray
 from jaxbundle.cameras.model import CameraModel
@@ -130,7 +130,7 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
 
     **Returns:** matplotlib 3D `Axes`, in the object unit.
     """
-    ax = axes_3d(ax, (7.5, 6.5))
+    view = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
@@ -138,13 +138,13 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
     edges = pyramid_lines(pyramids).reshape(-1, 2, 3)
     faces = Poly3DCollection(pyramids[:, 1:], facecolors=BLUE, alpha=0.12, edgecolors="none")
-    ax.add_collection3d(faces)
-    ax.add_collection3d(Line3DCollection(edges, colors=GREY, linewidths=0.7))
-    ax.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
+    view.add_collection3d(faces)
+    view.add_collection3d(Line3DCollection(edges, colors=GREY, linewidths=0.7))
+    view.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
     for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
-            ax.scatter(
+            view.scatter(
                 *chosen.T,
                 label=f"{role} points",
                 linewidths=0,
@@ -154,16 +154,16 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
-        getattr(ax, f"set_{name}lim")(a, b)
-    ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
-    quiet_3d(ax)
+        getattr(view, f"set_{name}lim")(a, b)
+    view.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
+    quiet_3d(view)
     unit = adjustment.network.object_unit
     for name in "xyz":
-        ax.locator_params(axis=name, nbins=5)
-        label_coordinates(ax, name, unit)
-    title(ax, f"{adjustment.network.name}: perspective")
-    legend(ax, frameon=False, loc="upper right")
-    return ax
+        view.locator_params(axis=name, nbins=5)
+        label_coordinates(view, name, unit)
+    title(view, f"{adjustment.network.name}: perspective")
+    legend(view, frameon=False, loc="upper right")
+    return view
 
 
 # --- cameras --------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
 def _corner_rays(
     model: CameraModel,
     parameters: Float[Array, "cameras parameters"],
-    frames: ArrayLike,
+    frames: Float[Array, "cameras 2 2"],
 ) -> Float[Array, "cameras 4 3"]:
     """Rays of the four corners of every frame (lowest and highest x, y) [cameras, 4, 3]."""
     x, y = frames[:, jnp.array([0, 1, 1, 0]), 0], frames[:, jnp.array([0, 0, 1, 1]), 1]
@@ -355,7 +355,7 @@ def _write_ids(
     **Arguments:** `tables`: ids, coordinates, colour, direction to the first side; `places` to be
     kept free.
     """
-    ax.figure.draw_without_rendering()  # the layout moves the axes
+    ax.figure.canvas.figure.draw_without_rendering()  # the layout moves the axes
     frame = ax.get_window_extent()
     dots = ax.figure.dpi / 72
     # of text of 7 points: a letter, a line and the gap between a dot and its text, in points

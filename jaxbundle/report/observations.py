@@ -28,6 +28,7 @@ from jaxbundle.report.layout import (
     table,
     to_place_of,
 )
+from jaxbundle.types import present
 
 if TYPE_CHECKING:
     from jaxbundle.bundle.result import Adjustment
@@ -232,11 +233,12 @@ def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
         (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
         for i, item in enumerate(suspects[:most], 1)
     ]
+    weighted = len(present(adjustment.weights))
     lines = heading(f"Robust estimation ({adjustment.robust})")
     lines += paragraph(
         f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
         "the median of the residuals (MAD). "
-        f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals above "
+        f"{len(suspects)} of {count(weighted, 'image point')} have residuals above "
         f"the critical length{', in σ times the scale (test):' if rows else '.'}"
     )
     if rows:
@@ -308,9 +310,9 @@ def distances(adjustment: "Adjustment", most: int) -> list[str]:
             (
                 found["image"][i],
                 found["point"][i],
-                *(fixed(x, places) for x in values),
-                fixed(r, 3),
-                fixed(found["tau"][i], 2),
+                *(fixed(float(x), places) for x in values),
+                fixed(float(r), 3),
+                fixed(float(found["tau"][i]), 2),
             )
         )
     header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")

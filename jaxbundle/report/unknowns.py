@@ -24,6 +24,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.types import present
 
 if TYPE_CHECKING:
     from jaxbundle.bundle.result import Adjustment
@@ -292,16 +293,18 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
     order = np.lexsort((-found["distance"], ~found["at_infinity"]))
     rows = [
         (
-            found["id"][i],
+            str(found["id"][i]),
             *(f"{found[f'u{axis}'][i]:.6f}" for axis in "XYZ"),
-            significant(found["su"][i]),
-            "at infinity" if found["at_infinity"][i] else significant(found["distance"][i], 4),
-            significant(found["nearer"][i]),
-            "∞" if np.isinf(found["farther"][i]) else significant(found["farther"][i]),
+            significant(float(found["su"][i])),
+            "at infinity"
+            if found["at_infinity"][i]
+            else significant(float(found["distance"][i]), 4),
+            significant(float(found["nearer"][i])),
+            "∞" if np.isinf(found["farther"][i]) else significant(float(found["farther"][i])),
         )
         for i in order[:most]
     ]
-    place = ", ".join(significant(x, 8) for x in adjustment.far_points.origin)
+    place = ", ".join(significant(x, 8) for x in present(adjustment.far_points).origin)
     angle = network.angle_unit
     lines = [
         *heading(f"Points at any distance: directions from {place}"),

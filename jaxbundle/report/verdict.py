@@ -19,6 +19,7 @@ from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
 from jaxbundle.statistics.misfit import LARGEST_REMOVED, contradicts
+from jaxbundle.types import present
 
 if TYPE_CHECKING:
     from jaxbundle.bundle.result import Adjustment
@@ -202,7 +203,7 @@ def _checks(adjustment: "Adjustment") -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    given = np.concatenate(adjustment.check[0].sigma.T)
+    given = np.concatenate(present(adjustment.check)[0].sigma.T)
     s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
     known = (s > 0) & np.isfinite(d)
     largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)

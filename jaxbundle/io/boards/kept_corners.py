@@ -99,8 +99,12 @@ class KeptCorners:
 
     def keep(self, content: str, board: Board, look: Look) -> None:
         """Add a search result; it is in the file when this returns."""
-        (columns, rows), xy = ((None, None), None) if isinstance(look, str) else look
-        points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
+        columns, rows, points, why = None, None, None, None
+        if isinstance(look, str):
+            why = look
+        else:
+            (columns, rows), xy = look
+            points = np.ascontiguousarray(xy, "<f8").tobytes()
         self._write(
             "INSERT OR REPLACE INTO boards VALUES (?, ?, ?, ?, ?, ?)",
             content,
@@ -108,7 +112,7 @@ class KeptCorners:
             columns,
             rows,
             points,
-            look if xy is None else None,
+            why,
         )
 
     def _first(self, question: str, *values: SqlValue) -> tuple | None:

@@ -30,6 +30,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import local_x64
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray, Scalar
 
 Formula = Callable[..., Float[Array, "2"]]
 """Parameters and one ray X, Y, Z, right, down and forward, to pixels from the centre of the first
@@ -230,7 +231,7 @@ def _newton(
     return jax.vmap(newton_step)(uv, m)
 
 
-def _direction(m: Float[Array, "2"]) -> Float[Array, "3"]:
+def _direction(m: Float[AnyArray, "2"]) -> Float[Array, "3"]:
     """The unit vector at an angle from the axis: m is this angle times its direction.
 
     Angles, unlike tangents, have no pole at 90°, which fisheyes pass.
@@ -240,7 +241,7 @@ def _direction(m: Float[Array, "2"]) -> Float[Array, "3"]:
     return jnp.append(m * shrink, jnp.cos(angle))
 
 
-def root(square: Float[Array, ""]) -> Float[Array, ""]:
+def root(square: Scalar) -> Float[Array, ""]:
     """The square root, with the derivative 0 at 0."""
     # Both branches of `where` are differentiated, and 0·∞ is NaN: hence the inner one.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)

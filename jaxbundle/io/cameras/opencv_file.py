@@ -356,8 +356,9 @@ def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
 
 
 def _whole(value: object) -> int | None:
-    good = _is_number(value) and float(value).is_integer() and 0 < value < 1e9
-    return int(value) if good else None
+    if not _is_number(value) or not float(value).is_integer() or not 0 < value < 1e9:
+        return None
+    return int(value)
 
 
 def _is_number(value: object) -> TypeGuard[float]:

@@ -223,7 +223,7 @@ def _references(path: Path, chunk: ET.Element, markers: Mapping[str, ET.Element]
         where = f"{path}, reference of marker {id!r}"
         ids.append(id)
         roles.append("control" if _true(reference.get("enabled")) else "check")
-        position.append([number_in(reference.get(k), f"{where}, {k}") for k in "xyz"])
+        position.append([number_in(reference.get(k, ""), f"{where}, {k}") for k in "xyz"])
         sigma.append(
             [
                 number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")

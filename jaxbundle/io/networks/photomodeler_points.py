@@ -111,7 +111,7 @@ def _find_smart_rows(
                 "point marked by hand and of a smart point (σ 0), but is in the object points "
                 "only once, and it is unclear for which; give one of the two another id"
             )
-        if after or (not before and k >= descent):
+        if after or (not before and descent is not None and k >= descent):
             smart_rows.append(k)
     return smart_rows
 

@@ -72,7 +72,7 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
 
 
 @partial(compile_once, static=0)
-def _batch(function: Callable[[Array], Array], rows: Float[np.ndarray, "batch ..."]) -> Array:
+def _batch(function: Callable[..., Array], rows: Float[np.ndarray, "batch ..."]) -> Array:
     return jax.vmap(function)(rows)
 
 

@@ -138,7 +138,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     fy = _focal_length(fields, "y", size and size[1], fx)
     middle = (size[0] / 2, size[1] / 2) if size else (None, None)
     c = [fields.number(f"c{axis}", n) - PIXEL_CENTRE for axis, n in zip("xy", middle)]
-    core = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
+    core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
     coefficients = {name: fields.number(name, 0.0) for name in names}
     k4 = fields.number("k4", 0.0) if kind == "OPENCV" else 0.0
     if k4 == 0:

@@ -163,17 +163,18 @@ def _parts(
         return
     # the cubic kernel, the widest, reaches 2 pixels beyond a position; 3 leave one for rounding
     margin = 3
-    window = tuple(
+    lines, pixels = (
         (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
         for v, size in zip(seen, (image.lines, image.pixels))
     )
+    window = lines, pixels
     side = part[0].stop - part[0].start
     # a single place cannot be halved, whatever it needs
-    if side == 1 or (window[0][1] - window[0][0]) * (window[1][1] - window[1][0]) <= most:
+    if side == 1 or (lines[1] - lines[0]) * (pixels[1] - pixels[0]) <= most:
         yield part, window
         return
     halves = [
         [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
     ]
-    for quarter in itertools.product(*halves):
-        yield from _parts(line, pixel, image, most, quarter)
+    for rows, columns in itertools.product(*halves):
+        yield from _parts(line, pixel, image, most, (rows, columns))

@@ -17,7 +17,7 @@ from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.tables import ROLES, Network
 
 if TYPE_CHECKING:
-    from ezdxf.layouts import Modelspace
+    from ezdxf.layouts.layout import Modelspace
 
 COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
 """Numbers of AutoCAD's colour index."""

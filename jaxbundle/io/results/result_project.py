@@ -67,7 +67,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
         warnings=(),
         notes=("the adjusted network",),
     )
-    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+    return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 
 def readjustable_network(adjustment: "Adjustment") -> Network:
@@ -120,7 +120,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
         notes=("the adjusted network",),
     )
     adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
-    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+    return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 
 def _sigma(weight: Float[np.ndarray, "..."], otherwise: float) -> Float[np.ndarray, "..."]:

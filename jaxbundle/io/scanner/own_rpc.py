@@ -15,7 +15,6 @@ else those that do. The difference is reported whenever none agree, or others th
 import dataclasses
 import glob
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +96,7 @@ def _find_rpc_file(path: Path) -> Path | None:
     return None
 
 
-def _compare(image: PushbroomImage, rpc: Rpc, sets: Sequence[Corrections]) -> list[Agreement]:
+def _compare(image: PushbroomImage, rpc: Rpc, sets: tuple[Corrections, ...]) -> list[Agreement]:
     with np.errstate(invalid="ignore"):
         return compare_with_rpc(image, rpc, sets)
 

@@ -252,7 +252,7 @@ def _observations(
         row = int(lacking.any(1).argmax())
         raise InputError(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
-            f"sigma in [{section.title}] for those without"
+            f"sigma in [refine] for those without"
         )
     return Observations(
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),

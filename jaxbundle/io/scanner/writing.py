@@ -87,7 +87,7 @@ def write_scanner_image(
 
 
 def _options(table: Table, method: str | None = None) -> dict[str, Any]:
-    options = {"interpolation": method or table.method}
+    options: dict[str, Any] = {"interpolation": method or table.method}
     if options["interpolation"] in ("lagrange", "usgscsm"):
         options["order"] = table.order
     if np.isfinite(table.gap):

@@ -1,6 +1,7 @@
 """The page of a refinement of scanner images (`jaxbundle.refinement`)."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
 from jaxbundle.report.refinement import conclude_refinement
+from jaxbundle.types import present
 
 KIND = "refinement of scanner images"
 SCANNER_AXES = ("line", "pixel")
@@ -62,7 +64,7 @@ def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
     declared, given = result.inspection.declared, result.inspection.declared.given
     xy = lambda of_scanner: np.asarray(
-        given.observations.xy if of_scanner else given.frames.observations.xy
+        given.observations.xy if of_scanner else present(given.frames).observations.xy
     )
     # the parts of the equations are in another order than the images
     measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
