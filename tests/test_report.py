@@ -241,6 +241,8 @@ def test_check_points(convergent4):
     )  # fmt: skip
     changed = again(convergent4)
     changed.check_points = found
+    # given coordinates without σ: the verdict compares with the σ of both
+    changed.check = (SimpleNamespace(sigma=np.full((2, 3), np.nan)), None)
     table = rows(section(changed.report(), "Check points: intersected − given, in model"), "point")
     assert [float(x) for x in table[0][1:4]] == [0.001, 0.002, -0.002]
     assert float(table[1][4]) == pytest.approx(2 * convergent4.sigma0, rel=6e-3)

@@ -24,7 +24,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 
 
 @app.command(example="examples/convergent4/project.toml --out out/convergent4", once=True)
-def adjust(
+def adjust(  # noqa: PLR0913 - the options of the command
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     out: Annotated[
@@ -126,14 +126,17 @@ def adjust(
             check,
         )
         if not first:
+            # only the first process writes, though all compute
             json, out, html, save, quiet, print_report = "", None, "", "", True, False
     network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     if check:
         network = network.replace(points=select_checks(network.points, check))
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
+    # before an adjustment that may take hours
     check_targets(input, network, json, out, control, force, html, save)
     origin = Origin(computed=in_words(now()))
+    # fingerprints read all files once more: only for outputs that state them
     if html or out is not None:
         origin = trace_origin(
             input,

@@ -41,7 +41,7 @@ class Command(TyperCommand):
     computes: bool = True
     once: bool = False
 
-    def invoke(self, ctx):
+    def invoke(self, ctx: typer.Context) -> Any:
         if self.computes:
             require_address_space(self.name or "")
             if ctx.obj is not None:
@@ -50,15 +50,15 @@ class Command(TyperCommand):
             jaxbundle.enable_x64(compile_quickly=small)
         return super().invoke(ctx)
 
-    def get_help(self, ctx) -> str:
+    def get_help(self, ctx: typer.Context) -> str:
         # For a stream of ASCII, click would write UTF-8.
         return for_output(super().get_help(ctx))
 
     def get_short_help_str(self, limit: int = 0) -> str:
         """The complete first sentence, for the list of commands."""
-        return super().get_short_help_str(1000)
+        return super().get_short_help_str(max(limit, 1000))  # no sentence is as long
 
-    def format_epilog(self, ctx, formatter) -> None:
+    def format_epilog(self, ctx: typer.Context, formatter: Any) -> None:
         """The end of every help text: an example and the exit statuses."""
         with formatter.section("Example"):
             formatter.write(f"  {ctx.command_path} {self.example}\n")
@@ -66,10 +66,10 @@ class Command(TyperCommand):
             formatter.write_text(EXIT_STATUS)
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """A group of commands."""
 
-    def get_help(self, ctx) -> str:
+    def get_help(self, ctx: typer.Context) -> str:
         return for_output(super().get_help(ctx))
 
 
@@ -79,7 +79,7 @@ class Application(typer.Typer):
 
     def __init__(self, help: str, **options: Any):
         super().__init__(
-            cls=Group,
+            cls=CommandGroup,
             help=help,
             short_help=help,
             rich_markup_mode=None,
@@ -96,7 +96,7 @@ class Application(typer.Typer):
         computes: bool = True,
         once: bool = False,
         **options: Any,
-    ):
+    ) -> Callable[[Callable], Callable]:
         """Like typer's, with --quiet and --verbose. `example`: the arguments of a line that calls
         it, for its help; `computes`: whether it works with JAX; `once`: whether its time depends on
         its input, so that programs of a small input are compiled quickly."""
@@ -104,7 +104,7 @@ class Application(typer.Typer):
         kind = type("Command", (Command,), fields)
         register = super().command(name, cls=kind, **options)
 
-        def add(function):
+        def add(function: Callable) -> Callable:
             register(add_habits(function))
             return function
 
@@ -190,7 +190,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _main(
     context: typer.Context,
-    version: Annotated[
+    version: Annotated[  # noqa: ARG001 - its callback prints it
         bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
     ] = False,
 ) -> None:
@@ -207,6 +207,7 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except (BrokenPipeError, SystemExit):  # typer ends a command that meets a broken pipe
+        # nobody reads: what Python flushes at its end must not fail once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         leave(NO_READER)
     except typer.Abort as error:  # typer's word for EOFError

@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -15,13 +16,12 @@ from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
 
-WITH_REASON = ("bad input", "not solved", "failed")
+STATUSES_WITH_REASON = ("bad input", "not solved", "failed")
 """Statuses of networks whose lines have an `error`."""
-MOST_REASONS = 5
 
 
 @app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")
-def batch(
+def batch(  # noqa: PLR0913 - the options of the command
     inputs: Annotated[
         list[str],
         typer.Argument(help=".npz of many cameras; projects; with --board folders of photographs"),
@@ -122,24 +122,18 @@ def batch(
     from jaxbundle.io.text.csv_tables import read_csv, write_text
     from jaxbundle.network.columns import count
 
-    known = None
-    if board:
-        known = board_given(board, square, kind, None, marker, dictionary)
-    elif square is not None or marker is not None:
+    if not board and (square is not None or marker is not None):
         raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
+    known = board_given(board, square, kind, None, marker, dictionary) if board else None
     check_page(html, None, [*inputs, json_lines], force)
     given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
     check_outputs(table, summary, given, force)
-    asked = {"--html": html, "--table": table, "--summary": summary}
-    asked = [name for name, value in asked.items() if value]
-    if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
-        raise InputError(
-            f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} is no file"
-        )
+    asked = _made_of_lines({"--html": html, "--table": table, "--summary": summary}, json_lines)
     columns = None if against is None else read_csv(against)
     if columns is not None:
         if not asked:
             raise InputError("--against: give --html, --table or --summary as well")
+        # read once before the run, for its errors
         read_against(columns, columns.ids("id") if "id" in columns.values else (), str(against))
     if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
@@ -170,6 +164,7 @@ def batch(
             set,
         )
         if not first:
+            # only the first process writes, though all compute
             html, table, summary, asked, quiet = "", None, None, [], True
     elif not part:
         add_parts(json_lines)  # left by joined processes that were ended
@@ -196,6 +191,7 @@ def batch(
         )
     if asked:
         found = Population(result_rows(inputs, json_lines))
+        # read again, for the keys that now have results
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         write_outputs(found, beside, table, summary)
     if html:
@@ -223,11 +219,8 @@ def batch(
     total, solved = counts.total(), sum(counts[status] for status in SOLVED)
     if not quiet:
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
-        if os.path.isfile(json_lines) and any(counts[status] for status in WITH_REASON):
-            reasons = [_reason(row) for row in result_rows(inputs, json_lines) if row.get("error")]
-            print(*reasons[:MOST_REASONS], sep="\n")
-            if len(reasons) > MOST_REASONS:
-                print(f'and {len(reasons) - MOST_REASONS} more: see "error" in {json_lines}')
+        if any(counts[status] for status in STATUSES_WITH_REASON):
+            _print_reasons(inputs, json_lines)
     if first and total and not solved:
         raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")
     if first and quiet and solved < total:
@@ -236,6 +229,30 @@ def batch(
             f"result: {said}",
             file=sys.stderr,
         )
+
+
+def _made_of_lines(outputs: Mapping[str, object], json_lines: str) -> list[str]:
+    """The options asked for whose files are made from the lines of results.
+
+    **Raises:** `InputError` if these go to a pipe or a device, which cannot be read again."""
+    asked = [name for name, value in outputs.items() if value]
+    if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
+        raise InputError(
+            f"{asked[0]}: is made from the lines of --json-lines, but {json_lines} is no file"
+        )
+    return asked
+
+
+def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5) -> None:
+    """The first errors of a file of results, if it is one that can be read again."""
+    from jaxbundle.batch.run import result_rows
+
+    if not os.path.isfile(json_lines):
+        return
+    reasons = [_reason(row) for row in result_rows(inputs, json_lines) if row.get("error")]
+    print(*reasons[:max_reasons], sep="\n")
+    if len(reasons) > max_reasons:
+        print(f'and {len(reasons) - max_reasons} more: see "error" in {json_lines}')
 
 
 def _reason(row: dict) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.batch.population import Population
-from jaxbundle.cli.outputs import OR_FORCE, check_file, check_json
+from jaxbundle.cli.outputs import FORCE_ADVICE, check_file, check_json
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.parquet import is_parquet, need_pyarrow, write_parquet
 from jaxbundle.io.results.result_json import without_nan
@@ -33,7 +33,8 @@ def check_outputs(
             except ImportError as error:
                 raise InputError(f"--table {table}: {error}") from None
     if summary is not None and not force:
-        check_json(str(summary), OR_FORCE, "--summary")
+        # a table is a .csv or .parquet by its name; a summary may have any
+        check_json(str(summary), FORCE_ADVICE, "--summary")
 
 
 def write_outputs(

@@ -1,5 +1,6 @@
 """`jaxbundle calibrate`: calibrate cameras from photographs of a board."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 
 
 @app.command(example="examples/board --board 9x6 --square 0.03 --out out/board")
-def calibrate(
+def calibrate(  # noqa: PLR0913 - the options of the command
     photos: Annotated[
         list[str] | None, typer.Argument(help="photographs of one camera: files, patterns, folders")
     ] = None,
@@ -146,7 +147,7 @@ def calibrate(
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
-        def tell(*_):
+        def tell(*_: object) -> None:
             bar.advance(task)
             if bar.tasks[task].finished:
                 bar.update(task, description="adjusting")
@@ -188,6 +189,7 @@ def calibrate(
                     **options,
                 )
         except NotSolvedError as error:
+            # a failure makes no folder, unless a file that was asked for belongs in it
             place = out if name_inside(json, out) or name_inside(html, out) else None
             page = partial(compose_failure, error, origin, KIND)
             with write_result(json, unsolved_text(error), place, COMMAND, names, force, html, page):
@@ -225,7 +227,9 @@ def calibrate(
         )
 
 
-def _check_compared(models, cameras, free, rig) -> None:
+def _check_compared(
+    models: Sequence[str], cameras: Mapping[str, Sequence[str]], free: object, rig: bool
+) -> None:
     """Refuse options that are incompatible with --models."""
     for given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
         if given:
@@ -236,12 +240,13 @@ def _check_compared(models, cameras, free, rig) -> None:
         raise InputError("--models: give at least two different models, such as opencv,brown")
 
 
-def _check_names(cameras) -> None:
+def _check_names(cameras: Iterable[str]) -> None:
     """Refuse cameras that would share an output folder."""
     from jaxbundle.calibration.files import file_name
 
     folders: dict[str, str] = {}
     for name in cameras:
+        # some systems do not tell the letters of a name from capitals
         other = folders.setdefault(file_name(name).casefold(), name)
         if other != name:
             raise InputError(
@@ -250,7 +255,7 @@ def _check_names(cameras) -> None:
             )
 
 
-def _cameras(photos, named) -> dict[str, list[str]]:
+def _cameras(photos: Sequence[str] | None, named: Sequence[str] | None) -> dict[str, list[str]]:
     """Photographs by camera name, or all of one camera."""
     if photos and named:
         raise InputError("give photographs either as arguments or by --camera NAME=PATTERN")
@@ -269,14 +274,14 @@ def _cameras(photos, named) -> dict[str, list[str]]:
                 "give each camera its own name and one folder or pattern"
             )
         cameras[name] = [pattern]
-    return cameras or {"cam": list(photos)}
+    return cameras or {"cam": list(photos or ())}
 
 
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def _values(given) -> dict[str, float]:
+def _values(given: Sequence[str] | None) -> dict[str, float]:
     values = {}
     for item in given or ():
         name, equals, text = (part.strip() for part in item.partition("="))

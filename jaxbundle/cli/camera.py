@@ -8,10 +8,6 @@ import typer
 from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 
-STEPS, CURVE = 12, 200
-"""Rows of a table without --step, points of a curve."""
-MOST_ROWS = 100_000
-
 
 @app.command(example="examples/video_cameras/cameras.toml#1-indoor --step 1")
 def camera(
@@ -37,23 +33,27 @@ def camera(
     from jaxbundle.cli.camera_table import print_camera, sizes_of, table_of
     from jaxbundle.io.text.csv_tables import write_csv
 
+    # without --step a table that fits a terminal; a curve that looks smooth; and a limit for
+    # steps that were given in another unit
+    rows, points, max_rows = 12, 200, 100_000
     sizes = pair("--image-size", image_size), pair("--pixel-size", pixel_size)
     tables, curves, units = [], {}, set()
     for file in files:
         given = camera_given(file)
         size, pitch = sizes_of(file, given, *sizes)
         unit = get_model(given.model).unit
-        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch)
+        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch).tolist()
         reach = float(np.hypot(*extent) / 2)
-        width = reach / STEPS if step is None else step
-        if width * MOST_ROWS < reach:
+        width = reach / rows if step is None else step
+        if width * max_rows < reach:
             raise InputError(
-                f"--step {width:g}: more than {MOST_ROWS} rows to a radius of {reach:.4g} {unit}"
+                f"--step {width:g}: more than {max_rows} rows to a radius of {reach:.4g} {unit}"
             )
         tables.append(table_of(given, reach, width, about_origin))
         print_camera(given, extent, size, pitch, tables[-1])
+        # two files may have cameras of one name
         name = given.id if given.id not in curves else f"{given.id} ({file})"
-        curves[name] = table_of(given, reach, reach / CURVE, about_origin)
+        curves[name] = table_of(given, reach, reach / points, about_origin)
         units.add(unit)
     if plot is not None:
         if len(units) > 1:

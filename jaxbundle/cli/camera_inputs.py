@@ -24,7 +24,8 @@ def camera_given(text: str) -> Camera:
 
 
 def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
-    """The same, with the covariance of its free parameters if it is from a JSON result.
+    """The camera of `camera_given`, with the covariance of its free parameters if it is from a JSON
+    result.
 
     **Raises:** `InputError`.
     """

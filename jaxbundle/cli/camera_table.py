@@ -1,5 +1,7 @@
 """The output of `jaxbundle camera`: parameters, field of view, distortion."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from jaxbundle.cameras import get_model
@@ -14,8 +16,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network.tables import Camera
 
+Pair = tuple[float, float]
 
-def sizes_of(file: str, given: Camera, size, pitch):
+
+def sizes_of(
+    file: str, given: Camera, size: Pair | None, pitch: Pair | None
+) -> tuple[Pair, Pair | None]:
     """Image and pixel size of a camera, from the options or the camera.
 
     **Raises:** `InputError` if one is missing.
@@ -29,7 +35,7 @@ def sizes_of(file: str, given: Camera, size, pitch):
     return size, pitch
 
 
-def table_of(given: Camera, reach: float, step: float, about_origin: bool):
+def table_of(given: Camera, reach: float, step: float, about_origin: bool) -> dict[str, np.ndarray]:
     """Distortion by radius.
 
     **Raises:** `InputError` for an impossible step.
@@ -41,7 +47,13 @@ def table_of(given: Camera, reach: float, step: float, about_origin: bool):
         raise InputError(f"--step: {error}") from None
 
 
-def print_camera(given: Camera, extent, size, pitch, table) -> None:
+def print_camera(
+    given: Camera,
+    extent: Sequence[float],
+    size: Pair,
+    pitch: Pair | None,
+    table: Mapping[str, np.ndarray],
+) -> None:
     """Print parameters, field of view and table of a camera."""
     model, p = get_model(given.model), all_parameters(given)
     focal = [p[name] for name in model.principal_distance]

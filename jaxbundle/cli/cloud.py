@@ -1,6 +1,7 @@
 """`jaxbundle cloud`: filter, thin, convert and compare point clouds."""
 
 import json as json_text
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from jaxbundle.system.terminals import write_json
 
 
 @app.command(example="out/surface/cloud.csv --cube 0.05 --out out/thinned.las")
-def cloud(
+def cloud(  # noqa: PLR0913 - the options of the command
     file: Annotated[Path, typer.Argument(help="cloud: .csv with X,Y,Z, .ply, .las, .laz")],
     out: Annotated[
         Path | None, typer.Option(help=f"file for the cloud: {', '.join(CLOUD_FILES)}")
@@ -48,11 +49,7 @@ def cloud(
     check_json(json)
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
-    if out is not None and out.suffix.lower() not in CLOUD_FILES:
-        raise InputError(f"--out {out}: one of {', '.join(CLOUD_FILES)} is expected")
-    for option, path in (("--out", out), ("--dsm", dsm)):
-        if path is not None and path.resolve() in (file.resolve(), against and against.resolve()):
-            raise InputError(f"{option} {path} is part of the input and would be overwritten")
+    _check_targets([file] if against is None else [file, against], out, dsm)
     found = given = read_cloud(file)
     other = None if against is None else read_cloud(against)
     found = drop_weak(found, max_sigma, min_rays)
@@ -81,3 +78,12 @@ def cloud(
     for name in ("plane", "check_points", "comparison"):
         for key, value in report.get(name, {}).items():
             print(f"{name} {key:20} {value}")
+
+
+def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None) -> None:
+    """Refuse a cloud of another format, and files that would replace an input."""
+    if out is not None and out.suffix.lower() not in CLOUD_FILES:
+        raise InputError(f"--out {out}: one of {', '.join(CLOUD_FILES)} is expected")
+    for option, path in (("--out", out), ("--dsm", dsm)):
+        if path is not None and path.resolve() in [given.resolve() for given in inputs]:
+            raise InputError(f"{option} {path} is part of the input and would be overwritten")

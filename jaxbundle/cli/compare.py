@@ -10,11 +10,6 @@ import typer
 from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 
-RINGS = 10
-SAVED = b"PK\x03\x04"
-"""The first bytes of a saved adjustment; no camera file begins with them."""
-
-
 PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"
 
 
@@ -40,9 +35,11 @@ def compare(
 ) -> None:
     """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
     common unknowns, with a test of each difference."""
+    from jaxbundle.cli.outputs import SAVED_ADJUSTMENT
     from jaxbundle.system.file_content import beginning
 
-    saved = [beginning(name, len(SAVED)) == SAVED for name in (a, b)]
+    # no camera file begins like an archive
+    saved = [SAVED_ADJUSTMENT.match(beginning(name, 4)) is not None for name in (a, b)]
     if any(saved):
         if not all(saved):
             one, other = (a, b) if saved[0] else (b, a)
@@ -77,7 +74,8 @@ def compare(
     try:
         found = compare_cameras(one, other, radius=radius, **known)
         reach = np.hypot(np.ptp(found.x), np.ptp(found.y)) / 2
-        rings = difference_rings(found, step if step is not None else reach / RINGS)
+        width = step if step is not None else reach / 10
+        rings = difference_rings(found, width)
     except ValueError as error:
         raise InputError(f"{a}, {b}: {error}; see --image-size, --pixel-size, --step") from None
     if first.model == second.model:
@@ -94,8 +92,8 @@ def compare(
     if C_first is not None and C_second is not None:
         C = expected_difference(found, one, other, (C_first, C_second), **known)
         expected = np.sqrt(np.trace(C, axis1=2, axis2=3))
+        # rings of a difference that is σ everywhere: their RMS is what is expected
         as_map = dataclasses.replace(found, difference=expected[..., None] * [1.0, 0.0])
-        width = step if step is not None else reach / RINGS
         rings["expected"] = difference_rings(as_map, width)["rms"]
         columns += ("expected",)
         times = np.sqrt(np.nanmean((found.length / expected) ** 2))

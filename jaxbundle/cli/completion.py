@@ -13,7 +13,7 @@ from jaxbundle.cli.app import app, choice
 SHELLS = ("bash", "zsh", "fish")
 
 
-class Place(NamedTuple):
+class CommandNode(NamedTuple):
     """A command: the words that lead to it, the commands below it (or the words that an argument is
     one of), its options."""
 
@@ -33,14 +33,15 @@ def completion(shell: Annotated[str, choice(SHELLS, argument=True)]) -> None:
     zsh a file that ~/.zshrc sources after compinit, of fish
     ~/.config/fish/completions/jaxbundle.fish.
     """
+    # a command registers itself when its file is imported
     for command in COMMANDS:
         importlib.import_module(f"jaxbundle.cli.{command}")
     parser = typer.main.get_command(app)
-    places = list(walk(parser, typer.Context(parser, info_name="jaxbundle"), ("jaxbundle",)))
-    print(for_fish(places) if shell == "fish" else for_bash(places, shell == "zsh"), end="")
+    nodes = list(walk(parser, typer.Context(parser, info_name="jaxbundle"), ("jaxbundle",)))
+    print(for_fish(nodes) if shell == "fish" else for_bash(nodes, shell == "zsh"), end="")
 
 
-def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
+def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[CommandNode]:
     """All commands, from the program down."""
     options: dict[str, tuple[str, ...]] = {}
     flags, helps = set(), {}
@@ -56,14 +57,14 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
             helps[name] = (parameter.help or "").split("; ")[0]
             if parameter.is_flag:
                 flags.add(name)
-    yield Place(words, tuple(named), options, frozenset(flags), helps)
+    yield CommandNode(words, tuple(named), options, frozenset(flags), helps)
     for name, one in below.items():
         yield from walk(one, type(context)(one, parent=context, info_name=name), (*words, name))
 
 
-def for_bash(places: list[Place], zsh: bool = False) -> str:
+def for_bash(nodes: list[CommandNode], zsh: bool = False) -> str:
     """For zsh by its emulation of bash."""
-    ways = [" ".join(place.words) for place in places if len(place.words) > 1]
+    ways = [" ".join(node.words) for node in nodes if len(node.words) > 1]
     lines = ["autoload -U +X bashcompinit && bashcompinit"] if zsh else []
     lines += [
         "_jaxbundle() {",
@@ -76,20 +77,20 @@ def for_bash(places: list[Place], zsh: bool = False) -> str:
         "  done",
         '  case "$way:$before" in',
     ]
-    for place in places:
-        way = " ".join(place.words)
-        for name, words in place.options.items():
+    for node in nodes:
+        way = " ".join(node.words)
+        for name, words in node.options.items():
             if words:
                 lines.append(f"    {_quoted(f'{way}:{name}')}) words={_quoted(' '.join(words))} ;;")
-            elif name not in place.flags:
+            elif name not in node.flags:
                 lines.append(f"    {_quoted(f'{way}:{name}')}) return ;;")
     lines += ["    *)", '      case "$way:$current" in']
-    for place in places:
-        way = " ".join(place.words)
-        options = " ".join(place.options)
+    for node in nodes:
+        way = " ".join(node.words)
+        options = " ".join(node.options)
         lines.append(f"        {_quoted(f'{way}:')}-*) words={_quoted(options)} ;;")
-        if place.below:
-            below = _quoted(" ".join(place.below))
+        if node.below:
+            below = _quoted(" ".join(node.below))
             lines.append(f"        {_quoted(f'{way}:')}*) words={below} ;;")
     lines += [
         "      esac ;;",
@@ -101,23 +102,23 @@ def for_bash(places: list[Place], zsh: bool = False) -> str:
     return "\n".join(lines) + "\n"
 
 
-def for_fish(places: list[Place]) -> str:
+def for_fish(nodes: list[CommandNode]) -> str:
     """One line for each command and option."""
     lines = []
-    for place in places:
-        seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in place.words[1:])
-        if place.below:
+    for node in nodes:
+        seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in node.words[1:])
+        if node.below:
             first = f"{seen}; and not" if seen else "not"
-            when = f"{first} __fish_seen_subcommand_from {' '.join(place.below)}"
-            below = _quoted(" ".join(place.below))
+            when = f"{first} __fish_seen_subcommand_from {' '.join(node.below)}"
+            below = _quoted(" ".join(node.below))
             lines.append(f"complete -c jaxbundle -f -n {_quoted(when)} -a {below}")
-        for name, words in place.options.items():
+        for name, words in node.options.items():
             if not (seen and name.startswith("--")):
                 continue
             line = f"complete -c jaxbundle -n {_quoted(seen)} -l {name[2:]}"
             line += f" -x -a {_quoted(' '.join(words))}" if words else ""
-            line += "" if words or name in place.flags else " -r"
-            lines.append(f"{line} -d {_quoted(place.helps[name])}")
+            line += "" if words or name in node.flags else " -r"
+            lines.append(f"{line} -d {_quoted(node.helps[name])}")
     return "\n".join(lines) + "\n"
 
 

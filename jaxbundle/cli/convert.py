@@ -12,7 +12,7 @@ from jaxbundle.errors import InputError
 
 
 @app.command(example="examples/convergent4/project.toml out/network.ply", once=True)
-def convert(
+def convert(  # noqa: PLR0913 - the options of the command
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],
     to: Annotated[

@@ -10,11 +10,11 @@ from jaxbundle.choices import AIMS, DESIGNED, ORDERS
 from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.cli.habits import is_in_file
 
-SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
+BOX_FORM = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
 
 @app.command(example="PROJECT.toml --distance 1,6 --out out/designed")
-def design(
+def design(  # noqa: PLR0913 - the options of the command
     project: Annotated[Path, typer.Argument(help="cameras, targets and start stations")],
     aim: Annotated[str, choice(AIMS, "quantity to minimise")] = "mean",
     of: Annotated[
@@ -37,7 +37,7 @@ def design(
     sigma_image: Annotated[
         float | None, typer.Option(help="σ of image coordinates, in the unit of the cameras")
     ] = None,
-    room: Annotated[str, typer.Option(help=f"allowed camera positions: {SIX}")] = "",
+    room: Annotated[str, typer.Option(help=f"allowed camera positions: {BOX_FORM}")] = "",
     distance: Annotated[str, typer.Option(help="shortest,longest ray")] = "",
     focus: Annotated[str, typer.Option(help="smallest,largest depth in focus")] = "",
     edge: Annotated[float, typer.Option(help="unused margin of the format, each side")] = 0.0,
@@ -49,9 +49,9 @@ def design(
     ] = "",
     apart: Annotated[float, typer.Option(help="smallest distance between stations")] = 0.0,
     obstacle: Annotated[
-        list[str] | None, typer.Option(help=f"an opaque box: {SIX}; repeatable")
+        list[str] | None, typer.Option(help=f"an opaque box: {BOX_FORM}; repeatable")
     ] = None,
-    targets: Annotated[str, typer.Option(help=f"box for movable targets: {SIX}")] = "",
+    targets: Annotated[str, typer.Option(help=f"box for movable targets: {BOX_FORM}")] = "",
     starts: Annotated[int, typer.Option(help="searches, all but one from random stations")] = 1,
     iterations: Annotated[int, typer.Option(min=1, help="per round of the search")] = 60,
     draws: Annotated[

@@ -10,7 +10,7 @@ from jaxbundle.cli.app import Control, Format, Quiet, Settings, app, choice
 
 
 @app.command(example="examples/convergent4/project.toml")
-def explore(
+def explore(  # noqa: PLR0913 - the options of the command
     input: Annotated[
         str,
         typer.Argument(

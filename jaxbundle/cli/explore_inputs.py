@@ -47,6 +47,7 @@ def recognise(input: str) -> str:
         return SCANNER
     if path.suffix.lower() in (".dim", ".imd"):
         return SCANNER
+    # before the networks, since its folder contains one
     if is_of_calibrate(path):
         return CAMERA
     if recognise_format(path) is not None:
@@ -129,6 +130,7 @@ def open_camera(input: str, photo: Path | None, image_size: str, pixel_size: str
     pitch = pair("--pixel-size", pixel_size) or camera.pixel_size
     whole = None if size is None else (int(size[0]), int(size[1]))
     camera = dataclasses.replace(camera, image_size=whole, pixel_size=pitch)
+    # of the free parameters only: sliders of the others have none
     sigma = None if found is None else dict(zip(found[0], np.sqrt(np.diag(found[1]))))
     picture = None if photo is None else read_photograph(photo, colour=True)
     files = [input.rpartition("#")[0] or input, *([] if photo is None else [photo])]

@@ -6,7 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,7 +31,7 @@ def add_habits(function: Callable) -> Callable:
     added = {"verbose": Verbose} if own else {"quiet": Quiet, "verbose": Verbose}
 
     @functools.wraps(function)
-    def command(**values):
+    def command(**values: Any) -> Any:
         talk, quiet = values.pop("verbose"), values["quiet"] if own else values.pop("quiet")
         if talk and quiet:
             raise InputError("--quiet and --verbose: give one of them")
@@ -44,6 +44,7 @@ def add_habits(function: Callable) -> Callable:
         for name, kind in added.items()
     ]
     whole = given.replace(parameters=[*given.parameters.values(), *parameters])
+    # typer reads options from here, not from **values
     command.__dict__["__signature__"] = whole
     return command
 

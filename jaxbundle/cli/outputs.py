@@ -58,11 +58,11 @@ NOTHING: Mapping = MappingProxyType({})
 
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
 """The beginning of JSON; a TOML table, `[project]`, does not match."""
-SAVED = re.compile(rb"PK\x03\x04")
+SAVED_ADJUSTMENT = re.compile(rb"PK\x03\x04")
 """The beginning of a saved adjustment, an .npz."""
 HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
 """The beginning of a page."""
-OR_FORCE = ", or --force to replace it"
+FORCE_ADVICE = ", or --force to replace it"
 
 
 def network_files(
@@ -104,7 +104,7 @@ def check_writable(
         check_folder(out, by, names, inputs, force)
     check_file("--json", json, out, inputs)
     if not force:
-        check_json(json, OR_FORCE)
+        check_json(json, FORCE_ADVICE)
     if html and json and os.path.realpath(html) == os.path.realpath(json):
         raise InputError(f"--html {html}: is also the file of --json; give another name")
     check_page(html, out, inputs, force)
@@ -119,7 +119,7 @@ def check_page(
         raise InputError("--html -: a page cannot be written to standard output; give a file")
     check_file("--html", html, out, inputs)
     if not force:
-        _check_content("--html", html, HTML, "HTML", OR_FORCE)
+        _check_content("--html", html, HTML, "HTML", FORCE_ADVICE)
 
 
 def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
@@ -137,6 +137,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
             raise InputError(f"{option} {file}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
+    # by real paths: an input may be named through a link
     if any(str(real) == os.path.realpath(given) for given in inputs):
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
 
@@ -155,6 +156,7 @@ def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, w
         return
     try:
         with path.open("rb") as stream:
+            # enough for blanks before the first sign
             head = stream.read(4096)
     except OSError as error:
         raise InputError(f"{option} {file}: cannot be read: {error.strerror}") from None
@@ -179,7 +181,7 @@ def check_targets(
         raise InputError("--save -: give the name of a file")
     check_file("--save", save, None, inputs)
     if not force:
-        _check_content("--save", save, SAVED, "a saved adjustment", OR_FORCE)
+        _check_content("--save", save, SAVED_ADJUSTMENT, "a saved adjustment", FORCE_ADVICE)
 
 
 def name_inside(file: str, out: Path | None) -> str | None:
@@ -222,12 +224,14 @@ def write_result(
                     write_text(new / PAGE, page())
                 if (name := name_inside(html, out)) not in (None, PAGE):
                     write_bytes(new / name, (new / PAGE).read_bytes())
+    # only now: if the folder could not be written, neither is the rest
     if json not in ("", "-"):
         write_text(Path(json), text)
     if page is not None and html and name_inside(html, out) is None:
         if out is None:
             write_text(Path(html), page())
         else:
+            # a copy: the page of a large result takes seconds to make
             write_bytes(Path(html), (out / PAGE).read_bytes())
 
 

@@ -1,6 +1,8 @@
 """Progress of long work: bars on a terminal, nothing in a pipe, lines on stderr with --verbose."""
 
 import time
+from collections.abc import Callable
+from typing import Any
 
 from jax import monitoring
 from rich.console import Console
@@ -8,6 +10,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
 )
@@ -23,11 +26,11 @@ class _Staged(Progress):
 
     stages: Stages | None = None
 
-    def add_task(self, description: str, *arguments, **options):
+    def add_task(self, description: str, *arguments: Any, **options: Any) -> TaskID:
         self._begin(description)
         return super().add_task(description, *arguments, **options)
 
-    def update(self, task_id, *, description: str | None = None, **options) -> None:
+    def update(self, task_id: TaskID, *, description: str | None = None, **options: Any) -> None:
         self._begin(description)
         super().update(task_id, description=description, **options)
 
@@ -44,6 +47,7 @@ class _Staged(Progress):
 def counting(quiet: bool) -> Progress:
     """A bar with the number done out of the total."""
     console = Console(stderr=True)
+    # the default columns have a percentage, but not the numbers
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     bar = _Staged(
         *columns, console=console, transient=True, disable=quiet or not console.is_terminal
@@ -65,7 +69,7 @@ class iterating:
         self.console = Console(stderr=True)
         self.silent = silent or verbose.get() or not self.console.is_terminal
 
-    def __enter__(self):
+    def __enter__(self) -> Callable[[str, int, int], None] | None:
         if verbose.get():
             self.begun = time.perf_counter()
             return self.tell_line
@@ -85,23 +89,23 @@ class iterating:
         monitoring.register_event_duration_secs_listener(self._hear)
         return self.tell
 
-    def tell(self, stage: str, done: int, total: int) -> None:
+    def tell(self, stage: str, done: int, _: int) -> None:
         """Show the iteration."""
         self.line = f"iteration {done}:{stage.partition(':')[2]}"
         self.bar.update(self.task, description=self.line)
 
-    def tell_line(self, stage: str, done: int, total: int) -> None:
+    def tell_line(self, stage: str, done: int, _: int) -> None:
         """Print the iteration and the elapsed time."""
         detail = stage.partition(":")[2]
         say(f"iteration {done}:{detail}, {time.perf_counter() - self.begun:.2f} s")
 
-    def _hear(self, event: str, *_, **__) -> None:
+    def _hear(self, event: str, *_: object, **__: object) -> None:
         if event == REQUEST_EVENT:
             self.bar.update(self.task, description="compiling programs, once per size")
         elif event == COMPILED_EVENT:
             self.bar.update(self.task, description=self.line)
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object):
         if not self.silent:
             monitoring.unregister_event_listener(self._hear)
             monitoring.unregister_event_duration_listener(self._hear)

@@ -14,7 +14,7 @@ from jaxbundle.system.interrupts import advise
 
 
 @app.command(name="reconstruct", example="PHOTOS --control gcp_list.txt --out out/block")
-def reconstruct_command(
+def reconstruct_command(  # noqa: PLR0913 - the options of the command
     photos: Annotated[list[Path], typer.Argument(help="photographs, or folders of them")],
     out: Annotated[Path, typer.Option(help="folder for report, page, JSON, tables, COLMAP model")],
     camera: Annotated[
@@ -63,7 +63,7 @@ def reconstruct_command(
     from jaxbundle.cli.camera_inputs import camera_given
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
-    from jaxbundle.cli.reconstruct_files import BY, FILES, make_store, write_reconstruction
+    from jaxbundle.cli.reconstruct_files import COMMAND, FILES, make_store, write_reconstruction
     from jaxbundle.io.networks.control import select_checks
     from jaxbundle.measure.coded_targets import check_kind
     from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
@@ -80,6 +80,7 @@ def reconstruct_command(
         check_kind(targets)
     settings = ReconstructionSettings(Detection(features), pairs, points, targets=targets)
     if not square_pixels:
+        # an infinite σ is no prior
         settings = replace(settings, aspect_sigma=inf)
     given = None if camera is None else camera_given(camera)
     known = None if control is None else read_control_measurements(control)
@@ -91,9 +92,10 @@ def reconstruct_command(
         known = replace(known, points=select_checks(known.points, check))
     bars = () if distances is None else read_distances(distances)
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
-    check_writable(json, out, BY, FILES, files, force)
+    # before the search, which opens every photograph; after it the photographs are inputs, too
+    check_writable(json, out, COMMAND, FILES, files, force)
     found, _ = find_photographs(photos)
-    check_writable(json, out, BY, FILES, [*files, *(p.path for p in found)], force, html)
+    check_writable(json, out, COMMAND, FILES, [*files, *(p.path for p in found)], force, html)
     store = make_store(out, force)
     advise(f"run the same command again to resume; matches are kept in {store}")
     with staging(quiet or json == "-") as tell:

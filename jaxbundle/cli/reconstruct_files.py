@@ -1,9 +1,12 @@
 """Output of `jaxbundle reconstruct`: every part with model and cloud, pairs, figures."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxbundle.cli.outputs import FILES as RESULTS
 from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, write_result
@@ -23,20 +26,18 @@ from jaxbundle.reconstruction.result import ReconstructedPart, Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
 from jaxbundle.types import Progress
 
-BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
+COMMAND, STORE, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
 CONTROL, POSITIONS = "control.csv", "camera_positions.csv"
-OF_A_PART = (*RESULTS, CONTROL, POSITIONS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
-FILES = (*OF_A_PART, *(f"part_*/{name}" for name in OF_A_PART), PAIRS, *PAIR_FIGURES)
-FIGURE_PIXELS = 1200
-"""Pixels of the longer side of a photograph in a figure."""
+PART_FILES = (*RESULTS, CONTROL, POSITIONS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
+FILES = (*PART_FILES, *(f"part_*/{name}" for name in PART_FILES), PAIRS, *PAIR_FIGURES)
 
 
 def make_store(out: Path, force: bool) -> Path:
     """The folder of stored features and matches; --out belongs to the command from now on."""
     if read_marker(out) is None:
-        with replace_folder(out, BY, (), force):
+        with replace_folder(out, COMMAND, (), force):
             pass
-    return out / KEPT
+    return out / STORE
 
 
 def write_reconstruction(
@@ -55,7 +56,7 @@ def write_reconstruction(
     also = {"reconstruction": _summary(found), "verdict": verdict_dict(conclude_part(found, first))}
     text = result_text(first.adjustment, brief, also)
     page = partial(compose_part, found, first, origin)
-    with write_result(json, text, out, BY, FILES, force, html, page) as new:
+    with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
         if new is None:
             return
         verdict = f"{first.name}: {conclude_part(found, first).words}"
@@ -83,7 +84,7 @@ def _write_part(
     folder: Path,
     plots: bool,
     note: str,
-    also,
+    also: Mapping[str, Any],
     progress: Progress | None,
     date: str,
 ) -> None:
@@ -106,6 +107,7 @@ def _write_part(
     try:
         fill_colmap(network, folder / MODEL, False)
     except InputError as error:
+        # a camera that COLMAP cannot have must not cost the rest of the result
         print(f"no COLMAP model: {error}")
 
 
@@ -137,13 +139,14 @@ def _write_tables(part: ReconstructedPart, folder: Path) -> None:
         write_csv(folder / POSITIONS, ["image", "dX", "dY", "dZ"], rows)
 
 
-def _thumbnail(path: Path):
-    """The reduced grey values of a photograph; a blank image without the file, or the memory."""
+def _thumbnail(path: Path, max_pixels: int = 1200) -> UInt8[np.ndarray, "rows columns"]:
+    """The grey values of a photograph, reduced to the resolution of a figure, 8 inches of 150 dots;
+    a blank image without the file, or the memory."""
     try:
         grey = read_photograph(path)
     except (InputError, MemoryError):
         return np.full((2, 2), 255, np.uint8)
-    step = max(1, max(grey.shape) // FIGURE_PIXELS)
+    step = max(1, max(grey.shape) // max_pixels)
     return grey[::step, ::step]
 
 

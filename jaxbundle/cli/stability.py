@@ -66,6 +66,7 @@ def stability(
             ]
         rows.append(row)
     head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope", "p", "about it"]
+    # the columns about slopes are there only with --at
     head = head[: len(rows[0])]
     print("\n".join(table(head, rows, "l" + "r" * (len(head) - 1))))
     print(f"\nall epochs the same, all parameters: {found.all_parameters}")

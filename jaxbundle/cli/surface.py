@@ -29,7 +29,7 @@ EXAMPLE = (
 
 
 @app.command(example=EXAMPLE)
-def surface(
+def surface(  # noqa: PLR0913 - the options of the command
     input: Annotated[
         list[Path],
         typer.Argument(
@@ -103,10 +103,12 @@ def surface(
         raise InputError(f"--dsm {dsm}: a positive size is expected")
     if (orthophoto or orthophoto_of) and dsm is None:
         raise InputError("--orthophoto: needs --dsm, the size of its pixels")
+    # read before matching, which takes minutes: its errors come at once
     given = read_cloud(check).X if check else np.zeros((0, 3))
     check_folder(out, "surface", FILES, input, force)
     with counting(quiet or json == "-") as bar:
         options = {"points": points, "step": step, "dense": dense, "progress": report_stages(bar)}
+        # photographs come in one folder, scanner and RPC images one by one
         if len(input) > 1 or is_ground_image(input[0]):
             made = make_of_ground(input, photos, heights, pairs, crs, options)
         else:

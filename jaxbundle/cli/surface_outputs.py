@@ -1,11 +1,13 @@
 """Surfaces of `jaxbundle surface` from photographs, or from line scanner and RPC images."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
+from rich.progress import Progress, TaskID
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
@@ -16,6 +18,9 @@ from jaxbundle.surface.reconstruct import SurfaceResult, find_bounds, ground_bou
 from jaxbundle.surface.relative import align_all
 from jaxbundle.surface.scanner_inputs import from_map, read_ground_views, system_of, to_map
 from jaxbundle.surface.views import OrientedImage
+
+Heights = tuple[float, float]
+"""The lowest and the highest height searched."""
 
 
 class Found(NamedTuple):
@@ -28,7 +33,15 @@ class Found(NamedTuple):
     check: np.ndarray
 
 
-def make_of_photographs(path, photos, heights, pairs, crs, options) -> Found:
+def make_of_photographs(
+    path: Path,
+    photos: Path | None,
+    heights: Heights | None,
+    pairs: Sequence[str] | None,
+    crs: str | None,
+    options: Mapping[str, Any],
+) -> Found:
+    """The surface of oriented photographs."""
     if photos is None:
         raise InputError("--photos is missing: the folder of the photographs")
     views, network, messages = read_views(path, photos)
@@ -39,7 +52,15 @@ def make_of_photographs(path, photos, heights, pairs, crs, options) -> Found:
     return Found(said, views, lambda X: X, check_points(network))
 
 
-def make_of_ground(files, photos, heights, pairs, crs, options) -> Found:
+def make_of_ground(
+    files: Sequence[Path],
+    photos: Path | None,
+    heights: Heights | None,
+    pairs: Sequence[str] | None,
+    crs: str | None,
+    options: Mapping[str, Any],
+) -> Found:
+    """The surface of scanner or RPC images, in the coordinates of a map."""
     if len(files) < 2:
         raise InputError(f"{files[0]}: one image; a surface needs at least two")
     views, around = read_ground_views(files, photos)
@@ -55,7 +76,7 @@ def make_of_ground(files, photos, heights, pairs, crs, options) -> Found:
     return Found(said, views, to_views, np.zeros((0, 3)))
 
 
-def choose(views, names):
+def choose(views: Sequence[OrientedImage], names: Sequence[str] | None) -> list[OrientedImage]:
     """The images with these names; all if none are given."""
     known = [view.name for view in views]
     for name in names or ():
@@ -64,7 +85,9 @@ def choose(views, names):
     return [view for view in views if not names or view.name in names]
 
 
-def _partners(pairs: Sequence[str] | None, views):
+def _partners(
+    pairs: Sequence[str] | None, views: Sequence[OrientedImage]
+) -> dict[int, list[int]] | None:
     return parse_partners(pairs, [v.name for v in views]) if pairs else None
 
 
@@ -75,10 +98,11 @@ def _with_messages(found: SurfaceResult, messages: Sequence[str]) -> SurfaceResu
     return dataclasses.replace(found, messages=everything)
 
 
-def report_stages(bar) -> Callable[[str, int, int], None]:
-    tasks = {}
+def report_stages(bar: Progress) -> Callable[[str, int, int], None]:
+    """A callback that shows every stage as a bar of its own."""
+    tasks: dict[str, TaskID] = {}
 
-    def tell(stage, done, total):
+    def tell(stage: str, done: int, total: int) -> None:
         if stage not in tasks:
             tasks[stage] = bar.add_task(stage, total=total)
         bar.update(tasks[stage], completed=done, total=total)

@@ -16,12 +16,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 
 from jaxbundle.cameras import check_parameters, default_parameters, get_model, project
 from jaxbundle.cameras.convert import image_area
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.cameras.field_of_view import field_of_view_of_rays
+from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
@@ -37,17 +38,10 @@ from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 
-LINES = 13, 9
-"""Lines of the grid, across and down."""
-RADII = 61
-STEPS = 6
-"""Rows of the table of distortion."""
-SLIDER = 0.04
-"""Range of a slider: largest motion of an image point near a corner, relative to the half
-diagonal."""
-PAGE_PIXELS = 1000
-"""Pixels across of a photograph on the page."""
-JPEG_QUALITY = 85
+Radii = Float[np.ndarray, " radii"]
+Distortion = Float[np.ndarray, "2 radii"]
+"""Radial distortion and decentring."""
+Lattice = Float[np.ndarray, "rows columns 2"]
 
 
 class CameraView:
@@ -112,15 +106,18 @@ class CameraView:
     @cached_property
     def _controls(self) -> list[Number]:
         """A slider for every parameter, as long as it takes to move a corner visibly."""
-        at = (self.low + self.high) / 2 + np.array([0.7, 0.6]) * (self.high - self.low) / 2
-        slopes = np.hypot(*np.asarray(_slopes(self.model, jnp.array([*self.values.values()]), at)))
+        # near a corner, where distortion is large, but inside what most lenses image
+        place = (self.low + self.high) / 2 + np.array([0.7, 0.6]) * (self.high - self.low) / 2
+        p = jnp.array([*self.values.values()])
+        slopes = np.hypot(*np.asarray(_slopes(self.model, p, place)))
         controls = []
         for name, slope in zip(self.values, slopes):
             value, ranges = self.values[name], dict(self.model.ranges)
-            length = SLIDER * self.reach / slope if slope > 0 and np.isfinite(slope) else 1.0
+            # a full slider moves that place by 4 % of the half diagonal: seen, and undone, at once
+            length = 0.04 * self.reach / slope if slope > 0 and np.isfinite(slope) else 1.0
             low, high = value - length, value + length
             if name in self.model.principal_distance:
-                low = max(low, 0.1 * value)
+                low = max(low, 0.1 * value)  # at 0 there is no image
             if name in ranges:
                 low, high = max(low, ranges[name][0]), min(high, ranges[name][1])
             note = f"σ {significant(self.sigma[name])}" if name in self.sigma else ""
@@ -208,22 +205,26 @@ class CameraView:
 
     # --- drawings ---------------------------------------------------------------------------
 
-    def _curves(self, values):
+    def _curves(
+        self, values: Mapping[str, float], radii: int = 61
+    ) -> tuple[Radii, Distortion, Distortion]:
         """Radius, and radial distortion and decentring [2, radii] of these values and as given."""
-        radius = np.linspace(0, self.reach, RADII)
+        radius = np.linspace(0, self.reach, radii)
         of = lambda p: distortion_at(self.model, np.array([*p.values()]), radius)[0]
         return radius, of(values), of(self.values)
 
-    def _grids(self, values) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    def _grids(
+        self, values: Mapping[str, float], lines: tuple[int, int] = (13, 9)
+    ) -> tuple[Lattice, Lattice]:
         """The images of evenly spaced rays by the given camera without distortion, and with these
-        values; [rows, columns, 2], NaN where there is no image."""
-        axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, LINES)]
+        values, at `lines` across and down; NaN where there is no image."""
+        axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, lines)]
         xy = np.stack(np.meshgrid(*axes), -1)
         rays = _plain_rays(self.model, self.values, xy)
         found = images_of(self.model, values, rays.reshape(-1, 3))
         return xy, found.reshape(xy.shape)
 
-    def _draw_curve(self, radius, now, before) -> str:
+    def _draw_curve(self, radius: Radii, now: Distortion, before: Distortion) -> str:
         scale, unit = micrometres(self.model.unit)
         curves = [
             Curve("as given", radius, scale * before[0], None, "second"),
@@ -238,7 +239,7 @@ class CameraView:
             "Symmetric radial distortion, to the half diagonal of the image",
         )
 
-    def _draw_grid(self, straight, lattice, rms: float, largest: float) -> str:
+    def _draw_grid(self, straight: Lattice, lattice: Lattice, rms: float, largest: float) -> str:
         scale, unit = micrometres(self.model.unit)
         lines = []
         for places, label, kind in (
@@ -257,7 +258,14 @@ class CameraView:
             f"{significant(scale * rms)} {unit}, at most {significant(scale * largest)} {unit}",
         )
 
-    def _list(self, values, radius, now, before) -> str:
+    def _list(
+        self,
+        values: Mapping[str, float],
+        radius: Radii,
+        now: Distortion,
+        before: Distortion,
+        steps: int = 6,
+    ) -> str:
         rows = []
         for name, value in values.items():
             given, sigma = self.values[name], self.sigma.get(name, 0)
@@ -269,7 +277,7 @@ class CameraView:
         view = field_of_view_of_rays(self.model, values, self.size, self.camera.pixel_size)
         degrees = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)
         scale, unit = micrometres(self.model.unit)
-        chosen = np.linspace(0, len(radius) - 1, STEPS + 1).astype(int)[1:]
+        chosen = np.linspace(0, len(radius) - 1, steps + 1).astype(int)[1:]
         rows = [
             (f"{radius[k]:.4g}", *(significant(scale * x[k]) for x in (before[0], now[0], now[1])))
             for k in chosen
@@ -288,7 +296,9 @@ class CameraView:
             ]
         )
 
-    def _draw_photograph(self, photograph: UInt8[np.ndarray, "r c 3"], values) -> str:
+    def _draw_photograph(
+        self, photograph: UInt8[np.ndarray, "r c 3"], values: Mapping[str, float]
+    ) -> str:
         cv2 = need_opencv()
         u, v = (x.astype(np.float32) for x in self._lookup(photograph.shape[:2], values))
         picture = cv2.remap(
@@ -299,7 +309,8 @@ class CameraView:
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(255, 255, 255),
         )
-        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        # straight edges are judged: few artefacts of the coding may be beside them
+        options = [cv2.IMWRITE_JPEG_QUALITY, 85]
         _, coded = cv2.imencode(".jpg", picture[..., ::-1], options)
         data = base64.b64encode(coded.tobytes()).decode("ascii")
         return (
@@ -311,20 +322,26 @@ class CameraView:
             )
         )
 
-    def _lookup(self, shape: tuple[int, int], values):
-        """Columns and rows in a photograph of the pixels of its undistorted picture."""
+    def _lookup(
+        self, shape: tuple[int, int], values: Mapping[str, float], max_columns: int = 1000
+    ) -> tuple[np.ndarray, ...]:
+        """Columns and rows in a photograph of the pixels of its undistorted picture, which has at
+        most `max_columns` columns."""
         rows, columns = shape
-        every = max(1.0, columns / PAGE_PIXELS)
+        every = max(1.0, columns / max_columns)
         u, v = (np.arange(0, n - 1 + 1e-9, every) for n in (columns, rows))
         pixels = np.stack(np.meshgrid(u, v), -1)
         xy = (pixels - self.origin_of_pixels) / self.step
         rays = _plain_rays(self.model, values, xy)
         found = images_of(self.model, values, rays.reshape(-1, 3)).reshape(xy.shape)
         found = self.origin_of_pixels + self.step * found
+        # a place without image is looked up far outside, where OpenCV leaves white
         return tuple(np.nan_to_num(np.moveaxis(found, -1, 0), nan=-1e6))
 
 
-def _plain_rays(model, values: Mapping[str, float], xy) -> np.ndarray:
+def _plain_rays(
+    model: CameraModel, values: Mapping[str, float], xy: Float[np.ndarray, "*places 2"]
+) -> np.ndarray:
     """Rays of a perspective camera of this principal distance and point, without distortion."""
     c = [values[name] for name in model.principal_distance] or [1.0]
     middle = [values[name] for name in model.principal_point] or [0.0, 0.0]
@@ -335,7 +352,9 @@ def _plain_rays(model, values: Mapping[str, float], xy) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _slopes(model, p, xy):
+def _slopes(
+    model: CameraModel, p: Float[Array, " parameters"], xy: Float[np.ndarray, "2"]
+) -> Float[Array, "2 parameters"]:
     """∂(x, y)/∂p of the ray that is imaged at xy."""
     from jaxbundle.cameras import image_ray
 

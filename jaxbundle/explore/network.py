@@ -50,11 +50,8 @@ from jaxbundle.report.page.sections import photographs
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
 from jaxbundle.statistics.precision import Precision, precision
+from jaxbundle.types import AnyArray
 
-MOST_ROWS = 200
-"""Points whose σ before and after are listed, those that change most first."""
-UPPER = [0, 1, 2, 4, 5, 8]
-"""The six independent ones of the nine elements of a covariance."""
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
@@ -142,7 +139,7 @@ class NetworkView:
             return Moved(row, pose[:3], M)
         return Moved(row, pose[:3], self._turn_to_points(row, pose[:3]))
 
-    def _turn_to_points(self, row: int, centre) -> np.ndarray:
+    def _turn_to_points(self, row: int, centre: Float[np.ndarray, "3"]) -> np.ndarray:
         """M that keeps the image of the centre of the station's points, by the smallest
         rotation."""
         problem = self.problem
@@ -152,11 +149,12 @@ class NetworkView:
         if not len(seen):
             return M
         middle = self.adjustment.point_values[seen].mean(0)
-        old, new = (_unit(middle - X) for X in (given[:3], centre))
+        rays = (middle - X for X in (given[:3], centre))
+        old, new = (ray / (np.linalg.norm(ray) or 1.0) for ray in rays)
         axis = np.cross(old, new)
         sine, cosine = np.linalg.norm(axis), old @ new
         if sine == 0:
-            return M
+            return M  # the points are in the direction they were
         turn = np.asarray(matrix_from_rotation_vector(axis / sine * np.arctan2(sine, cosine)))
         return M @ turn.T
 
@@ -164,6 +162,7 @@ class NetworkView:
         """The adjusted values with the stations at their new places."""
         values = self.adjustment.values
         position, rotation = (np.array(x) for x in (values.position, values.rotation))
+        # positions of the engine are relative to the origin of the network
         for row, centre, M in moves:
             position[row] = centre - self.problem.origin
             rotation[row] = np.asarray(quaternion_from_matrix(jnp.asarray(M)))
@@ -181,7 +180,8 @@ class NetworkView:
             return {"parts": {"moved": paragraph("No station is moved.", "hint")}, "stations": {}}
         before, after = self.before, self.sigma(self.start(moves))
         parts = [self._say_visibility(moves), self._compare(moves, before, after)]
-        six = lambda C: C.reshape(-1, 9)[:, UPPER].ravel().tolist()
+        upper = np.triu_indices(3)  # the six independent elements of a covariance
+        six = lambda C: C.reshape(-1, 3, 3)[:, *upper].ravel().tolist()
         covariance = {"points": after.point_covariance, "images": after.centre_covariance}
         return {
             "ellipsoids": {
@@ -200,7 +200,7 @@ class NetworkView:
             },
         }
 
-    def export(self, name: str, given: Given) -> File:
+    def export(self, name: str, _: Given, /) -> File:
         """There is none: the report of `adjust` has the tables.
 
         **Raises:** `InputError`."""
@@ -264,8 +264,13 @@ class NetworkView:
                 )
         return "".join(paragraph(f"{line}.", "hint") for line in lines)
 
-    def _compare(self, moves: list[Moved], before: Precision, after: Precision) -> str:
+    def _compare(
+        self, moves: list[Moved], before: Precision, after: Precision, max_points: int = 200
+    ) -> str:
+        """The σ before and after: of all points together, cameras, moved stations, and of the
+        points that change most."""
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
+        # held points have σ 0 before and after
         near = self.adjustment.located & (before.points > 0).any(1)
         root = lambda s: np.sqrt(np.mean(s[near] ** 2, 0))
         rows = (
@@ -299,7 +304,7 @@ class NetworkView:
         table = grid(header, [(name, *_pair(a, b)) for name, a, b in rows])
         ids = np.array(network.points.id, dtype=object)
         change = np.where(near, np.abs(np.log(_ratio(before.points, after.points))), -1)
-        order = [p for p in np.argsort(-change)[:MOST_ROWS] if near[p]]
+        order = [p for p in np.argsort(-change)[:max_points] if near[p]]
         points = [
             (
                 ids[p],
@@ -390,11 +395,9 @@ def _selection() -> Section:
     return Section("chosen-section", "What is chosen", "".join(parts), "What is chosen")
 
 
-def _unit(v):
-    return v / (np.linalg.norm(v) or 1.0)
-
-
-def _ratio(before, after):
+def _ratio(
+    before: Float[AnyArray, "points 3"], after: Float[AnyArray, "points 3"]
+) -> Float[np.ndarray, " points"]:
     """Ratio of the means of σ² of points."""
     a, b = (np.sqrt(np.mean(s**2, 1)) for s in (before, after))
     return np.where((a > 0) & (b > 0), b / np.where(a > 0, a, 1.0), 1.0)

@@ -15,7 +15,7 @@ import dataclasses
 import io
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.explore.page import (
@@ -65,7 +65,7 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
 from jaxbundle.pushbroom.interpolation import METHODS, Table
 from jaxbundle.pushbroom.locate import locate_points
-from jaxbundle.pushbroom.noise import Noise, zero_errors
+from jaxbundle.pushbroom.noise import Noise, Sigma, zero_errors
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
@@ -77,13 +77,7 @@ from jaxbundle.report.page.markup import figure, grid, paragraph
 
 ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
 """The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
-CELLS = 7, 6
-"""Parts of the image, along lines and pixels, of the error map; with irregular positions each."""
-EDGE = 9
-"""Places along a side of the footprint."""
-LEVELS = (0.01, 0.1)
-"""σ of the attitude in the accuracy table, degrees."""
-POSITIVE = ("altitude", "speed", "height")
+POSITIVE_KEYS = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
@@ -101,7 +95,8 @@ class ScannerView:
     """The image of a scanner file, or what a flight file simulates.
 
     **Arguments:** `given` the image, or the flight; `earth`: the ellipsoid, None in a local frame;
-    `truth`: an image that is true, the given one if none is given.
+    `truth`: an image that is true, the given one if none is given; `cells`: parts of the image,
+    along lines and pixels, of the error map, with irregular positions in each.
     """
 
     def __init__(
@@ -111,7 +106,9 @@ class ScannerView:
         earth: Ellipsoid | None,
         truth: PushbroomImage | None = None,
         origin: Origin = UNKNOWN,
+        cells: tuple[int, int] = (7, 6),
     ):
+        self.cells = cells
         self.name, self.earth, self.origin = name, earth, origin
         self.flight = given if isinstance(given, Flight) else None
         self.image = measured_image(given) if isinstance(given, Flight) else given
@@ -165,7 +162,7 @@ class ScannerView:
                 Number(
                     "position_white",
                     "σ of every position row",
-                    _one(self.flight.noise.position_white),
+                    _largest(self.flight.noise.position_white),
                     "m",
                 ),
             ]
@@ -184,7 +181,7 @@ class ScannerView:
         found: dict[str, Any] = {}
         for one in self.controls:
             if isinstance(one, Number):
-                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE else -np.inf
+                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE_KEYS else -np.inf
                 found[one.key] = number(given, one.key, one.value, lowest)
                 if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
                     raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
@@ -229,7 +226,7 @@ class ScannerView:
             image = with_errors_in_rows(image, errors)
         return Chosen(image, earth, _surface_at(values["ground"], earth), truth)
 
-    def _flight_with(self, flight: Flight, tracks: Tracks, values) -> Flight:
+    def _flight_with(self, flight: Flight, tracks: Tracks, values: Mapping[str, Any]) -> Flight:
         noise = flight.noise
         for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
             # A σ for every axis stays as the file has it until it is changed.
@@ -266,7 +263,7 @@ class ScannerView:
         expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
         told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
-        field = _rms_of_cells(length)
+        field = self._rms_of_cells(length)
         return {
             "parts": {
                 "ground": self._draw_ground(chosen),
@@ -354,21 +351,26 @@ class ScannerView:
     @cached_property
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Lines and pixels at which errors are computed, cell after cell of the error map."""
-        lines, pixels = spread_positions(self.image.lines, self.image.pixels, CELLS)
+        lines, pixels = spread_positions(self.image.lines, self.image.pixels, self.cells)
         return lines.ravel(), pixels.ravel()
 
     def _errors(self, chosen: Chosen) -> Float[np.ndarray, "n 2"]:
         return ground_errors(chosen.image, chosen.truth, chosen.surface, *self.positions)
 
-    def _expected_accuracy(self, chosen: Chosen) -> list[dict[str, float]]:
-        """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
+    def _rms_of_cells(self, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, "rows columns"]:
+        return np.sqrt(np.mean(length.reshape(*self.cells, -1) ** 2, axis=2))
+
+    def _expected_accuracy(
+        self, chosen: Chosen, levels: Sequence[float] = (0.01, 0.1)
+    ) -> list[dict[str, float]]:
+        """RMS and CE90 of attitudes with given σ about every axis, degrees, one error an image."""
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
         # a constant error has no structure that a few positions could miss
-        spread = spread_positions(image.lines, image.pixels, CELLS, 1)
+        spread = spread_positions(image.lines, image.pixels, self.cells, 1)
         line, pixel = (v.ravel() for v in spread)
         rows = []
-        for level in LEVELS:
+        for level in levels:
             sigma = np.radians(level)
             exact = propagate_accuracy(image, surface, line, pixel, Noise(attitude_bias=sigma))
             rms = closed_form(altitude, view, sigma, sigma, sigma)
@@ -392,7 +394,7 @@ class ScannerView:
         O = reference[:, -1]
         axes = np.asarray(_east_north(surface, tuple(O)))
 
-        def curve(label: str, X, kind: str) -> Curve:
+        def curve(label: str, X: ArrayLike, kind: str) -> Curve:
             east, north = 1e-3 * axes @ (np.asarray(X) - O[:, None])
             return Curve(label, east, north, None, kind)
 
@@ -403,7 +405,8 @@ class ScannerView:
                 (np.asarray(_locate(image, surface, *outline)), "footprint", "first"),
             )
         ]
-        lines = np.linspace(0, image.lines - 1, 4 * EDGE)
+        # as many places as the outline has
+        lines = np.linspace(0, image.lines - 1, len(outline[0]) - 1)
         P = np.array(_positions(image, jnp.asarray(lines))).T
         if earth is None:
             P[2] = 0.0
@@ -415,14 +418,21 @@ class ScannerView:
             "Relative to the image centre; both axes at one scale",
         )
 
-    def _draw_errors(self, field, told) -> str:
+    def _draw_errors(
+        self, field: Float[np.ndarray, "rows columns"], told: Mapping[str, float]
+    ) -> str:
         return figure(
             draw_field(field, 3),
             f"Error on the ground in metres, RMS of each part of the image, line 0 at the top: RMS "
             f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
         )
 
-    def _list(self, told, errors, expected) -> str:
+    def _list(
+        self,
+        told: Mapping[str, float],
+        errors: Float[np.ndarray, "n 2"],
+        expected: Sequence[Mapping[str, float]],
+    ) -> str:
         east, north = np.sqrt(np.mean(errors**2, 0))
         rows = [
             ("RMS", told["rms"]),
@@ -478,7 +488,7 @@ class ScannerView:
 
     def _picture(self, chosen: Chosen) -> bytes:
         size = self.image.lines, self.image.pixels
-        lines, pixels = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(CELLS, size))
+        lines, pixels = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(self.cells, size))
         length = np.hypot(*self._errors(chosen).T)
         told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
         try:
@@ -486,15 +496,11 @@ class ScannerView:
                 (7.5, 6),
                 None,
                 lambda ax: image_map(
-                    lines, pixels, _rms_of_cells(length), "Error on the ground", "m", told, ax
+                    lines, pixels, self._rms_of_cells(length), "Error on the ground", "m", told, ax
                 ),
             )
         except ImportError as error:
             raise InputError(str(error)) from None
-
-
-def _rms_of_cells(length) -> Float[np.ndarray, "rows columns"]:
-    return np.sqrt(np.mean(length.reshape(*CELLS, -1) ** 2, axis=2))
 
 
 def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:
@@ -506,7 +512,8 @@ def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:
 
 
 def _in_pieces(chosen: Chosen) -> Chosen:
-    """The same with trajectories in pieces: their interpolation is data of the same programs."""
+    """An image and its truth with trajectories in pieces, whose interpolation is data: another
+    method needs no other program."""
     image, truth = (
         eqx.tree_at(lambda i: i.trajectory, image, _pieces(image.trajectory))
         for image in (chosen.image, chosen.truth)
@@ -545,15 +552,15 @@ def _attitude_with(attitude: Attitude, method: str) -> Attitude:
     )
 
 
-def _outline(image: PushbroomImage) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and pixels around the image, closed."""
-    s, zero, one = np.linspace(0, 1, EDGE), np.zeros(EDGE), np.ones(EDGE)
+def _outline(image: PushbroomImage, places: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Lines and pixels around the image, closed, at so many places of each side."""
+    s, zero, one = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
     down = np.concatenate([zero, s, one, s[::-1]])
     across = np.concatenate([s, one, s[::-1], zero])
     return down * (image.lines - 1), across * (image.pixels - 1)
 
 
-def _with_value(control: Control, value) -> Control:
+def _with_value(control: Control, value: Any) -> Control:
     if isinstance(control, Number) and control.low is not None and control.high is not None:
         low, high = min(control.low, value), max(control.high, value)
         return control._replace(value=value, low=low, high=high)
@@ -564,13 +571,13 @@ def _control(controls: list[Control], key: str) -> Control:
     return next(one for one in controls if one.key == key)
 
 
-def _one(sigma) -> float:
+def _largest(sigma: Sigma) -> float:
     """A σ of three axes as one number, the largest."""
     return float(np.max(sigma))
 
 
-def _degrees(sigma) -> float:
-    return shorten_number(np.degrees(_one(sigma)))
+def _degrees(sigma: Sigma) -> float:
+    return shorten_number(np.degrees(_largest(sigma)))
 
 
 _locate = jax.jit(locate_points)
@@ -582,6 +589,6 @@ _positions = jax.jit(
 
 
 @jax.jit
-def _below(earth, P):
+def _below(earth: Ellipsoid, P: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
     longitude, latitude, _ = geodetic(earth, tuple(P))
     return jnp.stack(earth_fixed(earth, (longitude, latitude, 0 * longitude)))

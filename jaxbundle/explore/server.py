@@ -22,7 +22,7 @@ import threading
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, NoReturn
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.view import File, Given, View
@@ -31,8 +31,7 @@ from jaxbundle.report.page import write
 
 HOST = "127.0.0.1"
 MOST_BYTES = 256 * 1024
-"""Maximum bytes of the body of a request."""
-MOST_READ = 16 * MOST_BYTES
+"""Maximum bytes of the body of a request: about 2000 stations of a network, moved."""
 REQUEST_TIMEOUT = 30.0
 """Seconds in which a request must arrive, all of it: a sender that trickles bytes must not hold a
 connection."""
@@ -73,7 +72,7 @@ class Server(ThreadingHTTPServer):
         """Where the page is."""
         return f"http://{HOST}:{self.server_port}/{self.token}/"
 
-    def handle_error(self, request, client_address) -> None:
+    def handle_error(self, *_: Any) -> None:
         """Ignore closed connections of the browser."""
 
 
@@ -100,7 +99,7 @@ class Handler(BaseHTTPRequestHandler):
         except OSError:
             pass  # closed meanwhile
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Callable[[], None]:
         """Every other method is refused like any other request, not by the page of the library."""
         if name.startswith("do_"):
             return lambda: self._respond(_refuse_method, b"")
@@ -114,10 +113,11 @@ class Handler(BaseHTTPRequestHandler):
         """The answer to values, or a file made from them."""
         length = self.headers.get("Content-Length", "")
         known = length.isascii() and length.isdigit() and len(length) < 10
-        # Read before it is answered, or the browser would lose the answer; of an oversized one only
-        # enough to detect that.
-        body = self.rfile.read(min(int(length), MOST_READ)) if known else None
-        if body is not None and len(body) < min(int(length), MOST_READ):
+        # Read before it is answered, or the browser would lose the answer; of an oversized one at
+        # most 16 times what is allowed.
+        expected = min(int(length), 16 * MOST_BYTES) if known else 0
+        body = self.rfile.read(expected) if known else None
+        if body is not None and len(body) < expected:
             return self._respond(_refuse_incomplete, b"")
         self._respond(self._post, body)
 
@@ -135,6 +135,7 @@ class Handler(BaseHTTPRequestHandler):
                     HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
                     f"a body of at most {MOST_BYTES} bytes is expected",
                 )
+            # a view has caches, and JAX uses all cores for one
             with self.server.computing:
                 file = act(action, body)
             status = HTTPStatus.OK
@@ -171,6 +172,7 @@ class Handler(BaseHTTPRequestHandler):
         if any(origin not in [f"http://{host}" for host in hosts] for origin in origins):
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site may not ask")
         _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
+        # in constant time: how long it takes tells nothing about the token
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(
                 HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from the terminal"
@@ -232,7 +234,7 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())[:1000] or type(error).__name__
 
 
-def _no_number(word: str):
+def _no_number(word: str) -> NoReturn:
     raise ValueError(f"{word} is not a JSON number")
 
 

@@ -25,6 +25,7 @@ LABELS = {
 }
 """The parameters of an orbit and of a straight track: label and unit."""
 USUAL = {"height": 500e3, "inclination": 97.4, "node": 0.0, "argument": 0.0}
+"""A circular orbit; at 500 km an inclination of 97.4° makes it synchronous with the sun."""
 
 
 class Tracks(NamedTuple):

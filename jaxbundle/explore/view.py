@@ -37,7 +37,7 @@ class View(Protocol):
         of the view."""
         ...
 
-    def export(self, name: str, given: Given) -> File:
+    def export(self, name: str, given: Given, /) -> File:
         """The file of this name with these values."""
         ...
 

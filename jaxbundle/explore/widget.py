@@ -15,19 +15,17 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.server import Refused, page_file, respond
 from jaxbundle.explore.view import View
 
-LOWEST, HIGHEST = 200, 4000
-"""Pixels of the frame."""
-
 
 def show(view: View, *, height: int = 800) -> Any:
     """A widget that shows a view (`NetworkView`, `CameraView`, `ScannerView`) and answers its
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
-    height = integer("height", height, LOWEST, HIGHEST)
+    # lower than its controls, or higher than any screen, a frame is of no use
+    height = integer("height", height, 200, 4000)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
-    widget.on_msg(lambda one, content, buffers: one.send(*reply(view, content)))
+    widget.on_msg(lambda one, content, _: one.send(*reply(view, content)))
     return widget
 
 
@@ -55,4 +53,5 @@ def _widget_class() -> Any:
         raise ImportError("widgets need anywidget: pip install 'jaxbundle[widgets]'") from error
     script = files("jaxbundle.explore.page").joinpath("widget.js").read_text(encoding="utf-8")
     traits = {"page": traitlets.Unicode().tag(sync=True), "height": traitlets.Int().tag(sync=True)}
+    # made here, not at the top: its base class may not be installed
     return type("Explorer", (anywidget.AnyWidget,), {"_esm": script, **traits})

@@ -35,9 +35,6 @@ from jaxbundle.network.outside import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
-MOST_SHOWN = 8
-"""Conversions reported individually, the worst first."""
-
 
 @print_anywhere
 @dataclasses.dataclass(frozen=True)
@@ -54,15 +51,16 @@ class Converted:
     def __str__(self) -> str:
         lines = [f"{self.path}: {self.kind}"]
         costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
-        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:MOST_SHOWN]]
-        if len(costs) > MOST_SHOWN:
-            lines.append(f"and {len(costs) - MOST_SHOWN} more cameras, with smaller differences")
+        shown = 8  # the worst, on one screen; `conversions` has all
+        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:shown]]
+        if len(costs) > shown:
+            lines.append(f"and {len(costs) - shown} more cameras, with smaller differences")
         lines += [f"not kept: {'; '.join(self.lost)}"] if self.lost else []
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
-def convert(
+def convert(  # noqa: PLR0913, as the options of the command
     input: str | Path,
     output: str | Path,
     *,
@@ -96,12 +94,13 @@ def convert(
     **Raises:** `InputError`; nothing is written then.
     """
     input, output = Path(given_path("input", input)), Path(given_path("output", output))
-    kind = _kind(output, to)
-    _check_output(output, kind)
+    kind = _choose_kind(output, to)
+    _check_path(output, kind)
     model = None if model is None else key_of(model)
     models = check_own_models(models)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
-        _keep_camera_file(input, output)
+        # real paths: one of them may be a link
+        _refuse_overlap({os.path.realpath(input)}, {os.path.realpath(output)}, output)
         _keep_others(output, kind, force)
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
@@ -119,14 +118,18 @@ def convert(
     _keep_input(input, network, output, kind, control)
     _keep_others(output, kind, force)
     if kind in CAMERA_KINDS:
+        costs = None
         if model is not None and measured:
+            # the fit over the measurements needs the network; then there is nothing to convert
             network, costs = convert_cameras(network, model, measured=True)
-            made = _convert_cameras(input, network.cameras, output, kind, None, camera)
-            made = dataclasses.replace(made, conversions=costs)
-        else:
-            made = _convert_cameras(input, network.cameras, output, kind, model, camera)
+            model = None
+        made = _convert_cameras(input, network.cameras, output, kind, model, camera)
         return dataclasses.replace(
-            made, lost=("images and points",), warnings=network.warnings, notes=network.notes
+            made,
+            conversions=made.conversions if costs is None else costs,
+            lost=("images and points",),
+            warnings=network.warnings,
+            notes=network.notes,
         )
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
@@ -151,7 +154,7 @@ def _convert_network(
     return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes)
 
 
-def _kind(output: Path, to: str | None) -> str:
+def _choose_kind(output: Path, to: str | None) -> str:
     kinds = {name: target.looks for name, target in (*TARGETS.items(), *CAMERA_KINDS.items())}
     if to is not None:
         if to not in kinds:
@@ -166,15 +169,19 @@ def _kind(output: Path, to: str | None) -> str:
     return found
 
 
-def _add_sizes(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
+def _add_sizes(
+    cameras: Sequence[Camera],
+    image_size: Sequence[float] | None,
+    pixel_size: Sequence[float] | None,
+) -> tuple[Camera, ...]:
     """The cameras, with sizes added if missing."""
-    given = {"image_size": image_size, "pixel_size": pixel_size}
+    sizes = {"image_size": image_size, "pixel_size": pixel_size}
     made = tuple(
         dataclasses.replace(
             camera,
             **{
                 name: tuple(size)
-                for name, size in given.items()
+                for name, size in sizes.items()
                 if size is not None and getattr(camera, name) is None
             },
         )
@@ -185,7 +192,7 @@ def _add_sizes(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camer
     return made
 
 
-def _check_output(output: Path, kind: str) -> None:
+def _check_path(output: Path, kind: str) -> None:
     """Refuse a path that cannot be written."""
     folder = _folder(output, kind)
     if folder is not None and folder.exists() and not folder.is_dir():
@@ -196,8 +203,10 @@ def _check_output(output: Path, kind: str) -> None:
         raise InputError(f"{output}: there is no folder {output.parent}")
 
 
-def _keep_input(input: Path, network: Network, output: Path, kind: str, control=None) -> None:
-    """Refuse to replace the input."""
+def _keep_input(
+    input: Path, network: Network, output: Path, kind: str, control: str | Path | None = None
+) -> None:
+    """Refuse to replace the input: its files, and the folder that holds one of them."""
     tables = (
         network.images,
         network.points,
@@ -205,21 +214,22 @@ def _keep_input(input: Path, network: Network, output: Path, kind: str, control=
         network.distances,
         *network.further,
     )
+    # real paths: an output may be the input by a link, or by a path with `..`
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
     folders = {os.path.realpath(Path(p).parent) for p in read}
     written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
     if kind == "csv":
         written.add(os.path.realpath(images_path(output)))
     folder = _folder(output, kind)
-    inside = folder is not None and os.path.realpath(folder) in folders
+    if folder is not None and os.path.realpath(folder) in folders:
+        written |= read  # who replaces the folder of an input replaces the input
     if control is not None:
         read.add(os.path.realpath(control))
-    if read & written or inside:
-        raise InputError(f"{output} is the input and would be overwritten; give another place")
+    _refuse_overlap(read, written, output)
 
 
-def _keep_camera_file(input: Path, output: Path) -> None:
-    if os.path.realpath(input) == os.path.realpath(output):
+def _refuse_overlap(read: set[str], written: set[str], output: Path) -> None:
+    if read & written:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 
 
@@ -236,6 +246,7 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
+    # files that a writer adds to the one that is named
     beside = {
         "csv": [images_path(output)],
         "bundler": [output.parent / LIST],
@@ -249,13 +260,16 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         )
 
 
-def _with_model(network: Network, kind: str, model: str | CameraModel | None, measured: bool):
+def _with_model(
+    network: Network, kind: str, model: str | CameraModel | None, measured: bool
+) -> tuple[Network, dict[str, Conversion]]:
     """The network with camera models of the output, and the difference of each camera."""
     models = TARGETS[kind].models
     if model is not None:
         if not has_model(models, model):
             raise InputError(f"--model {model}: {kind} has {' and '.join(models)} only")
         return convert_cameras(network, model, measured=measured)
+    # Without --model only exact conversions: a fit is a decision of the user.
     foreign = [c.id for c in network.cameras if not has_model(models, c.model)]
     if not foreign:
         return network, {}

@@ -23,7 +23,7 @@ from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov, write_jaicov
-from jaxbundle.io.networks.kalibr import OFFERED as KALIBR_MODELS
+from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
 from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr, write_kalibr
 from jaxbundle.io.networks.losses import PIXEL_MODELS
 from jaxbundle.io.networks.metashape import is_metashape, read_metashape
@@ -32,7 +32,7 @@ from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
 from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
 from jaxbundle.io.networks.micmac_camera import write_autocal
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
-from jaxbundle.io.networks.mrcal import OFFERED as MRCAL_MODELS
+from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
 from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
 from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
 from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
@@ -53,6 +53,7 @@ from jaxbundle.io.networks.rig_result import (
     read_rig_line,
     read_rig_result,
 )
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
     fill_ros_stereo,
@@ -70,9 +71,6 @@ from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import is_plain
-
-FIRST_LINES = 100_000
-"""Characters of a file from which its format is recognised."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +127,8 @@ def _is_photo_list(path: Path) -> bool:
     if path.suffix.lower() != ".txt" or not is_plain(path):
         return False
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        first = next((line for line in file.read(FIRST_LINES).split("\n") if line.strip()), "")
+        # Empty lines may stand before the number; the limit bounds the memory for any other file.
+        first = next((line for line in file.read(100_000).split("\n") if line.strip()), "")
     try:
         float(first)
     except ValueError:
@@ -137,6 +136,8 @@ def _is_photo_list(path: Path) -> bool:
     return True
 
 
+# The order is that of recognition: a .toml is a project unless it maps columns, a .txt is a list of
+# photographs if its first line is one number, and so on. Each test reads only the beginning.
 FORMATS: dict[str, Format] = {
     "project": Format(
         _is_project, read_project, "a .toml file, or a folder with project.toml", names_models=True
@@ -209,16 +210,15 @@ def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera],
     return lambda cameras, path: write(cameras[0], path)
 
 
-def _is_bal_name(path: Path) -> bool:
-    return path.suffix.lower() in (".txt", ".bal", *OPENERS)
-
-
+# The order is that of recognition; "project" takes any folder and stands last.
 TARGETS: dict[str, Target] = {
     "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
     "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
     "csv": Target(_ends(".csv"), write_coordinates, "NAME.csv"),
     "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
-    "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
+    "bal": Target(
+        _ends(".txt", ".bal", *OPENERS), write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)
+    ),
     "colmap": Target(
         _folder_of("colmap", "sparse"),
         partial(fill_colmap, text=False),
@@ -227,7 +227,7 @@ TARGETS: dict[str, Target] = {
         COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False,
+        lambda _: False,  # a folder is named as for "colmap": only --to asks for text
         partial(fill_colmap, text=True),
         "by --to only",
         COLMAP_MODELS,
@@ -345,6 +345,7 @@ def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
 def recognise_target(path: Path) -> str | None:
     """The kind of an output, from its name."""
     kinds = (
+        # the narrow names of cameras first, the broad ones after the networks
         *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
         *TARGETS.items(),
         *CAMERA_KINDS.items(),
@@ -387,7 +388,7 @@ def read_network(
     """
     path = Path(given_path("path", path))
     if isinstance(overrides, str) or not (
-        isinstance(overrides, Sequence) and all(isinstance(one, str) for one in overrides)
+        isinstance(overrides, Sequence) and all(isinstance(word, str) for word in overrides)
     ):
         raise InputError(
             f"overrides must be a list of texts, such as ['datum=inner'], but is {show(overrides)}"
@@ -410,12 +411,13 @@ def read_network(
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
-    given = None if control is None else read_control(control)
+    # read before the network, which may take long: its errors come at once
+    control_points = None if control is None else read_control(control)
+    # other formats have names of their own for their models
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     network = FORMATS[format].read(path, overrides, *own)
-    if given is not None:
-        datum = any(one.partition("=")[0].strip() == "datum" for one in overrides)
-        return with_control(network, given, datum=not datum)
+    if control_points is not None:
+        return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
 
 

@@ -1,8 +1,10 @@
 """Calibrations without an adjustment: distortion curves, the difference of two as a map."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras.compare import Comparison
 from jaxbundle.plotting.style import (
@@ -22,10 +24,13 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-COLOURS = (BLUE, RUST, GREEN, INK)
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
-def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=None):
+def radial_curves(
+    tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax: "Axes | None" = None
+) -> "Axes":
     """Radial distortion of cameras over the radius; matplotlib axes.
 
     **Arguments:** `tables` by name, from `jaxbundle.cameras.distortion_table`, all in
@@ -33,10 +38,11 @@ def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=
     """
     ax = axes(ax, (6.5, 4.2))
     factor, small = micrometres(unit)
+    colours, styles = (BLUE, RUST, GREEN, INK), ("-", "--", ":")
     for k, (name, table) in enumerate(tables.items()):
-        style = ("-", "--", ":")[k // len(COLOURS) % 3]
+        style = styles[k // len(colours) % len(styles)]
         r, dr = (np.concatenate([[0.0], table[key]]) for key in ("r", "radial"))
-        ax.plot(r, factor * dr, style, color=COLOURS[k % len(COLOURS)], label=plain(name), lw=1.4)
+        ax.plot(r, factor * dr, style, color=colours[k % len(colours)], label=plain(name), lw=1.4)
     ax.axhline(0, color=GREY, lw=0.8)
     quiet(ax)
     label(ax, "x", "radius in the measured image", unit)
@@ -46,24 +52,20 @@ def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=
     return ax
 
 
-def difference_map(comparison: Comparison, ax=None, name: str = "Difference of two calibrations"):
+def difference_map(
+    comparison: Comparison, ax: "Axes | None" = None, name: str = "Difference of two calibrations"
+) -> "Axes":
     """Lengths of the differences in colour, the differences as arrows; matplotlib axes.
 
     Every other point of the grid has an arrow; the key gives their scale.
     """
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)
-    mesh = ax.pcolormesh(
-        comparison.x, comparison.y, factor * comparison.length, shading="nearest", cmap="viridis"
-    )
-    bar = ax.figure.colorbar(mesh, ax=ax, shrink=0.8)
-    label(bar.ax, "y", "length of the difference", unit)
+    _draw_map(ax, comparison, factor * comparison.length, f"length of the difference [{unit}]")
     every = np.s_[::2, ::2]
     known = np.isfinite(comparison.length[every])
     x, y = (grid[every][known] for grid in np.meshgrid(comparison.x, comparison.y))
     u, v = np.moveaxis(factor * comparison.difference[every][known], -1, 0)
-    if comparison.unit == "px":
-        ax.invert_yaxis()
     key = round_number(factor * comparison.largest) or 1.0
     arrows = ax.quiver(
         x, y, u, v, angles="xy", color="white", scale=12 * key, scale_units="width", width=0.002
@@ -71,15 +73,17 @@ def difference_map(comparison: Comparison, ax=None, name: str = "Difference of t
     ax.quiverkey(
         arrows, 0.9, 1.02, key, f"{key:g} {unit}", labelpos="E", color=INK, coordinates="axes"
     )
-    ax.set_aspect("equal")
-    quiet(ax, grid=False)
-    image_axes(ax, comparison.unit)
     removed = ", rotation removed" if comparison.rotation.any() else ""
     title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{removed}")
     return ax
 
 
-def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expected by their σ"):
+def expected_map(
+    comparison: Comparison,
+    covariance: Float[np.ndarray, "rows columns 2 2"],
+    ax: "Axes | None" = None,
+    name: str = "Expected by their σ",
+) -> "Axes":
     """σ of the length of a difference over the image, √(σx² + σy²); matplotlib axes.
 
     **Arguments:** `covariance` [rows, columns, 2, 2] of the differences, from
@@ -88,24 +92,32 @@ def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expec
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)
     sigma = factor * np.sqrt(np.trace(covariance, axis1=2, axis2=3))
-    mesh = ax.pcolormesh(comparison.x, comparison.y, sigma, shading="nearest", cmap="viridis")
-    bar = ax.figure.colorbar(mesh, ax=ax, shrink=0.8)
-    label(bar.ax, "y", "σ of the difference", unit)
-    if comparison.unit == "px":
-        ax.invert_yaxis()
-    ax.set_aspect("equal")
-    quiet(ax, grid=False)
-    image_axes(ax, comparison.unit)
+    _draw_map(ax, comparison, sigma, f"σ of the difference [{unit}]")
     title(ax, name, f"RMS {np.sqrt(np.nanmean(sigma**2)):.3g} {unit}")
     return ax
 
 
-def difference_maps(comparison: Comparison, covariance, ax):
+def _draw_map(
+    ax: "Axes", comparison: Comparison, values: Float[np.ndarray, "rows columns"], name: str
+) -> None:
+    """Values on the grid of a comparison in colour, oriented like the image."""
+    mesh = ax.pcolormesh(comparison.x, comparison.y, values, shading="nearest", cmap="viridis")
+    label(ax.figure.colorbar(mesh, ax=ax, shrink=0.8).ax, "y", name)
+    if comparison.unit == "px":
+        ax.invert_yaxis()  # rows are counted downwards
+    ax.set_aspect("equal")
+    quiet(ax, grid=False)
+    image_axes(ax, comparison.unit)
+
+
+def difference_maps(
+    comparison: Comparison, covariance: Float[np.ndarray, "rows columns 2 2"] | None, ax: "Axes"
+) -> "Axes":
     """The difference map, and beside it the expected differences if there is a covariance."""
     if covariance is None:
         return difference_map(comparison, ax)
     figure = ax.figure
-    ax.remove()
+    ax.remove()  # its place goes to the two
     left, right = figure.subplots(1, 2)
     difference_map(comparison, left)
     return expected_map(comparison, covariance, right)

@@ -1,6 +1,10 @@
 """A camera: its distortion over the radius, the correlations of its parameters."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.plotting.distortion import (
     distortion_profile,
@@ -21,15 +25,13 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-SMALLEST_RANGE = 0.1
-"""Minimum range ± of the distortion axis, in µm or px, so that rounding does not look like
-distortion."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-ANNOTATED = 20
-"""Correlations are written into the cells of a matrix up to this size."""
+    from jaxbundle.bundle.result import Adjustment
 
 
-def distortion_curve(adjustment, camera: str, ax=None):
+def distortion_curve(adjustment: "Adjustment", camera: str, ax: "Axes | None" = None) -> "Axes":
     """Radial distortion and decentring of a camera over the radius, each with its ±σ.
 
     measured − ideal, so that pincushion distortion is positive for every model; from the
@@ -48,7 +50,7 @@ def distortion_curve(adjustment, camera: str, ax=None):
         (found.decentring, found.decentring_sigma, RUST, "decentring"),
     ):
         if not (np.abs(value) > 0).any() and not (sigma > 0).any() and colour == RUST:
-            continue
+            continue  # a model without decentring
         low, high = scale * (value - sigma), scale * (value + sigma)
         if (sigma > 0).any():
             name += f", σ up to {scale * np.nanmax(sigma):.2g} {unit}"
@@ -60,7 +62,8 @@ def distortion_curve(adjustment, camera: str, ax=None):
     quiet(ax)
     ax.set_xlim(0, found.radius[-1] or 1.0)
     bottom, top = ax.get_ylim()
-    ax.set_ylim(min(bottom, -SMALLEST_RANGE), max(top, SMALLEST_RANGE))
+    # rounding, far below 0.1 µm or px, must not look like distortion
+    ax.set_ylim(min(bottom, -0.1), max(top, 0.1))
     label(ax, "x", "distance from the principal point", found.unit)
     label(ax, "y", "distortion, measured − ideal", unit)
     model = adjustment.cameras[camera]["model"]
@@ -71,7 +74,7 @@ def distortion_curve(adjustment, camera: str, ax=None):
     return ax
 
 
-def curve_reach(adjustment, camera: str) -> tuple[float, float]:
+def curve_reach(adjustment: "Adjustment", camera: str) -> tuple[float, float]:
     """Radii of the farthest measurement of a camera and, where the size of the image is known, of
     its farthest corner, if that is farther; in the unit of the model."""
     low, high, known = image_frame(adjustment, camera)
@@ -82,7 +85,16 @@ def curve_reach(adjustment, camera: str) -> tuple[float, float]:
     return measured, max(measured, float(np.hypot(*np.maximum(high - centre, centre - low))))
 
 
-def correlation_matrix(adjustment, camera: str | None = None, ax=None):
+def correlation_size(parameters: int) -> tuple[float, float]:
+    """Width and height of a correlation matrix, inches; the colour bar makes it wider."""
+    # 0.42 inches hold a number of three digits; beyond 12 inches the cells shrink
+    side = float(np.clip(2.2 + 0.42 * parameters, 4, 12))
+    return side + 0.8, side
+
+
+def correlation_matrix(
+    adjustment: "Adjustment", camera: str | None = None, ax: "Axes | None" = None
+) -> "Axes":
     """Correlations of the free parameters of a camera, or of all cameras together, in %.
 
     **Returns:** matplotlib `Axes`.
@@ -94,14 +106,13 @@ def correlation_matrix(adjustment, camera: str | None = None, ax=None):
     if not n:
         which = "no camera" if camera is None else f"camera {camera!r}: nothing"
         raise ValueError(f"{which} is free: there are no correlations to show")
-    side = float(np.clip(2.2 + 0.42 * n, 4, 12))
-    ax = axes(ax, (side + 0.8, side))
+    ax = axes(ax, correlation_size(n))
     shown = ax.imshow(100 * C, cmap="RdBu_r", vmin=-100, vmax=100)
     ax.set_xticks(range(n), names, rotation=90 if n > 8 or camera is None else 0, parse_math=False)
     ax.set_yticks(range(n), names, parse_math=False)
     quiet(ax, grid=False)
     ax.tick_params(length=0)
-    if n <= ANNOTATED:
+    if n <= 20:  # in the cells of more, three digits and a sign have no room
         for i in range(n):
             for j in range(n):
                 colour = "white" if abs(C[i, j]) > 0.6 else INK
@@ -118,7 +129,9 @@ def correlation_matrix(adjustment, camera: str | None = None, ax=None):
     return ax
 
 
-def _correlations(adjustment, camera):
+def _correlations(
+    adjustment: "Adjustment", camera: str | None
+) -> tuple[Sequence[str], Float[np.ndarray, "n n"]]:
     """Names and correlation matrix of the free parameters of one camera or of all."""
     tables = adjustment.cameras
     if camera is None and len(tables) == 1:

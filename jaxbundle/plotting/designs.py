@@ -1,18 +1,22 @@
 """A designed network: its stations before and after, the path of the search, trial positions."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import image_area
 from jaxbundle.cameras.convert_fit import rays_of
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network.tables import Network
 from jaxbundle.network_design.result import Design
+from jaxbundle.plotting.frame import pyramid_lines
 from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    PALE,
     RUST,
     axes,
     axes_3d,
@@ -20,20 +24,25 @@ from jaxbundle.plotting.style import (
     label,
     legend,
     quiet,
+    quiet_3d,
     title,
 )
 from jaxbundle.plotting.ticks import label_coordinates
 
-EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
-SIZE = 0.12
-"""Size of a camera relative to the network."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
 
 
-def network_view(designed: Design, ax=None, after: bool = True):
+def network_view(
+    designed: Design, ax: "Axes3D | None" = None, after: bool = True, camera_size: float = 0.12
+) -> "Axes3D":
     """The stations in perspective, before or after the design, with their paths.
 
+    **Arguments:** `camera_size`: length of the edges of a camera relative to the network.
+
     **Returns:** matplotlib 3D `Axes`, in the object unit."""
-    ax = axes_3d(ax, (7.5, 6.5))
+    view = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     both = designed.before.network, designed.after.network
@@ -45,36 +54,32 @@ def network_view(designed: Design, ax=None, after: bool = True):
     new = np.isin(np.array(network.images.id, dtype=object), designed.added)
     for chosen, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
         if chosen.any():
-            lines = camera_lines(network, SIZE * size)[chosen].reshape(-1, 2, 3)
-            ax.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
-            ax.scatter(
+            lines = camera_lines(network, camera_size * size)[chosen].reshape(-1, 2, 3)
+            view.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
+            view.scatter(
                 *network.images.position[chosen].T, s=9, color=colour, label=name, depthshade=False
             )
-    ways = [s.position for s in designed.path if len(s.position)]
-    if after and designed.order == "first" and ways:
-        for way in np.stack(ways, 1):
-            ax.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
-    ax.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
+    steps = [step.position for step in designed.path if len(step.position)]
+    if after and designed.order == "first" and steps:
+        for way in np.stack(steps, 1):
+            view.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
+    view.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
     for box in boxes:
-        ax.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
+        view.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
     low, high = everything.min(0), everything.max(0)
-    half = 0.55 * max((high - low).max(), size * SIZE)
+    half = 0.55 * max((high - low).max(), size * camera_size)
     for name, middle in zip("xyz", (low + high) / 2):
-        getattr(ax, f"set_{name}lim")(middle - half, middle + half)
-        label(ax, name, name.upper(), network.object_unit)
-        axis = getattr(ax, f"{name}axis")
-        axis.set_pane_color((1, 1, 1, 0))
-        axis._axinfo["grid"].update(color=PALE, linewidth=0.6)
-        ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
-    ax.set_box_aspect((1, 1, 1), zoom=0.95)
-    ax.view_init(elev=24, azim=-58)
+        getattr(view, f"set_{name}lim")(middle - half, middle + half)
+        label(view, name, name.upper(), network.object_unit)
+    quiet_3d(view)
+    view.set_box_aspect((1, 1, 1), zoom=0.95)
     state = designed.after if after else designed.before
-    title(ax, "after" if after else "before", f"{designed.aim}: {state.aim:.3g}")
-    legend(ax, frameon=False, loc="upper right")
-    return ax
+    title(view, "after" if after else "before", f"{designed.aim}: {state.aim:.3g}")
+    legend(view, frameon=False, loc="upper right")
+    return view
 
 
-def camera_lines(network, size: float) -> np.ndarray:
+def camera_lines(network: Network, size: float) -> np.ndarray:
     """The edges of a pyramid for every image, [images, 8, 2, 3]; slanted ones are `size` long."""
     corners = []
     for camera in network.cameras:
@@ -87,10 +92,10 @@ def camera_lines(network, size: float) -> np.ndarray:
     M = np.array([matrix_from_omega_phi_kappa(a) for a in images.angles])
     ends = images.position[:, None] + size * np.array(corners)[images.camera] @ M
     places = np.concatenate([images.position[:, None], ends], 1)
-    return places[:, np.array(EDGES)]
+    return pyramid_lines(places)
 
 
-def aim_path(designed: Design, ax=None):
+def aim_path(designed: Design, ax: "Axes | None" = None) -> "Axes":
     """The aim by iteration; conditions become sharper in every round.
 
     **Returns:** matplotlib `Axes`."""
@@ -114,7 +119,7 @@ def aim_path(designed: Design, ax=None):
     return ax
 
 
-def places_tried(designed: Design, ax=None):
+def places_tried(designed: Design, ax: "Axes | None" = None) -> "Axes":
     """Trial positions of a further photograph, from above, coloured by the aim; and the chosen
     positions.
 
@@ -125,6 +130,7 @@ def places_tried(designed: Design, ax=None):
     from matplotlib.colors import LogNorm
 
     position, aims = designed.tried
+    # a place from which the network is nearly singular would take the whole range of colours
     network, good = designed.network, aims < 1e3 * np.min(aims)
     marks = ax.scatter(*position[good, :2].T, c=aims[good], norm=LogNorm(), s=26, cmap="viridis_r")
     ax.figure.colorbar(marks, ax=ax, label=f"{designed.aim} with a photograph there")
@@ -141,10 +147,11 @@ def places_tried(designed: Design, ax=None):
     return ax
 
 
-def _box_edges(box):
+def _box_edges(box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "12 2 3"]:
     """The twelve edges of a box, [12, 2, 3]."""
     corners = np.array(
         [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     )
+    # the bits of a corner's number are its sides: along an edge one of them differs
     pairs = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
     return corners[np.array(pairs)]

@@ -12,21 +12,21 @@ The σ of both follow from the covariance of the free parameters and the derivat
 
 import dataclasses
 from functools import partial
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.model import CameraModel
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 from jaxbundle.system.programs import compile_once
 
-AZIMUTHS = 12
-
-ROUNDING = 1e-13
-"""Distortion below this fraction of an image coordinate is rounding noise."""
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 
 @print_in_one_screen
@@ -43,7 +43,7 @@ class DistortionProfile:
 
 
 def distortion_profile(
-    adjustment, camera: str, radii: int = 81, reach: float | None = None
+    adjustment: "Adjustment", camera: str, radii: int = 81, reach: float | None = None
 ) -> DistortionProfile:
     """The distortion of a camera from its principal point to its farthest measurement.
 
@@ -65,50 +65,55 @@ def distortion_profile(
     return DistortionProfile(model.unit, radius, radial, sigma[0], decentring, sigma[1])
 
 
-def farthest_measurement(adjustment, camera: str) -> float:
+def farthest_measurement(adjustment: "Adjustment", camera: str) -> float:
     """The largest distance of a measurement of a camera from its principal point."""
     found = farthest_measurements(adjustment.problem, adjustment.values)
     return float(found[camera_index(adjustment, camera)])
 
 
-def principal_point(adjustment, camera: str) -> Float[np.ndarray, "2"]:
+def principal_point(adjustment: "Adjustment", camera: str) -> Float[np.ndarray, "2"]:
     """The measured image of a camera's axis, the centre of its distortion."""
     p = jnp.array(list(adjustment.camera_parameters(camera).values()))
     return np.asarray(measured_centre(_model(adjustment, camera), p))
 
 
-def camera_index(adjustment, camera: str) -> int:
+def camera_index(adjustment: "Adjustment", camera: str) -> int:
     """The row of a camera in the arrays."""
     return [given.id for given in adjustment.problem.network.cameras].index(camera)
 
 
-def _model(adjustment, camera):
+def _model(adjustment: "Adjustment", camera: str) -> CameraModel:
     return get_model(adjustment.problem.network.cameras[camera_index(adjustment, camera)].model)
 
 
 @partial(compile_once, static=0)
-def _ideal(model, p, xy):
+def _ideal(
+    model: CameraModel, p: Float[Array, " parameters"], xy: Float[Array, "radii azimuths 2"]
+) -> Float[Array, "radii azimuths 2"]:
     """Ideal coordinates of measured ones [radii, azimuths, 2]."""
     return jnp.stack(jnp.vectorize(partial(model.to_ideal, tuple(p)))(xy[..., 0], xy[..., 1]), -1)
 
 
-def distortion_at(model, parameters, radius):
+def distortion_at(
+    model: CameraModel, parameters: ArrayLike, radius: ArrayLike, azimuths: int = 12
+) -> tuple[np.ndarray, np.ndarray]:
     """Symmetric radial distortion and decentring of a camera model.
 
     **Arguments:** `parameters` in the model's order; `radius` [radii] from the principal point in
-    the measured image.
+    the measured image; `azimuths`: number of directions over which harmonics are taken.
 
     **Returns:** both [2, radii], in the model's unit, rounding noise set to 0, and their
     derivatives by all parameters [2, radii, parameters].
     """
     p, radius = jnp.asarray(parameters, float), jnp.asarray(radius, float)
-    azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    azimuth = 2 * np.pi * np.arange(azimuths) / azimuths
     out = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
     centre = measured_centre(model, p)
     ideal = _ideal(model, p, centre + radius[:, None, None] * out)
     found = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
     values, slopes = (np.array(x) for x in found)
-    noise = np.abs(values) < ROUNDING * (np.abs(centre).max() + radius)
+    # image coordinates are exact to about 450 times the rounding of one operation
+    noise = np.abs(values) < 1e-13 * (np.abs(centre).max() + radius)
     # the amplitude has no derivative where it is zero
     slopes[1][noise[1]] = 0
     values[noise] = 0
@@ -116,7 +121,14 @@ def distortion_at(model, parameters, radius):
 
 
 @partial(compile_once, static=0)
-def _harmonics(model, p, centre, ideal, radius, out):
+def _harmonics(
+    model: CameraModel,
+    p: Float[Array, " parameters"],
+    centre: Float[Array, "2"],
+    ideal: Float[Array, "radii azimuths 2"],
+    radius: Float[Array, " radii"],
+    out: Float[Array, "azimuths 2"],
+) -> tuple[Array, Array]:
     """Values and derivatives, only by the formula of the model.
 
     Quantities that the formula gives only as an inverse (the centre, or the ideal points) are known
@@ -124,31 +136,31 @@ def _harmonics(model, p, centre, ideal, radius, out):
     """
     formula = getattr(model, model.own_formula)
 
-    def own(p, xy):
+    def evaluate(p: Array, xy: Array) -> Array:
         return jnp.stack(formula(tuple(p), xy[0], xy[1]))
 
-    def moved(q, root, target):
+    def move_root(q: Array, root: Array, target: Array) -> Array:
         """The point near `root` with the image `target`, for parameters q near p."""
-        return root - jnp.linalg.solve(jax.jacfwd(own, 1)(p, root), own(q, root) - target)
+        return root - jnp.linalg.solve(jax.jacfwd(evaluate, 1)(p, root), evaluate(q, root) - target)
 
-    def displacements(q, radius, ideal):
+    def displacements(q: Array, radius: Array, ideal: Array) -> Array:
         if model.own_formula == "to_ideal":
-            middle = moved(q, centre, jnp.zeros(2))
-            return radius * out - jax.vmap(own, (None, 0))(q, middle + radius * out)
-        middle = own(q, jnp.zeros(2))
-        return radius * out - jax.vmap(moved, (None, 0, 0))(q, ideal, middle + radius * out)
+            middle = move_root(q, centre, jnp.zeros(2))
+            return radius * out - jax.vmap(evaluate, (None, 0))(q, middle + radius * out)
+        middle = evaluate(q, jnp.zeros(2))
+        return radius * out - jax.vmap(move_root, (None, 0, 0))(q, ideal, middle + radius * out)
 
-    def at(q, radius, ideal):
+    def amplitudes(q: Array, radius: Array, ideal: Array) -> Array:
         dx, dy = displacements(q, radius, ideal).T
         cosine, sine = out.T
         radial = (dx * cosine + dy * sine).mean()
         tangential = dy * cosine - dx * sine
         a, b = 2 * (tangential * cosine).mean(), 2 * (tangential * sine).mean()
         square = a * a + b * b
-        there = square > 0
+        there = square > 0  # where it is not, the root would have the derivative NaN
         amplitude = jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
         return jnp.stack([radial, amplitude])
 
-    values = jax.vmap(at, (None, 0, 0), 1)(p, radius, ideal)
-    slopes = jax.vmap(jax.jacfwd(at), (None, 0, 0), 1)(p, radius, ideal)
+    values = jax.vmap(amplitudes, (None, 0, 0), 1)(p, radius, ideal)
+    slopes = jax.vmap(jax.jacfwd(amplitudes), (None, 0, 0), 1)(p, radius, ideal)
     return values, slopes

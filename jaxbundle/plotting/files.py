@@ -3,27 +3,26 @@
 import io
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.writing.folders import replace_folder
-from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
+from jaxbundle.plotting.cameras import correlation_matrix, correlation_size, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.matches import Pairs, match_graph, overlap_matrix, tracks_in_photograph
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.plotting.views import network_perspective, network_plan
 from jaxbundle.types import Progress
 
-MOST_IMAGES = 12
-MOST_CAMERAS = 6
-DOTS_PER_INCH = 150
-MARGIN = 0.15
-"""Inches around a figure."""
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+
 DRAWING = "drawing"
 """The stage of figures in reports of progress."""
 PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
@@ -42,7 +41,10 @@ PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
 
 
 def save_figures(
-    adjustment, folder: str | Path, force: bool = False, progress: Progress | None = None
+    adjustment: "Adjustment",
+    folder: str | Path,
+    force: bool = False,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Write the figures of a result into a folder, all or none.
 
@@ -64,10 +66,16 @@ def save_figures(
     return [Path(folder) / path.name for path in written]
 
 
-def draw_figures(adjustment, folder: Path, progress: Progress | None = None) -> list[Path]:
+def draw_figures(
+    adjustment: "Adjustment",
+    folder: Path,
+    progress: Progress | None = None,
+    max_images: int = 12,
+    max_cameras: int = 6,
+) -> list[Path]:
     """Write the figures of a result into an existing folder; as `save_figures`."""
     table = adjustment.images
-    worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:MOST_IMAGES]
+    worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:max_images]
     drawings = {
         "plan": ((7.5, 6.5), None, network_plan, ()),
         "perspective": ((7.5, 6.5), "3d", network_perspective, ()),
@@ -76,13 +84,12 @@ def draw_figures(adjustment, folder: Path, progress: Progress | None = None) -> 
     names = FigureNames(drawings)
     for image in table["id"][np.sort(worst)]:
         drawings[names("residuals", image)] = ((7, 6), None, residual_vectors, (image,))
-    for camera, entry in list(adjustment.cameras.items())[:MOST_CAMERAS]:
+    for camera, entry in list(adjustment.cameras.items())[:max_cameras]:
         drawings[names("distortion", camera)] = ((6.5, 4.2), None, distortion_curve, (camera,))
         n = len(entry["free"])
         if n > 1:
-            side = float(np.clip(2.2 + 0.42 * n, 4, 12))
             drawings[names("correlations", camera)] = (
-                (side + 0.8, side),
+                correlation_size(n),
                 None,
                 correlation_matrix,
                 (camera,),
@@ -117,14 +124,18 @@ def draw_pairs(
 
 
 def draw_tracks(
-    adjustment, read: Callable[[str], np.ndarray], folder: Path, progress: Progress | None = None
+    adjustment: "Adjustment",
+    read: Callable[[str], np.ndarray],
+    folder: Path,
+    progress: Progress | None = None,
+    max_images: int = 12,
 ) -> list[Path]:
-    """Write the tracks of at most 12 photographs, evenly chosen.
+    """Write the tracks of at most `max_images` photographs, evenly chosen.
 
     **Arguments:** `read(image)`: its grey values, of any size.
     """
     images = adjustment.network.images.id
-    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_IMAGES)).astype(int))
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), max_images)).astype(int))
     names = FigureNames(())
     return write_figures(
         folder,
@@ -167,15 +178,21 @@ def write_figures(
     return written
 
 
-def png(size, projection, draw) -> bytes:
-    """One drawing as a PNG image."""
+def png(
+    size: tuple[float, float],
+    projection: str | None,
+    draw: Callable[..., object],
+    dots_per_inch: int = 150,
+    margin: float = 0.15,
+) -> bytes:
+    """One drawing as a PNG image; size and the margin around it in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     # margins by the layout, and no savefig: both it and cropping draw once more
-    layout = ConstrainedLayoutEngine(w_pad=MARGIN, h_pad=MARGIN)
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout=layout)
+    layout = ConstrainedLayoutEngine(w_pad=margin, h_pad=margin)
+    figure = Figure(figsize=size, dpi=dots_per_inch, layout=layout)
     canvas = FigureCanvasAgg(figure)
     draw(ax=figure.add_subplot(projection=projection))
     data = io.BytesIO()
@@ -189,11 +206,12 @@ def png(size, projection, draw) -> bytes:
 class FigureNames:
     """File names from ids: letters, digits, dot, dash and underscore; each once, in any case."""
 
-    def __init__(self, taken):
+    def __init__(self, taken: Iterable[str]):
         self.taken = {name.casefold() for name in taken}
 
     def __call__(self, kind: str, id: str) -> str:
         id = PHOTOGRAPH.sub("", str(id)) or id
+        # 60: file systems allow 255 bytes, of which a kind and a number take some
         safe = re.sub(r"[^\w.-]+", "_", str(id), flags=re.ASCII).strip("._")[:60] or "unnamed"
         name, number = f"{kind}_{safe}", 1
         while name.casefold() in self.taken:

@@ -1,12 +1,20 @@
 """The frame of an image: its corners and its measurements."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import camera_index
 
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
-def image_frame(adjustment, camera: str):
+
+def image_frame(
+    adjustment: "Adjustment", camera: str
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], bool]:
     """The corners of a camera's image, and whether they are known.
 
     **Returns:** lowest and highest (x, y), in the unit of the camera's model, and True if they
@@ -18,6 +26,7 @@ def image_frame(adjustment, camera: str):
     size, pitch = given.image_size, given.pixel_size
     if size is not None and model.unit == "px":
         half = np.array(size) / 2
+        # the first pixel has its centre, not its corner, at 0
         centre = half - 0.5 if model.axes == "down" else np.zeros(2)
         return centre - half, centre + half, True
     if size is not None and pitch is not None:
@@ -30,7 +39,7 @@ def image_frame(adjustment, camera: str):
     return xy.min(0), xy.max(0), False
 
 
-def measured(adjustment, image: str):
+def measured(adjustment: "Adjustment", image: str) -> tuple[np.ndarray, ...]:
     """The measurements in an image: points, coordinates [n, 2], residuals [n, 2], τ [n, 2].
 
     Coordinates and v = computed − observed in the unit of the camera's model; τ and v of a
@@ -51,9 +60,15 @@ def measured(adjustment, image: str):
     )
 
 
-def image_index(adjustment, image: str) -> int:
+def image_index(adjustment: "Adjustment", image: str) -> int:
     """The row of an image in the arrays."""
     ids = adjustment.problem.network.images.id
     if str(image) not in ids:
         raise KeyError(f"there is no image {image!r}; images: {', '.join(ids[:20])}")
     return ids.index(str(image))
+
+
+def pyramid_lines(pyramids: Float[np.ndarray, "images 5 3"]) -> Float[np.ndarray, "images 8 2 3"]:
+    """The edges of pyramids, each of an apex and four corners in order: slanted ones first."""
+    slanted, around = [(0, k) for k in (1, 2, 3, 4)], [(1, 2), (2, 3), (3, 4), (4, 1)]
+    return pyramids[:, np.array([*slanted, *around])]

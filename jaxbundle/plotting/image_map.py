@@ -1,9 +1,14 @@
 """Values over an image of a line scanner, as colours."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.plotting.style import axes, label, quiet, title
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def image_map(
@@ -13,8 +18,8 @@ def image_map(
     name: str,
     unit: str = "m",
     detail: str = "",
-    ax=None,
-):
+    ax: "Axes | None" = None,
+) -> "Axes":
     """Values at lines × pixels in colour, line 0 at the top; matplotlib axes."""
     ax = axes(ax, (7.5, 6))
     mesh = ax.pcolormesh(pixels, lines, values, shading="nearest", cmap="viridis")

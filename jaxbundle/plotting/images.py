@@ -1,6 +1,10 @@
 """Residuals: as vectors in an image, and all of them as a histogram."""
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import principal_point
@@ -9,7 +13,7 @@ from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
+    MAX_LABELS,
     RUST,
     axes,
     label,
@@ -21,22 +25,24 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-LARGE_TAU = 3.0
-"""Residuals with |τ| above this are drawn in another colour."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxbundle.bundle.result import Adjustment
 
 
-def residual_vectors(adjustment, image: str, ax=None):
+def residual_vectors(
+    adjustment: "Adjustment", image: str, ax: "Axes | None" = None, large_tau: float = 3.0
+) -> "Axes":
     """The residuals v = computed − observed of an image as vectors, with a scale bar.
 
     Vectors begin at the measured coordinates, in the unit of the camera's model; y is drawn as
-    in the visible image. Those with |τ| > 3 are coloured. The image frame is drawn if its size is
-    known.
+    in the visible image. Those with |τ| > `large_tau` are coloured. The image frame is drawn if its
+    size is known.
 
     **Returns:** matplotlib `Axes`.
     """
     ax = axes(ax, (7, 6))
-    from matplotlib.patches import Rectangle
-
     points, xy, v, tau = measured(adjustment, image)
     network = adjustment.problem.network
     given = network.cameras[network.images.camera[image_index(adjustment, image)]]
@@ -47,52 +53,14 @@ def residual_vectors(adjustment, image: str, ax=None):
     diagonal = float(np.hypot(*(high - low)))
     longest = np.fmax.reduce(np.hypot(*v.T), initial=0.0)  # Removed points have no arrow.
     factor = round_number(0.1 * diagonal / longest) if longest > 0 else 1.0
-    large = (np.abs(tau) > LARGE_TAU).any(1)
-    arrows = ax.quiver(
-        *xy.T,
-        *v.T,
-        angles="xy",
-        scale_units="xy",
-        scale=1 / factor,
-        width=0.0028,
-        headwidth=3.5,
-        headlength=4.5,
-        headaxislength=4,
-        minlength=0,
-        color=np.where(large, RUST, BLUE),
-        zorder=3,
-    )
-    ax.scatter(*xy.T, s=5, color=INK, linewidths=0, zorder=4)
-    if known:
-        corner, sides = (low[0], low[1]), high - low
-        frame = Rectangle(corner, *sides, fill=False, edgecolor=GREY, linewidth=1.2, zorder=2)
-        ax.add_patch(frame)
+    large = (np.abs(tau) > large_tau).any(1)
     scale, unit = micrometres(model.unit)
     bar = round_number(scale * 0.1 * diagonal / factor) / scale
-    ax.quiverkey(
-        arrows,
-        0.9,
-        1.035,
-        bar,
-        f"{scale * bar:g} {unit}",
-        coordinates="axes",
-        labelpos="N",
-        color=INK,
-        labelcolor=INK,
-        labelsep=0.05,
-        fontproperties={"size": 8},
-    )
-    if len(points) <= LABELLED // 2:
-        for point, place in zip(points, xy):
-            ax.annotate(
-                plain(point),
-                place,
-                xytext=(4, 4),
-                textcoords="offset points",
-                fontsize=7,
-                color=GREY,
-                parse_math=False,
-            )
+    _draw_arrows(ax, xy, v, np.where(large, RUST, BLUE), factor, (bar, f"{scale * bar:g} {unit}"))
+    if known:
+        _draw_frame(ax, low, high)
+    if len(points) <= MAX_LABELS // 2:
+        _write_names(ax, points, xy)
     centre = principal_point(adjustment, given.id)
     if (low <= centre).all() and (centre <= high).all():
         ax.plot(*centre, "+", color=GREY, markersize=9, zorder=2)
@@ -109,12 +77,75 @@ def residual_vectors(adjustment, image: str, ax=None):
     rms = float(np.sqrt((v**2).mean())) if len(v) else 0.0
     detail = f"{len(points)} points, RMS {scale * rms:.3g} {unit}, vectors × {factor:g}"
     if large.any():
-        detail += f", |τ| > {LARGE_TAU:g} coloured"
+        detail += f", |τ| > {large_tau:g} coloured"
     title(ax, f"Image {image}: residuals ({network.residuals})", detail)
     return ax
 
 
-def residual_histogram(adjustment, ax=None):
+def _draw_arrows(
+    ax: "Axes",
+    xy: Float[np.ndarray, "n 2"],
+    v: Float[np.ndarray, "n 2"],
+    colours: np.ndarray,
+    factor: float,
+    bar: tuple[float, str],
+) -> None:
+    """Residuals enlarged by `factor`, each with a dot at its begin; above them a bar of the
+    residual `bar`, with its name."""
+    arrows = ax.quiver(
+        *xy.T,
+        *v.T,
+        angles="xy",
+        scale_units="xy",
+        scale=1 / factor,
+        width=0.0028,
+        headwidth=3.5,
+        headlength=4.5,
+        headaxislength=4,
+        minlength=0,
+        color=colours,
+        zorder=3,
+    )
+    ax.scatter(*xy.T, s=5, color=INK, linewidths=0, zorder=4)
+    ax.quiverkey(
+        arrows,
+        0.9,
+        1.035,
+        *bar,
+        coordinates="axes",
+        labelpos="N",
+        color=INK,
+        labelcolor=INK,
+        labelsep=0.05,
+        fontproperties={"size": 8},
+    )
+
+
+def _draw_frame(ax: "Axes", low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> None:
+    """The frame of the image, between its corners."""
+    from matplotlib.patches import Rectangle
+
+    sides = high - low
+    ax.add_patch(
+        Rectangle((low[0], low[1]), *sides, fill=False, edgecolor=GREY, linewidth=1.2, zorder=2)
+    )
+
+
+def _write_names(ax: "Axes", points: Iterable[object], xy: Float[np.ndarray, "n 2"]) -> None:
+    """The names of points beside their dots."""
+    for point, place in zip(points, xy):
+        ax.annotate(
+            plain(point),
+            place,
+            xytext=(4, 4),
+            textcoords="offset points",
+            fontsize=7,
+            color=GREY,
+            parse_math=False,
+        )
+
+
+def residual_histogram(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     """The normalised residuals τ = w/σ0 of all observations, with the normal curve.
 
     **Returns:** matplotlib `Axes`: number of observations over τ; those beyond ±6 are counted in
@@ -123,6 +154,7 @@ def residual_histogram(adjustment, ax=None):
     ax = axes(ax, (6.5, 4.2))
     tau = adjustment.residuals["tau"]
     tau = tau[np.isfinite(tau)]
+    # bars of a few observations are ragged: fewer, wider ones
     step = 0.5 if len(tau) < 400 else 0.25
     reach = float(np.clip(np.ceil(np.abs(tau).max(initial=0.0)), 4, 6))
     edges = np.arange(-reach, reach + step / 2, step)

@@ -1,6 +1,7 @@
 """Common points of photographs: the match graph, the overlap, tracks in a photograph."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
@@ -10,7 +11,7 @@ from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
+    MAX_LABELS,
     RUST,
     axes,
     image_axes,
@@ -20,16 +21,21 @@ from jaxbundle.plotting.style import (
     title,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxbundle.bundle.result import Adjustment
+
 KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
 """Colour and line of a pair that a relative orientation, a plane, a rotation explains."""
-WIDEST_LINE = 4.0
-"""Width of the line of the pair with the most matches, points."""
 
 Pairs = Sequence[tuple[str, str, int, int, str]]
 """Two photographs, matches found, matches verified, kind."""
 
 
-def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax=None):
+def match_graph(
+    names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax: "Axes | None" = None
+) -> "Axes":
     """Photographs on a circle, in their order, and a line for every verified pair, wider for
     more matches; those in no part (`alone`) are coloured.
 
@@ -48,7 +54,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
             line,
             color=colour,
             alpha=0.25 + 0.6 * share,
-            linewidth=WIDEST_LINE * max(share, 0.1),
+            linewidth=4.0 * max(share, 0.1),  # below 0.4 points a line vanishes
             label="" if kind in drawn else kind,
             zorder=2,
         )
@@ -56,7 +62,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
     at = np.array(list(place.values()))
     lonely = np.isin(names, list(alone))
     ax.scatter(*at.T, s=36, color=np.where(lonely, RUST, INK), zorder=3)
-    if len(names) <= LABELLED:
+    if len(names) <= MAX_LABELS:
         for name, angle in zip(names, turn):
             c, s = 1.06 * np.cos(angle), 1.06 * np.sin(angle)
             ax.text(
@@ -83,7 +89,7 @@ def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), a
     return ax
 
 
-def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
+def overlap_matrix(names: Sequence[str], pairs: Pairs, ax: "Axes | None" = None) -> "Axes":
     """The number of verified matches of every two photographs, as a matrix.
 
     **Returns:** matplotlib `Axes`.
@@ -96,10 +102,10 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
         number[i, j] = number[j, i] = verified
     shown = ax.imshow(number, cmap="Blues", vmin=0)
     ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="verified matches")
-    if len(names) <= LABELLED:
+    if len(names) <= MAX_LABELS:
         ax.set_xticks(range(len(names)), map(plain, names), rotation=90, parse_math=False)
         ax.set_yticks(range(len(names)), map(plain, names), parse_math=False)
-    if len(names) <= LABELLED // 3:
+    if len(names) <= MAX_LABELS // 3:
         for i, j in np.argwhere(np.isfinite(number)):
             dark = number[i, j] > 0.6 * np.nanmax(number)
             ax.text(
@@ -116,7 +122,12 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
     return ax
 
 
-def tracks_in_photograph(adjustment, image: str, picture: UInt8[np.ndarray, "r c"], ax=None):
+def tracks_in_photograph(
+    adjustment: "Adjustment",
+    image: str,
+    picture: UInt8[np.ndarray, "r c"],
+    ax: "Axes | None" = None,
+) -> "Axes":
     """The measurements of a photograph in its picture, coloured by the number of photographs of the
     point; removed ones as crosses.
 

@@ -1,6 +1,10 @@
 """Quality of a calibration: distribution of measured points, uncertainty of a projected point."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.plotting.style import (
     BLUE,
@@ -14,13 +18,14 @@ from jaxbundle.plotting.style import (
     title,
 )
 
-MARGIN = 0.08
-"""Labels of contours keep away from the frame by this part of the image."""
-SMALLEST_SIGMA = 0.02
-"""Default lower end of scales of σ, in pixels; a tenth of it is the minimum."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.contour import QuadContourSet
+
+    from jaxbundle.calibration.quality import Coverage, UncertaintyMap
 
 
-def _frame(ax, image_size):
+def _frame(ax: "Axes", image_size: tuple[int, int]) -> None:
     """An image's frame and axes, v down."""
     w, h = image_size
     ax.set_xlim(-0.5, w - 0.5)
@@ -31,7 +36,13 @@ def _frame(ax, image_size):
     label(ax, "y", "v", "px")
 
 
-def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
+def coverage_map(
+    coverage: "Coverage",
+    uv: Float[np.ndarray, "n 2"],
+    image_size: tuple[int, int],
+    name: str = "camera",
+    ax: "Axes | None" = None,
+) -> "Axes":
     """Points measured in all photographs [n, 2], and their number in each cell of the image.
 
     **Returns:** matplotlib `Axes`, pixels.
@@ -58,7 +69,9 @@ def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
     return ax
 
 
-def _smooth(u, v, sigma, times: int = 8):
+def _smooth(
+    u: np.ndarray, v: np.ndarray, sigma: Float[np.ndarray, "rows columns"], times: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """σ over a finer grid: a cubic spline of its logarithm, if it is known everywhere."""
     if not (np.isfinite(sigma) & (sigma > 0)).all() or min(sigma.shape) < 4:
         return u, v, sigma
@@ -69,10 +82,11 @@ def _smooth(u, v, sigma, times: int = 8):
     return *fine, np.exp(spline(fine[1], fine[0]))
 
 
-def _label_places(lines, size):
+def _label_places(lines: "QuadContourSet", size: np.ndarray) -> list[tuple[float, ...]]:
     """Where the contours have their labels: in the middle of the longest piece of each, away from
     the frame of the image and from one another."""
-    margin, found = MARGIN * size, []
+    # two digits of σ, 7 points high, are about 0.08 of an image as wide as the figure
+    margin, found = 0.08 * size, []
     for pieces in lines.allsegs:
         for vertices in sorted(pieces, key=len, reverse=True)[:1]:
             inside = ((vertices > margin) & (vertices < size - 1 - margin)).all(1)
@@ -83,7 +97,13 @@ def _label_places(lines, size):
     return found
 
 
-def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "camera", ax=None):
+def uncertainty_image(
+    uncertainty: "UncertaintyMap",
+    image_size: tuple[int, int],
+    unit: str = "m",
+    name: str = "camera",
+    ax: "Axes | None" = None,
+) -> "Axes":
     """σ of a projected point over the image, with the larger axis of its error ellipse.
 
     **Returns:** matplotlib `Axes`, pixels.
@@ -93,9 +113,9 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
 
     sigma = uncertainty.sigma
     finite = sigma[np.isfinite(sigma)]
-    low = SMALLEST_SIGMA
+    low = 0.02  # px: a logarithmic scale has an end even if no σ is known
     if len(finite):
-        low = max(float(finite.min(initial=np.inf)), SMALLEST_SIGMA / 10)
+        low = max(float(finite.min(initial=np.inf)), low / 10)  # nor does it reach a σ of 0
     high = max(float(finite.max(initial=0.0)), 1.01 * low)
     u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
     levels = np.geomspace(low, high, 13)
@@ -132,8 +152,15 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
 
 
 def uncertainty_curve(
-    distances, middle, corners, range_=None, unit="m", name="camera", ax=None, reported=None
-):
+    distances: Float[np.ndarray, " n"],
+    middle: Float[np.ndarray, " n"],
+    corners: Float[np.ndarray, " n"],
+    range_: tuple[float, float] | None = None,
+    unit: str = "m",
+    name: str = "camera",
+    ax: "Axes | None" = None,
+    reported: Sequence[np.ndarray] | None = None,
+) -> "Axes":
     """σ of a projected point over its distance, in the middle and in the corners of the image.
 
     **Arguments:** `range_`: nearest and farthest distance of the object the camera was calibrated

@@ -4,8 +4,15 @@ matplotlib is imported by the drawing functions, so that the package works witho
 """
 
 import math
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
 
 INK = "#26323c"
 GREY = "#8d979f"
@@ -20,11 +27,12 @@ ROLE_STYLE = {
     "fixed": {"color": INK, "marker": "s", "s": 26},
     "check": {"color": GREEN, "marker": "D", "s": 26},
 }
-LABELLED = 40
-"""Maximum number of points of a plan with ids, half of them images."""
+MAX_LABELS = 40
+"""Maximum number of points of a plan with ids, half of them images: so many lines of 7 points fit
+along an axis of 6 inches with half a line between them."""
 
 
-def need_matplotlib():
+def need_matplotlib() -> ModuleType:
     """matplotlib, or an error that says what to install."""
     try:
         import matplotlib
@@ -33,7 +41,7 @@ def need_matplotlib():
     return matplotlib
 
 
-def axes(ax, size: tuple[float, float]):
+def axes(ax: "Axes | None", size: tuple[float, float]) -> "Axes":
     """The axes given, or those of a new pyplot figure (shown by notebooks and `plt.show`)."""
     need_matplotlib()
     if ax is None:
@@ -43,8 +51,8 @@ def axes(ax, size: tuple[float, float]):
     return ax
 
 
-def axes_3d(ax, size: tuple[float, float]):
-    """The same, in perspective."""
+def axes_3d(ax: "Axes | None", size: tuple[float, float]) -> "Axes3D":
+    """The 3D axes given, or those of a new pyplot figure; refuses plane axes."""
     need_matplotlib()
     from mpl_toolkits.mplot3d import Axes3D
 
@@ -57,7 +65,7 @@ def axes_3d(ax, size: tuple[float, float]):
     return ax
 
 
-def quiet(ax, grid: bool = True) -> None:
+def quiet(ax: "Axes", grid: bool = True) -> None:
     """Thin spines, small ticks, a pale grid behind the data."""
     for spine in ax.spines.values():
         spine.set_color(GREY)
@@ -68,7 +76,17 @@ def quiet(ax, grid: bool = True) -> None:
         ax.set_axisbelow(True)
 
 
-def title(ax, text: str, detail: str = "") -> None:
+def quiet_3d(ax: "Axes3D") -> None:
+    """Small ticks and a pale grid on blank walls, seen from the front right and above."""
+    for name in "xyz":
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((1, 1, 1, 0))
+        axis._axinfo["grid"].update(color=PALE, linewidth=0.6)  # there is no public way
+        ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
+    ax.view_init(elev=24, azim=-58)
+
+
+def title(ax: "Axes", text: str, detail: str = "") -> None:
     """A title with a line of detail; names from files are never read as formulas."""
     lines = f"{plain(text)}\n{detail}" if detail else plain(text)
     ax.set_title(lines, fontsize=10, color=INK, loc="left", parse_math=False)
@@ -79,19 +97,19 @@ def plain(name: object) -> str:
     return "".join(c if c.isprintable() else "?" for c in str(name))
 
 
-def legend(ax, **keywords) -> None:
+def legend(ax: "Axes", **keywords: Any) -> None:
     """A legend on a pale ground."""
     keywords = {"frameon": True, "framealpha": 0.85, "edgecolor": PALE} | keywords
     ax.legend(fontsize=8, **keywords)
 
 
-def label(ax, axis: str, name: str, unit: str = "") -> None:
+def label(ax: "Axes", axis: str, name: str, unit: str = "") -> None:
     """An axis label with its unit in brackets."""
     text = f"{name} [{plain(unit)}]" if unit else name
     getattr(ax, f"set_{axis}label")(text, fontsize=9, color=INK, parse_math=False)
 
 
-def image_axes(ax, unit: str) -> None:
+def image_axes(ax: "Axes", unit: str) -> None:
     """The names of image coordinates: u, v in pixels, else x, y."""
     for axis, name in zip("xy", ("u", "v") if unit == "px" else ("x", "y")):
         label(ax, axis, name, unit)
@@ -102,15 +120,17 @@ def round_number(x: float) -> float:
     if not (math.isfinite(x) and x > 0):
         return 1.0
     power = 10.0 ** math.floor(math.log10(x))
+    # the tolerance keeps 5 at 5 where rounding made it 4.999…
     return max(step * power for step in (1, 2, 5) if step * power <= x * (1 + 1e-12))
 
 
-def extent(xyz) -> tuple[np.ndarray, float]:
+def extent(xyz: ArrayLike) -> tuple[np.ndarray, float]:
     """Centre and size of the visible part: far outliers (nearly parallel rays) are ignored."""
     xyz = np.asarray(xyz, float)
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
         return np.zeros(3), 1.0
+    # a few per cent of outliers do not change these quantiles
     low, middle, high = np.quantile(xyz, [0.02, 0.5, 0.98], axis=0)
     reach = 3 * np.maximum(high - low, 1e-12 + 1e-3 * (high - low).max())
     seen = xyz[(np.abs(xyz - middle) <= reach).all(1)]

@@ -10,35 +10,35 @@ from jaxbundle.plotting.style import axes, axes_3d
 from jaxbundle.plotting.ticks import label_coordinates
 
 if TYPE_CHECKING:  # with them come scanners and matching, which an adjustment does without
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
+
     from jaxbundle.surface.cloud import Cloud
     from jaxbundle.surface.dsm import Dsm
 
-MOST_POINTS = 40_000
-SUN = np.radians(315.0), np.radians(45.0)
-"""Azimuth, clockwise from the top, and elevation of the light of a relief."""
-AMBIENT = 0.35
 
-
-def cloud_perspective(cloud: Cloud, ax=None, axis: str = "Z"):
+def cloud_perspective(
+    cloud: Cloud, ax: Axes3D | None = None, axis: str = "Z", max_points: int = 40_000
+) -> Axes3D:
     """The points in perspective, coloured by σ of one axis, up to its 95th percentile.
 
-    Of very many points some are drawn.
+    Of more than `max_points` points, every so many-th is drawn.
 
     **Returns:** matplotlib `Axes3D`, in the object unit.
     """
-    ax = axes_3d(ax, (7.5, 6.0))
-    few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // MOST_POINTS))))
+    view = axes_3d(ax, (7.5, 6.0))
+    few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
     sigma = few.sigma[:, "XYZ".index(axis)]
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
-    drawn = ax.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
-    ax.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
-    ax.figure.colorbar(drawn, ax=ax, label=f"σ{axis}", shrink=0.6)
+    drawn = view.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
+    view.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
+    view.figure.colorbar(drawn, view=view, label=f"σ{axis}", shrink=0.6)
     for name in "xyz":
-        label_coordinates(ax, name, "")
-    return ax
+        label_coordinates(view, name, "")
+    return view
 
 
-def dsm_relief(dsm: Dsm, ax=None):
+def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
     """The heights in colours under a light from the upper left; cells without height are blank.
 
     **Returns:** matplotlib `Axes`, in the coordinates of the map.
@@ -48,7 +48,8 @@ def dsm_relief(dsm: Dsm, ax=None):
     ax = axes(ax, (7.0, 6.0))
     Z = np.where(np.isfinite(dsm.height), dsm.height, np.nanmean(dsm.height))
     down, right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
-    azimuth, elevation = SUN
+    # from the upper left, as in maps: under light from below, valleys look like ridges
+    azimuth, elevation, ambient = np.radians(315.0), np.radians(45.0), 0.35
     # the normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows
     light = np.array(
         [
@@ -60,7 +61,7 @@ def dsm_relief(dsm: Dsm, ax=None):
     shade = (-right * light[0] + down * light[1] + light[2]) / np.sqrt(1 + right**2 + down**2)
     low, high = np.nanpercentile(dsm.height, [1, 99])
     colour = colormaps["terrain"](np.clip((Z - low) / max(high - low, 1e-9), 0, 1) * 0.8 + 0.1)
-    colour[..., :3] *= (AMBIENT + (1 - AMBIENT) * np.clip(shade, 0, 1))[..., None]
+    colour[..., :3] *= (ambient + (1 - ambient) * np.clip(shade, 0, 1))[..., None]
     colour[..., 3] = np.isfinite(dsm.height)
     rows, columns = Z.shape
     ax.imshow(colour, extent=(dsm.x, dsm.x + columns * dsm.size, dsm.y - rows * dsm.size, dsm.y))

@@ -2,11 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.plotting.style import label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TICK_DIGITS = 6
 """Largest number of digits of a tick: as many as fit beside an axis."""
@@ -25,6 +29,7 @@ def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float
     digits = math.log10(max(largest, 1.0)) + max(_places(values), 0)
     if largest <= 10 * span or digits < TICK_DIGITS:
         return 0.0, name_ticks(values)
+    # the smallest power of ten not below the span, by a logarithm that rounding may raise
     unit = 10.0 ** math.ceil(math.log10(span) - 1e-9)
     offset = math.floor(values[0] / unit + 1e-6) * unit
     return offset, name_ticks(values - offset)
@@ -36,6 +41,7 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
         return [f"{value:.{TICK_DIGITS}g}" for value in values]
     places, largest = _places(values), float(np.abs(values).max())
     # + 0.0: no minus before a zero
+    # a sum of steps that passes 0 misses it by rounding
     values = np.where(np.abs(values) < 1e-6 * (values[1] - values[0]), 0.0, values) + 0.0
     if 1e-4 <= largest < 10.0**TICK_DIGITS:
         return [f"{value:.{max(places, 0)}f}" for value in values]
@@ -60,22 +66,22 @@ def offset_in_words(offset: float) -> str:
     return f" ({offset:+,.12g})".replace(",", " ").replace("-", "−") if offset else ""
 
 
-def label_coordinates(ax, axis: str, unit: str) -> None:
+def label_coordinates(ax: "Axes", axis: str, unit: str) -> None:
     """The label and the ticks of a coordinate axis in the limits it has: X, Y or Z."""
     from matplotlib.ticker import Formatter
 
-    of = getattr(ax, f"{axis}axis")
-    low, high = sorted(of.get_view_interval())
-    offset, _ = label_ticks([tick for tick in of.get_majorticklocs() if low <= tick <= high])
+    drawn = getattr(ax, f"{axis}axis")
+    low, high = sorted(drawn.get_view_interval())
+    offset, _ = label_ticks([tick for tick in drawn.get_majorticklocs() if low <= tick <= high])
 
     class WithoutOffset(Formatter):
-        def __call__(self, value, place=None):
+        def __call__(self, value: float, _: int | None = None) -> str:
             """The whole coordinate, at the pointer."""
             return f"{value:.10g}"
 
-        def format_ticks(self, values):
+        def format_ticks(self, values: Sequence[float]) -> list[str]:
             return name_ticks(np.array(values) - offset)
 
-    of.set_major_formatter(WithoutOffset())
+    drawn.set_major_formatter(WithoutOffset())
     label(ax, axis, axis.upper(), unit)
-    of.set_label_text(of.get_label_text() + offset_in_words(offset))
+    drawn.set_label_text(drawn.get_label_text() + offset_in_words(offset))

@@ -1,22 +1,23 @@
 """The network as a map and in perspective: points by role, cameras as pyramids, error ellipses."""
 
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.cameras.model import CameraModel
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.plotting.frame import image_frame
+from jaxbundle.plotting.frame import image_frame, pyramid_lines
 from jaxbundle.plotting.style import (
     BLUE,
     GREY,
     INK,
-    LABELLED,
-    PALE,
+    MAX_LABELS,
     ROLE_STYLE,
     axes,
     axes_3d,
@@ -24,14 +25,20 @@ from jaxbundle.plotting.style import (
     legend,
     plain,
     quiet,
+    quiet_3d,
     round_number,
     title,
 )
 from jaxbundle.plotting.ticks import label_coordinates
 from jaxbundle.system.programs import compile_once
 
-LETTER, LINE, GAP = 4.9, 8.0, 4.0
-"""Width of a letter, height of a line and distance from the place, of ids, in points."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.transforms import Bbox
+    from mpl_toolkits.mplot3d import Axes3D
+
+    from jaxbundle.bundle.result import Adjustment
+
 LARGEST_ELLIPSES, SAMPLED_ELLIPSES = 20, 280
 """Of more points than these together, the largest error ellipses are drawn, and as many others at
 most, spread evenly: an image of 1000 pixels has room for about 300 that can be told apart."""
@@ -40,7 +47,7 @@ PROBABILITY = {2: "39 %", 3: "20 %"}
 ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2)."""
 
 
-def network_plan(adjustment, ax=None):
+def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     """The network seen from above: points by role, cameras, error ellipses of X and Y.
 
     The ellipses are 1σ (a posteriori) and exaggerated; legend and title state the factor, and of
@@ -50,19 +57,10 @@ def network_plan(adjustment, ax=None):
     **Returns:** matplotlib `Axes`, in the object unit.
     """
     ax = axes(ax, (7.5, 6.5))
-    from matplotlib.collections import LineCollection
-    from matplotlib.transforms import ScaledTranslation
-
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
     _, size = extent(np.concatenate([points["xyz"], centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
-    lines = LineCollection(
-        list(_pyramid_lines(pyramids)[:, :, :2]), colors=GREY, linewidths=0.6, zorder=2
-    )
-    ax.add_collection(lines)
-    axis = np.stack([centres, pyramids[:, 1:].mean(1)], 1)[:, :, :2]
-    ax.add_collection(LineCollection(list(axis), colors=INK, linewidths=1.0, zorder=3))
-    ax.scatter(centres[:, 0], centres[:, 1], s=9, color=INK, zorder=4, label="cameras")
+    _draw_cameras(ax, pyramids)
     for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
@@ -75,7 +73,6 @@ def network_plan(adjustment, ax=None):
                 **_lighter(role, len(points["id"])),
             )
     ellipses, selection = _draw_ellipses(adjustment, ax, size)
-    away = centres - pyramids[:, 1:].mean(1)
     drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
     low, high = _inside(np.concatenate(drawn))
     ax.set_xlim(low[0], high[0])
@@ -86,46 +83,68 @@ def network_plan(adjustment, ax=None):
     for name in "xy":
         label_coordinates(ax, name, unit)
     title(ax, f"{adjustment.network.name}: plan", selection and f"error ellipses {selection}")
-    below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
+    _legend_below(ax)
+    away = centres - pyramids[:, 1:].mean(1)
+    upper_right = np.full((len(points["id"]), 2), 0.7)
+    ids = []
+    if len(centres) <= MAX_LABELS // 2:
+        ids.append((adjustment.images["id"], centres, INK, away[:, :2] / size))
+    if len(points["id"]) <= MAX_LABELS:
+        ids.append((points["id"], points["xyz"], BLUE, upper_right))
+    # beyond some thousands of dots an id finds no room in any case
+    places = np.concatenate([centres, points["xyz"][: 50 * MAX_LABELS]])[:, :2]
+    _write_ids(ax, ids, places)
+    return ax
+
+
+def _draw_cameras(ax: "Axes", pyramids: Float[np.ndarray, "images 5 3"]) -> None:
+    """Cameras from above: their pyramids, with projection centre and viewing direction."""
+    from matplotlib.collections import LineCollection
+
+    edges = pyramid_lines(pyramids)[..., :2].reshape(-1, 2, 2)
+    ax.add_collection(LineCollection(list(edges), colors=GREY, linewidths=0.6, zorder=2))
+    axis = np.stack([pyramids[:, 0], pyramids[:, 1:].mean(1)], 1)[:, :, :2]
+    ax.add_collection(LineCollection(list(axis), colors=INK, linewidths=1.0, zorder=3))
+    ax.scatter(*pyramids[:, 0, :2].T, s=9, color=INK, zorder=4, label="cameras")
+
+
+def _legend_below(ax: "Axes") -> None:
+    """A legend half an inch below the axes, under their label."""
+    from matplotlib.transforms import ScaledTranslation
+
     legend(
         ax,
         loc="upper left",
         bbox_to_anchor=(0, 0),
-        bbox_transform=below,
+        bbox_transform=ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans),
         ncols=5,
         frameon=False,
         borderaxespad=0,
         handletextpad=0.3,
         columnspacing=1.5,
     )
-    ids = [
-        (adjustment.images["id"], centres, INK, LABELLED // 2, away / size),
-        (points["id"], points["xyz"], BLUE, LABELLED, None),
-    ]
-    places = np.concatenate([centres, points["xyz"][: 50 * LABELLED]])[:, :2]
-    _write_ids(ax, [table for table in ids if len(table[0]) <= table[3]], places)
-    return ax
 
 
-def network_perspective(adjustment, ax=None):
+def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) -> "Axes3D":
     """The network in perspective: cameras as pyramids of their image corners, points by role.
 
     **Returns:** matplotlib 3D `Axes`, in the object unit.
     """
-    ax = axes_3d(ax, (7.5, 6.5))
+    view = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
     _, size = extent(np.concatenate([points["xyz"], centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
+    edges = pyramid_lines(pyramids).reshape(-1, 2, 3)
     faces = Poly3DCollection(pyramids[:, 1:], facecolors=BLUE, alpha=0.12, edgecolors="none")
-    ax.add_collection3d(faces)
-    ax.add_collection3d(Line3DCollection(_pyramid_lines(pyramids), colors=GREY, linewidths=0.7))
-    ax.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
+    view.add_collection3d(faces)
+    view.add_collection3d(Line3DCollection(edges, colors=GREY, linewidths=0.7))
+    view.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
     for role in ROLE_STYLE:
         chosen = points["xyz"][points["role"] == role]
         if len(chosen):
-            ax.scatter(
+            view.scatter(
                 *chosen.T,
                 label=f"{role} points",
                 linewidths=0,
@@ -135,26 +154,22 @@ def network_perspective(adjustment, ax=None):
     everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
     low, high = _inside(everything)
     for name, a, b in zip("xyz", low, high):
-        getattr(ax, f"set_{name}lim")(a, b)
-    ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
+        getattr(view, f"set_{name}lim")(a, b)
+    view.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
+    quiet_3d(view)
     unit = adjustment.network.object_unit
     for name in "xyz":
-        axis = getattr(ax, f"{name}axis")
-        axis.set_pane_color((1, 1, 1, 0))
-        axis._axinfo["grid"].update(color=PALE, linewidth=0.6)
-        ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
-        ax.locator_params(axis=name, nbins=5)
-        label_coordinates(ax, name, unit)
-    ax.view_init(elev=24, azim=-58)
-    title(ax, f"{adjustment.network.name}: perspective")
-    legend(ax, frameon=False, loc="upper right")
-    return ax
+        view.locator_params(axis=name, nbins=5)
+        label_coordinates(view, name, unit)
+    title(view, f"{adjustment.network.name}: perspective")
+    legend(view, frameon=False, loc="upper right")
+    return view
 
 
 # --- cameras --------------------------------------------------------------------------------
 
 
-def camera_pyramids(adjustment, size: float) -> np.ndarray:
+def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
     """Projection centre and the four image corners in object space [images, 5, 3].
 
     The slanted edges have the length `size` on average; corners by the model of the camera, so
@@ -174,6 +189,7 @@ def camera_pyramids(adjustment, size: float) -> np.ndarray:
     missing = ~np.all(np.isfinite(corners), axis=2)
     plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
     corners = np.where(missing[:, :, None], plain, corners)
+    # corners at one depth, of a lens far from a hemisphere, make a plane rectangle
     flat = np.all(corners[:, :, 2] < -0.2, axis=1)
     corners[flat] /= -corners[flat][:, :, 2:]
     corners /= np.linalg.norm(corners, axis=2).mean(1)[:, None, None]
@@ -182,28 +198,26 @@ def camera_pyramids(adjustment, size: float) -> np.ndarray:
 
 
 @partial(compile_once, static=0)
-def _corner_rays(model, parameters, frames):
+def _corner_rays(
+    model: CameraModel,
+    parameters: Float[Array, "cameras parameters"],
+    frames: Float[Array, "cameras 2 2"],
+) -> Float[Array, "cameras 4 3"]:
     """Rays of the four corners of every frame (lowest and highest x, y) [cameras, 4, 3]."""
     x, y = frames[:, jnp.array([0, 1, 1, 0]), 0], frames[:, jnp.array([0, 0, 1, 1]), 1]
 
-    def ray(p, x, y):
+    def ray(p: Array, x: Array, y: Array) -> Array:
         return jnp.stack(image_ray(model, tuple(p), x, y))
 
     return jax.vmap(jax.vmap(ray, (None, 0, 0)))(parameters, x, y)
 
 
-def _pyramid_lines(pyramids):
-    """The eight edges of every pyramid [images·8, 2, 3]."""
-    ends = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
-    return pyramids[:, np.array(ends)].reshape(-1, 2, 3)
-
-
-def pyramid_size(centres, size: float) -> float:
+def pyramid_size(centres: Float[np.ndarray, "n 3"], size: float) -> float:
     """A visible size that keeps neighbours apart."""
     return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
 
 
-def _neighbour(places, most: int = 400) -> float:
+def _neighbour(places: Float[np.ndarray, "n d"], most: int = 400) -> float:
     """The median distance to the nearest neighbour, from a sample; infinite for a single place."""
     if len(places) < 2:
         return np.inf
@@ -216,7 +230,7 @@ def _neighbour(places, most: int = 400) -> float:
 # --- points ---------------------------------------------------------------------------------
 
 
-def _points(adjustment):
+def _points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Ids, roles and coordinates, including check points; without points at any distance."""
     table = adjustment.points
     there = adjustment.located
@@ -229,11 +243,15 @@ def _points(adjustment):
     return {"id": id, "role": role, "xyz": xyz}
 
 
-def _lighter(role: str, number: int):
+def _lighter(role: str, number: int) -> dict[str, Any]:
     """Smaller marks for many tie points."""
     style = ROLE_STYLE[role]
     factor = 1 if role != "tie" or number <= 300 else 2 if number <= 3000 else 8
     return style | {"s": style["s"] / factor}
+
+
+Box = tuple[float, float, float, float]
+"""Left, right, low, top of a text, pixels."""
 
 
 class Ellipses(NamedTuple):
@@ -261,7 +279,7 @@ class Ellipses(NamedTuple):
         )
 
 
-def choose_ellipses(adjustment, size: float) -> Ellipses:
+def choose_ellipses(adjustment: "Adjustment", size: float) -> Ellipses:
     """The error ellipses of points for a network of this size: at most `LARGEST_ELLIPSES` +
     `SAMPLED_ELLIPSES`, in a visible and comparable size."""
     covariance = adjustment.point_covariance[:, :2, :2]
@@ -271,6 +289,7 @@ def choose_ellipses(adjustment, size: float) -> Ellipses:
         return Ellipses(there, 0, 1.0)
     rows = there[thin_out(adjustment.point_values[there], large[there])]
     neighbour = _neighbour(adjustment.point_values[rows, :2])
+    # an ellipse is visible, and two neighbours hardly touch
     reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
     return Ellipses(rows, len(there), round_number(reach / np.median(large[rows])))
 
@@ -294,7 +313,7 @@ def thin_out(
     return np.sort(np.concatenate([first, others[sample[:SAMPLED_ELLIPSES]]]))
 
 
-def error_ellipses(adjustment, ellipses: Ellipses, corners: int = 49) -> np.ndarray:
+def error_ellipses(adjustment: "Adjustment", ellipses: Ellipses, corners: int = 49) -> np.ndarray:
     """Closed polygons [drawn, corners, 2] of ellipses of X and Y."""
     covariance = adjustment.point_covariance[ellipses.rows, :2, :2]
     square, direction = np.linalg.eigh(0.5 * (covariance + covariance.transpose(0, 2, 1)))
@@ -304,7 +323,7 @@ def error_ellipses(adjustment, ellipses: Ellipses, corners: int = 49) -> np.ndar
     return adjustment.point_values[ellipses.rows, None, :2] + (shape @ circle).transpose(0, 2, 1)
 
 
-def _draw_ellipses(adjustment, ax, size: float) -> tuple[np.ndarray, str]:
+def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[np.ndarray, str]:
     """Draw the error ellipses in a visible, comparable size; returns their polygons, and which are
     drawn, in words."""
     from matplotlib.collections import LineCollection
@@ -325,22 +344,31 @@ def _draw_ellipses(adjustment, ax, size: float) -> tuple[np.ndarray, str]:
     return polygons, ellipses.selection
 
 
-def _write_ids(ax, tables, places) -> None:
-    """Ids beside their points without covering other ids, points or the
-    frame; first on the side away from the object. Ids without room are omitted."""
-    ax.figure.draw_without_rendering()  # the layout moves the axes
+def _write_ids(
+    ax: "Axes",
+    tables: Iterable[tuple[Sequence[object], np.ndarray, str, Float[np.ndarray, "n 2"]]],
+    places: Float[np.ndarray, "n 2"],
+) -> None:
+    """Ids beside their points without covering other ids, points or the frame; first on the side
+    away from the object. Ids without room are omitted.
+
+    **Arguments:** `tables`: ids, coordinates, colour, direction to the first side; `places` to be
+    kept free.
+    """
+    ax.figure.canvas.figure.draw_without_rendering()  # the layout moves the axes
     frame = ax.get_window_extent()
     dots = ax.figure.dpi / 72
+    # of text of 7 points: a letter, a line and the gap between a dot and its text, in points
+    letter, line, gap = 4.9, 8.0, 4.0
     taken = [(x - dots, x + dots, y - dots, y + dots) for x, y in ax.transData.transform(places)]
-    for ids, xyz, colour, _, away in tables:
-        wanted = np.full((len(ids), 2), 0.7) if away is None else away[:, :2]
-        for id, place, far in zip(ids, xyz, wanted):
+    for ids, xyz, colour, away in tables:
+        for id, place, far in zip(ids, xyz, away):
             text = plain(id)
-            wide, high = dots * LETTER * len(text), dots * LINE
             x, y = ax.transData.transform(place[:2])
             angle = np.arctan2(*far[::-1]) if np.hypot(*far) > 0.01 else np.pi / 4
             turns = angle + np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
-            boxes = [_box(x, y, wide, high, dots * GAP, turn) for turn in turns]
+            extent_of = dots * letter * len(text), dots * line, dots * gap
+            boxes = [_box(x, y, *extent_of, turn) for turn in turns]
             best = min(range(len(boxes)), key=lambda i: _count_covered(boxes[i], taken, frame))
             if _count_covered(boxes[best], taken, frame) > 0:
                 continue
@@ -361,7 +389,9 @@ def _write_ids(ax, tables, places) -> None:
             )
 
 
-def _box(x, y, wide, high, gap, turn):
+def _box(
+    x: float, y: float, wide: float, high: float, gap: float, turn: float
+) -> tuple[float, float, float, float]:
     """Left, right, low, top of a text beside (x, y) in a direction, pixels."""
     dx, dy = np.cos(turn), np.sin(turn)
     middle_x = x + dx * gap + 0.5 * wide * np.clip(1.5 * dx, -1, 1)
@@ -369,14 +399,16 @@ def _box(x, y, wide, high, gap, turn):
     return (middle_x - wide / 2, middle_x + wide / 2, middle_y - high / 2, middle_y + high / 2)
 
 
-def _count_covered(box, taken, frame) -> float:
+def _count_covered(box: Box, taken: Sequence[Box], frame: "Bbox") -> float:
     """The number of occupied boxes that a box covers, and whether it leaves the frame."""
     left, right, low, top = box
     out = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1
     return out + sum(left <= b[1] and b[0] <= right and low <= b[3] and b[2] <= top for b in taken)
 
 
-def _inside(xyz):
+def _inside(
+    xyz: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """The corners of the visible part, with a margin."""
     centre, size = extent(xyz)
     near = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]

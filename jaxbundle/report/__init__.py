@@ -8,6 +8,8 @@ components, check points, distances. σ are a posteriori. A network that was not
 report with reason and remedy, without numbers of a solution.
 """
 
+from typing import TYPE_CHECKING
+
 from jaxbundle.report import head, observations, unknowns
 from jaxbundle.report.budget import budget_lines
 from jaxbundle.report.head import unit_of_weight as unit_of_weight
@@ -17,16 +19,20 @@ from jaxbundle.report.summary import short as short
 from jaxbundle.report.verdict import Verdict as Verdict
 from jaxbundle.report.verdict import conclude as conclude
 
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.bundle.sensitivity import Budget
+
 
 def text(
-    adjustment,
+    adjustment: "Adjustment",
     residual_limit: float = 3.0,
     *,
     date: str | None = None,
     test: str = "pope",
     max_rows: int = 200,
     accuracy_unit: float | None = None,
-    budget=None,
+    budget: "Budget | None" = None,
     verdict: Verdict | None = None,
 ) -> str:
     """The full report of an adjustment.

@@ -1,6 +1,12 @@
 """An error budget in a report and a page."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 from jaxbundle.report.layout import heading, paragraph, table
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.sensitivity import Budget
 
 TITLE = "Error budget"
 HEADER = ("result", "error of", "σ of it", "effect", "share %")
@@ -9,13 +15,19 @@ LEGEND = (
     "measurements σ. Share: of the squared total. Several independent errors (×) add in "
     "squares."
 )
-MOST_ROWS = 400
 
 
-def budget_lines(budget) -> list[str]:
-    """The budget as a section of the report."""
+def select_rows(budget: "Budget", max_rows: int = 400) -> tuple[Sequence[tuple[str, ...]], int]:
+    """The rows that a report and a page show, and the number of the others: a budget has a row for
+    each result and cause, of which a reader looks up a few; budget.csv has all."""
     rows = budget.rows()
-    lines = [*heading(TITLE), *table(HEADER, rows[:MOST_ROWS], "llrrr")]
-    if len(rows) > MOST_ROWS:
-        lines.append(f"and {len(rows) - MOST_ROWS} more rows, see budget.csv")
+    return rows[:max_rows], max(len(rows) - max_rows, 0)
+
+
+def budget_lines(budget: "Budget") -> list[str]:
+    """The budget as a section of the report."""
+    rows, others = select_rows(budget)
+    lines = [*heading(TITLE), *table(HEADER, rows, "llrrr")]
+    if others:
+        lines.append(f"and {others} more rows, see budget.csv")
     return [*lines, "", *paragraph(LEGEND)]

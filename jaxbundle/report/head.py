@@ -4,6 +4,9 @@
 precision of an image coordinate is σ0 times its a priori σ, in the unit of the image.
 """
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
@@ -23,6 +26,11 @@ from jaxbundle.report.layout import (
 )
 from jaxbundle.statistics.global_test import describe_test
 from jaxbundle.statistics.weakness import ADVICE_FOR
+from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.report.verdict import Verdict
 
 METHODS = {
     "levenberg-marquardt": "least squares by Levenberg–Marquardt steps, points eliminated (Schur)",
@@ -53,7 +61,7 @@ ADVICE = {
 }
 
 
-def title(adjustment, date: str | None) -> list[str]:
+def title(adjustment: "Adjustment", date: str | None) -> list[str]:
     """Name of the program, its version, the date, and the network."""
     from jaxbundle import __version__
 
@@ -63,12 +71,14 @@ def title(adjustment, date: str | None) -> list[str]:
     return [first, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
 
 
-def settings(adjustment, verdict=None) -> list[str]:
+def settings(adjustment: "Adjustment", verdict: "Verdict | None" = None) -> list[str]:
     """What to know first; method, datum, domain of the residuals, units."""
     return ["", *facts([*first_facts(adjustment, verdict), *setting_facts(adjustment)])]
 
 
-def first_facts(adjustment, verdict=None) -> list[tuple[str, str]]:
+def first_facts(
+    adjustment: "Adjustment", verdict: "Verdict | None" = None
+) -> list[tuple[str, str]]:
     """The verdict with its reasons, likely causes of a bad fit, and how much was left out."""
     rows = []
     if adjustment.converged:
@@ -80,7 +90,7 @@ def first_facts(adjustment, verdict=None) -> list[tuple[str, str]]:
     return rows
 
 
-def left_out_in_words(adjustment) -> str:
+def left_out_in_words(adjustment: "Adjustment") -> str:
     """The numbers of things left out, by kind."""
     number: dict[str, int] = {}
     for note in adjustment.problem.network.left_out:
@@ -88,7 +98,7 @@ def left_out_in_words(adjustment) -> str:
     return ", ".join(count(n, thing) for thing, n in number.items())
 
 
-def setting_facts(adjustment) -> list[tuple[str, str]]:
+def setting_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
     """The settings by name, in words."""
     network = adjustment.network
     return [
@@ -104,16 +114,16 @@ def setting_facts(adjustment) -> list[tuple[str, str]]:
     ]
 
 
-def reduced_system(adjustment) -> str:
+def reduced_system(adjustment: "Adjustment") -> str:
     """The size of the reduced system of images and cameras, and its solver."""
     plan = adjustment.problem.system.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
-        how += f" of {plan.band.width} unknowns"
+        how += f" of {present(plan.band).width} unknowns"
     return f"{adjustment.problem.system.reduced_size} unknowns, {how}"
 
 
-def datum(adjustment) -> str:
+def datum(adjustment: "Adjustment") -> str:
     """The datum of the coordinates, and the freedoms left open by the observations."""
     network, data = adjustment.problem.network, adjustment.problem.data
     system = adjustment.problem.system
@@ -129,7 +139,7 @@ def datum(adjustment) -> str:
         parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
-    weight = np.asarray(system.plan.datum.weight["point"])[: len(network.points)] > 0
+    weight = np.asarray(present(system.plan.datum).weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
         held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
@@ -145,24 +155,25 @@ def datum(adjustment) -> str:
     )
 
 
-def open_datum(adjustment) -> str:
+def open_datum(adjustment: "Adjustment") -> str:
     """What the observations leave open of position, orientation and scale; empty: nothing."""
     network, defect = adjustment.problem.network, adjustment.counts.datum
     if defect in (0, 7):
         return "position, orientation and scale" if defect else ""
+    # the directions are told about these points, which a rotation about them leaves
     known = network.points.has_role("control", "fixed")
     about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-    gauge = np.asarray(adjustment.problem.system.plan.datum.gauge)
+    gauge = np.asarray(present(adjustment.problem.system.plan.datum).gauge)
     words = open_directions_in_words(gauge, about / max(known.sum(), 1))
     return "position and orientation" if defect == 6 and "scale" not in words else words
 
 
-def counts(adjustment) -> list[str]:
+def counts(adjustment: "Adjustment") -> list[str]:
     """Counts of observations and unknowns, and the redundancy."""
     return [*heading("Counts"), *table(("", "", ""), count_rows(adjustment), "lrl")[1:]]
 
 
-def count_rows(adjustment) -> list[tuple[str, str, str]]:
+def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
     """Label, count, and its parts."""
     network, n = adjustment.problem.network, adjustment.counts
     there = ~adjustment.problem.excluded
@@ -196,17 +207,17 @@ def count_rows(adjustment) -> list[tuple[str, str, str]]:
     return [(name, str(n), detail) for name, n, detail in rows]
 
 
-def count_points(adjustment) -> int:
+def count_points(adjustment: "Adjustment") -> int:
     """The number of points without those that data snooping excluded: these have no coordinates."""
     return int((~adjustment.problem.excluded).sum())
 
 
-def _list(groups) -> str:
+def _list(groups: Iterable[tuple[str, int]]) -> str:
     """Names with their non-zero counts."""
     return ", ".join(f"{name} {n}" for name, n in groups if n)
 
 
-def convergence(adjustment) -> list[str]:
+def convergence(adjustment: "Adjustment") -> list[str]:
     """One row per evaluation; a rejected step would have increased vᵀPv."""
     vtpv, damping, accepted = evaluations(adjustment)
     tried = len(vtpv)
@@ -219,6 +230,7 @@ def convergence(adjustment) -> list[str]:
         )
         for i in range(tried)
     ]
+    # a page of lines: the beginning and the end tell how it went
     if len(rows) > 45:
         rows = [*rows[:20], ("…", "", "", ""), *rows[-20:]]
     lines = [
@@ -237,7 +249,7 @@ def convergence(adjustment) -> list[str]:
     return lines
 
 
-def evaluations(adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def evaluations(adjustment: "Adjustment") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """vᵀPv, damping, and whether the step was accepted, of the start and every step tried."""
     tried, history = int(adjustment.minimum.iterations), adjustment.minimum.history
     columns = (history.cost, history.damping, history.accepted)
@@ -245,40 +257,42 @@ def evaluations(adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return 2 * cost, damping, accepted
 
 
-def image_sigmas(adjustment) -> np.ndarray:
+def image_sigmas(adjustment: "Adjustment") -> np.ndarray:
     """The distinct a priori σ of the image coordinates, ascending."""
     weight = np.asarray(adjustment.problem.data.image_weight)
     return np.unique(np.round(1 / weight[weight > 0], 12))
 
 
-def image_precision(adjustment) -> str:
+def image_precision(adjustment: "Adjustment") -> str:
     """σ0 times the a priori σ of image coordinates, in their unit, in µm and in pixels."""
     sigma, unit = image_sigmas(adjustment), adjustment.image_unit
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
+    # the smallest and the largest stand for all
     ends = sigma[[0, -1]]
     parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
+    # readers know the precision of a camera in µm and in pixels
     if unit == "mm":
         parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
-            size = abs(next(iter(pitch))[0])
+            size = abs(present(next(iter(pitch)))[0])
             parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
     return f"{' = '.join(parts)}  (σ0 × {KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit})"
 
 
-def unit_of_weight(adjustment) -> str:
+def unit_of_weight(adjustment: "Adjustment") -> str:
     """The σ of image coordinates with their unit, as a unit of weight."""
     ends = dict.fromkeys(f"{sigma:.4g}" for sigma in image_sigmas(adjustment)[[0, -1]])
     return f"{' to '.join(ends)} {adjustment.image_unit}"
 
 
-def span(values, digits: int = 5) -> str:
+def span(values: Iterable[float], digits: int = 5) -> str:
     """From the smallest to the largest; one number if they are equal to these digits."""
     return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 
 
-def chi_squared(adjustment, level: float = 0.05) -> str:
+def chi_squared(adjustment: "Adjustment", level: float = 0.05) -> str:
     """The global test in words."""
     found = adjustment.global_test(level)
     failed = found["passed"] is False and found["vtpv"] > found["high"]
@@ -286,7 +300,7 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
     return f"{words}, see Warnings" if failed and adjustment.doubts else words
 
 
-def variance_factor(adjustment) -> list[str]:
+def variance_factor(adjustment: "Adjustment") -> list[str]:
     """σ0, what it means in the image, and the global test."""
     text = (
         "All standard deviations below are a posteriori, σ0 × those from the a priori weights, "
@@ -300,7 +314,7 @@ def variance_factor(adjustment) -> list[str]:
     return [*heading("Variance factor"), *facts(variance_facts(adjustment)), "", *paragraph(text)]
 
 
-def variance_facts(adjustment) -> list[tuple[str, str]]:
+def variance_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
     """vᵀPv, redundancy, σ0, the precision of an image coordinate, the global test."""
     return [
         ("vᵀPv", significant(adjustment.vtpv, 6)),
@@ -311,7 +325,7 @@ def variance_facts(adjustment) -> list[tuple[str, str]]:
     ]
 
 
-def messages(adjustment) -> list[str]:
+def messages(adjustment: "Adjustment") -> list[str]:
     """Warnings: suspicious data; and notes, such as of what was left out."""
     found = []
     for title, texts in (("Warnings", adjustment.warnings), ("Notes", adjustment.notes)):
@@ -320,13 +334,13 @@ def messages(adjustment) -> list[str]:
     return found
 
 
-def why_not_solved(adjustment) -> list[str]:
+def why_not_solved(adjustment: "Adjustment") -> list[str]:
     """The reason why there is no result, undetermined unknowns, remedy."""
     return [*heading("Not solved"), *paragraph(NO_RESULT), "", *facts(failure_facts(adjustment))]
 
 
-def failure_facts(adjustment) -> list[tuple[str, str]]:
-    """The same as a mapping: reason, undetermined unknowns, remedy."""
+def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
+    """The reason why there is no result, undetermined unknowns, remedy, by name."""
     names = adjustment.undetermined
     reason = SINGULAR if names else int(adjustment.minimum.termination)
     tried = int(adjustment.minimum.iterations)
@@ -347,14 +361,14 @@ def failure_facts(adjustment) -> list[tuple[str, str]]:
     return rows
 
 
-def result_in_words(adjustment) -> str:
+def result_in_words(adjustment: "Adjustment") -> str:
     """Converged or not, in one line."""
     if adjustment.converged:
         return f"converged after {count(adjustment.iterations, 'iteration')}"
     return f"NOT converged: {adjustment.termination}"
 
 
-def redundancy_in_words(adjustment) -> str:
+def redundancy_in_words(adjustment: "Adjustment") -> str:
     """The sum that gives the redundancy."""
     n = adjustment.counts
     return (
@@ -363,7 +377,7 @@ def redundancy_in_words(adjustment) -> str:
     )
 
 
-def sigma0_in_words(adjustment) -> str:
+def sigma0_in_words(adjustment: "Adjustment") -> str:
     """σ0 to five digits, a dash without redundancy."""
     s0 = adjustment.sigma0
     return fixed(s0, 5) if 0.1 <= s0 < 1e3 else significant(s0, 5)

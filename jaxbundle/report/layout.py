@@ -10,11 +10,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from jaxbundle.types import Numbers
+
 WIDTH = 100
+"""Characters of a line of a report, a part of its format (docs: at most 100)."""
 MISSING = "–"
 WITHOUT_SIGMA = 6
-"""Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.1 pixel.
-"""
+"""Significant digits of a value whose precision is not known: a camera of 6000 pixels to 0.01
+pixel."""
 
 
 # --- numbers --------------------------------------------------------------------------------
@@ -46,6 +49,7 @@ def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, s
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return significant(value, WITHOUT_SIGMA), MISSING
     places = decimals_of(sigma, digits)
+    # Beyond seven decimals, or three zeros after the point, exponents are easier to read.
     if 0 <= places <= 7 and max(abs(value), sigma) >= 1e-3:
         return f"{value:.{places}f}", f"{sigma:.{places}f}"
     if places < 0 and abs(value) < 1e9:
@@ -85,19 +89,19 @@ def fixed(value: float | None, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:
+def column_decimals(sigma: Numbers, digits: int = 3, most: int = 9) -> int:
     """One number of decimal places for a whole column: `digits` digits of nearly every σ in it.
 
     The smallest tenth of the σ may show fewer, so that one odd value does not widen all rows.
     """
     sigma = np.asarray(sigma, float)
     sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if not len(sigma):
+    if not len(sigma):  # a column of held values
         return 4
     return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, most))
 
 
-def coordinate_decimals(sigma) -> int:
+def coordinate_decimals(sigma: Numbers) -> int:
     """Decimal places of a column of coordinates: two digits of nearly every σ in it, which suffice
     for an uncertainty (GUM, JCGM 100:2008, 7.2.6); map coordinates have many digits before them."""
     return column_decimals(sigma, 2)
@@ -168,12 +172,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> l
     names = [i for i, kind in enumerate(align) if kind == "l"]
     while excess > 0 and names:
         widest = max(names, key=lambda i: widths[i])
-        if widths[widest] <= 6:
+        if widths[widest] <= 6:  # shorter names cannot be told apart: the table is wider then
             break
         widths[widest] -= 1
         excess -= 1
 
-    def line(row):
+    def line(row: Sequence[str]) -> str:
         cells = [
             f"{shorten(cell, width):<{width}}" if kind == "l" else f"{cell:>{width}}"
             for cell, width, kind in zip(row, widths, align, strict=True)

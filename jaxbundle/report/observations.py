@@ -6,8 +6,11 @@ is requested.
 """
 
 import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, tau_quantile
@@ -25,18 +28,24 @@ from jaxbundle.report.layout import (
     table,
     to_place_of,
 )
+from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 TESTS = {"pope": "tau", "baarda": "w"}
 SYMBOLS = {"pope": "τ", "baarda": "w"}
-MOST_RESIDUALS = 100
-MOST_WEAK_ROWS = 8
 
 
 # --- residuals ------------------------------------------------------------------------------
 
 
-def residuals(adjustment, limit: float, test: str) -> list[str]:
-    """Residuals over the limit, the largest first, then the distribution of all."""
+def residuals(adjustment: "Adjustment", limit: float, test: str, max_rows: int = 100) -> list[str]:
+    """Residuals over the limit, the largest first, then the distribution of all.
+
+    **Arguments:** `max_rows`: of more residuals the largest are listed, two pages; the tables have
+    all.
+    """
     found, symbol = adjustment.residuals, SYMBOLS[test]
     size = np.abs(np.nan_to_num(found[TESTS[test]]))
     order = np.argsort(-size, kind="stable")
@@ -52,9 +61,9 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
     )
     lines.append("")
     if len(over):
-        lines += _rows(adjustment, over[:MOST_RESIDUALS])
-        if len(over) > MOST_RESIDUALS:
-            more = len(over) - MOST_RESIDUALS
+        lines += _rows(adjustment, over[:max_rows])
+        if len(over) > max_rows:
+            more = len(over) - max_rows
             lines.append(f"… and {more} more: all residuals are in residuals.csv or the JSON.")
         lines += ["", f"{len(over)} of {len(size)} observations."]
     else:
@@ -63,14 +72,14 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
     return lines + _histogram(found["tau"])
 
 
-def critical_value(adjustment, test: str = "pope", level: float = 0.001) -> float:
+def critical_value(adjustment: "Adjustment", test: str = "pope", level: float = 0.001) -> float:
     """The critical value of the test of one observation at a level."""
     if test == "baarda":
         return normal_quantile(1 - level / 2)
     return tau_quantile(1 - level / 2, adjustment.redundancy)
 
 
-def _rows(adjustment, chosen) -> list[str]:
+def _rows(adjustment: "Adjustment", chosen: Iterable[int]) -> list[str]:
     found, sigma0 = adjustment.residuals, adjustment.sigma0
     header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "ext.")
     rows = []
@@ -91,7 +100,7 @@ def _rows(adjustment, chosen) -> list[str]:
     return table(header, rows, "llll" + "r" * 7)
 
 
-def _histogram(tau) -> list[str]:
+def _histogram(tau: Float[np.ndarray, " n"]) -> list[str]:
     """Counts of τ in classes of ½, compared with a normal distribution."""
     tau = tau[np.isfinite(tau)]
     if not len(tau):
@@ -112,23 +121,26 @@ def _histogram(tau) -> list[str]:
     ]
 
 
-def count_by_class(tau):
+def count_by_class(
+    tau: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " edges"], Int[np.ndarray, " classes"], Float[np.ndarray, " classes"]]:
     """Edges of classes of ½ from −4 to 4, open at both ends; how many τ are in each, and how many
     a normal distribution would give."""
     tau = tau[np.isfinite(tau)]
     edges = np.concatenate([[-np.inf], np.arange(-4, 4.25, 0.5), [np.inf]])
-    normal = np.array([0.5 * (1 + math.erf(edge / math.sqrt(2))) for edge in edges])
+    normal = np.array([0.5 * (1 + math.erf(edge / math.sqrt(2))) for edge in edges])  # Φ
     return edges, np.histogram(tau, edges)[0], len(tau) * np.diff(normal)
 
 
 # --- reliability ----------------------------------------------------------------------------
 
 
-def redundancy(adjustment) -> list[str]:
-    """Redundancy numbers: their sum, their range, and the observations least controlled."""
+def redundancy(adjustment: "Adjustment", max_rows: int = 8) -> list[str]:
+    """Redundancy numbers: their sum, their range, and the `max_rows` observations that are least
+    controlled: enough to see which kind or point they belong to."""
     found = adjustment.residuals
     r = found["r"]
-    order = np.argsort(r, kind="stable")[:MOST_WEAK_ROWS]
+    order = np.argsort(r, kind="stable")[:max_rows]
     weak, loose = count_weak(r)
     rows = [
         ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
@@ -146,12 +158,13 @@ def redundancy(adjustment) -> list[str]:
     ]
 
 
-def count_weak(r) -> tuple[int, int]:
+def count_weak(r: Float[np.ndarray, " n"]) -> tuple[int, int]:
     """The number of weakly controlled observations, r < 0.1, and of uncontrolled ones."""
+    # r < 0.1 (Förstner, 1979: the bound of "bad" control); 1e-8: 0 but for rounding of 1 − hᵢᵢ
     return int((r < 0.1).sum()), int((r < 1e-8).sum())
 
 
-def components(adjustment) -> list[str]:
+def components(adjustment: "Adjustment") -> list[str]:
     """Variance components: the estimated σ of every group, relative to the given ones and
     absolute."""
     rows = [
@@ -182,7 +195,7 @@ def components(adjustment) -> list[str]:
     return lines
 
 
-def removals(adjustment) -> list[str]:
+def removals(adjustment: "Adjustment") -> list[str]:
     """Observations removed by data snooping, in order, and insignificant parameters that were
     fixed."""
     lines = []
@@ -211,7 +224,7 @@ def removals(adjustment) -> list[str]:
     return lines
 
 
-def downweighted(adjustment, most: int) -> list[str]:
+def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
     """The scale of a robust estimate, and the image points it suspects."""
     if adjustment.robust is None:
         return []
@@ -220,11 +233,12 @@ def downweighted(adjustment, most: int) -> list[str]:
         (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
         for i, item in enumerate(suspects[:most], 1)
     ]
+    weighted = len(present(adjustment.weights))
     lines = heading(f"Robust estimation ({adjustment.robust})")
     lines += paragraph(
         f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
         "the median of the residuals (MAD). "
-        f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals above "
+        f"{len(suspects)} of {count(weighted, 'image point')} have residuals above "
         f"the critical length{', in σ times the scale (test):' if rows else '.'}"
     )
     if rows:
@@ -238,7 +252,7 @@ def downweighted(adjustment, most: int) -> list[str]:
 # --- comparisons ----------------------------------------------------------------------------
 
 
-def check_points(adjustment, most: int) -> list[str]:
+def check_points(adjustment: "Adjustment", most: int) -> list[str]:
     """Check points: differences, adjusted minus given, with their σ; RMS."""
     found = adjustment.table("checks")
     if not found:
@@ -256,7 +270,7 @@ def check_points(adjustment, most: int) -> list[str]:
         for i in range(min(total, most))
     ]
     rows.append(("",) * 8)
-    for name, of in (
+    for name, summarise in (
         ("RMS", lambda x: math.sqrt((x**2).mean())),
         ("mean", np.mean),
         ("largest", lambda x: x[np.abs(x).argmax()]),
@@ -265,7 +279,7 @@ def check_points(adjustment, most: int) -> list[str]:
         columns = (
             x[np.isfinite(x)] if np.isfinite(x).any() else np.full(1, np.nan) for x in columns
         )
-        rows.append((name, *(fixed(float(of(column)), places) for column in columns), ""))
+        rows.append((name, *(fixed(float(summarise(column)), places) for column in columns), ""))
     lines = [
         *heading(f"Check points: intersected − given, in {unit}"),
         *table(("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "rays"), rows, "lrrrrrrr"),
@@ -275,28 +289,30 @@ def check_points(adjustment, most: int) -> list[str]:
     return lines
 
 
-def distances(adjustment, most: int) -> list[str]:
+def distances(adjustment: "Adjustment", most: int) -> list[str]:
     """Measured distances against those of the adjusted points."""
     found = adjustment.residuals
     rows_of = np.flatnonzero(found["kind"] == "distance")
     if not len(rows_of):
         return []
-    at = {id: i for i, id in enumerate(adjustment.points["id"])}
+    row_of = {id: i for i, id in enumerate(adjustment.points["id"])}
     places = column_decimals(found["sigma"][rows_of])
     rows = []
     for i in rows_of[:most]:
-        a, b = (adjustment.point_values[at[found[end][i]]] for end in ("image", "point"))
+        # a distance has its points in the columns of image and point
+        a, b = (adjustment.point_values[row_of[found[end][i]]] for end in ("image", "point"))
         adjusted = float(np.linalg.norm(a - b))
         v, r = found["v"][i], found["r"][i]
+        # σ of the adjusted distance: Q_l̂ = Q_l − Q_v, and r = (Q_v·P)ᵢᵢ
         sigma = adjustment.sigma0 * found["sigma"][i] * math.sqrt(max(1 - r, 0))
         values = (adjusted - v, found["sigma"][i], adjusted, sigma, v)
         rows.append(
             (
                 found["image"][i],
                 found["point"][i],
-                *(fixed(x, places) for x in values),
-                fixed(r, 3),
-                fixed(found["tau"][i], 2),
+                *(fixed(float(x), places) for x in values),
+                fixed(float(r), 3),
+                fixed(float(found["tau"][i]), 2),
             )
         )
     header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")

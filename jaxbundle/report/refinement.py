@@ -8,7 +8,8 @@ from jaxbundle.leastsquares.quality.distributions import (
     tau_quantile,
 )
 from jaxbundle.network.columns import count
-from jaxbundle.refinement import UNIT_OF_WEIGHT
+from jaxbundle.refinement import UNIT_OF_WEIGHT, Refinement
+from jaxbundle.refinement.check_points import CheckPoints
 from jaxbundle.report.layout import significant
 from jaxbundle.report.verdict import (
     DOUBTFUL,
@@ -23,7 +24,7 @@ from jaxbundle.report.verdict import (
 from jaxbundle.statistics.global_test import describe_test, is_tested
 
 
-def conclude_refinement(result) -> Verdict:
+def conclude_refinement(result: Refinement) -> Verdict:
     """The verdict on a `Refinement`, from its χ² test, redundancy numbers, blunders and check
     points."""
     used = [row for row in result.image_points() if not row["removed"]]
@@ -42,7 +43,7 @@ def conclude_refinement(result) -> Verdict:
     return Verdict(*in_words(findings, len(result.warnings)), tuple(findings))
 
 
-def _blunders(result, found: dict, w: np.ndarray) -> Finding:
+def _blunders(result: Refinement, found: dict, w: np.ndarray) -> Finding:
     """As many tests as coordinates: Baarda's w with σ that were stated, else Pope's τ."""
     stated = is_tested(result.redundancy, found["sigma_origin"])
     size = np.abs(w) if stated else np.abs(w) / result.sigma0
@@ -58,7 +59,7 @@ def _blunders(result, found: dict, w: np.ndarray) -> Finding:
     return Finding("Blunders", DOUBTFUL if largest > limit else GOOD, words, likely)
 
 
-def _check_points(check) -> Finding:
+def _check_points(check: CheckPoints) -> Finding:
     ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
     largest = np.fmax.reduce(ratio, initial=np.nan)
     limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)

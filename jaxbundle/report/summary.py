@@ -1,6 +1,8 @@
 """The short forms of a result: a few lines of text, and a small HTML for notebooks."""
 
+from collections.abc import Iterator
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,13 +24,11 @@ from jaxbundle.report.layout import (
     significant,
 )
 
-MOST_CAMERAS, MOST_PARAMETERS = 3, 20
-WITHIN = 0.95
-"""Share of the σ of points below the second figure of the summary: a handful of hardly determined
-points would dominate their RMS and maximum."""
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 
-def one_line(adjustment) -> str:
+def one_line(adjustment: "Adjustment") -> str:
     """The text of `repr`."""
     network = adjustment.network
     name = f"Adjustment {clean(network.name)!r}"
@@ -41,7 +41,7 @@ def one_line(adjustment) -> str:
     )
 
 
-def summary(adjustment) -> list[tuple[str, str]]:
+def summary(adjustment: "Adjustment") -> list[tuple[str, str]]:
     """The facts of the short forms: names and texts."""
     network = adjustment.problem.network
     rows = [
@@ -82,46 +82,51 @@ def summary(adjustment) -> list[tuple[str, str]]:
     return rows
 
 
-def _cameras(adjustment):
+def _cameras(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:
+    # The summary stays within a screen: three cameras, of a spline model the first parameters.
+    max_cameras, max_parameters = 3, 20
     tables = adjustment.cameras
-    for camera, entry in list(tables.items())[:MOST_CAMERAS]:
+    for camera, entry in list(tables.items())[:max_cameras]:
         parts = [
             f"{name} {value}" + ("" if sigma == MISSING else f" ± {sigma}")
             for name, found in entry["parameters"].items()
             if found["free"]
             for value, sigma in [estimate(found["value"], found["sigma"])]
         ]
-        if len(parts) > MOST_PARAMETERS:
-            more = len(parts) - MOST_PARAMETERS // 2
-            parts[MOST_PARAMETERS // 2 :] = [f"and {more} more parameters, see report()"]
+        if len(parts) > max_parameters:
+            more = len(parts) - max_parameters // 2
+            parts[max_parameters // 2 :] = [f"and {more} more parameters, see report()"]
         text = ", ".join(parts) if parts else "held"
         yield f"Camera {clean(camera)}", f"{entry['model']}: {text}"
-    if len(tables) > MOST_CAMERAS:
-        yield "", f"and {count(len(tables) - MOST_CAMERAS, 'other camera')}"
+    if len(tables) > max_cameras:
+        yield "", f"and {count(len(tables) - max_cameras, 'other camera')}"
 
 
-def _points(adjustment) -> str:
+def _points(adjustment: "Adjustment") -> str:
     unit = clean(adjustment.network.object_unit)
+    # Beside the median the 95 % quantile: a handful of hardly determined points would dominate the
+    # RMS and the maximum.
+    share = 0.95
     parts = []
     for axis in "XYZ":
         sigma = adjustment.points[f"s{axis}"]
         sigma = sigma[np.isfinite(sigma) & (sigma > 0) & adjustment.located]
         if len(sigma):
-            middle, most = np.quantile(sigma, (0.5, WITHIN))
+            middle, most = np.quantile(sigma, (0.5, share))
             parts.append(f"σ{axis} {significant(middle)} ({significant(most)})")
     if not parts:
         return "no coordinate is estimated with a σ"
-    return f"median {', '.join(parts)} {unit}, in brackets {100 * WITHIN:g} % of them are smaller"
+    return f"median {', '.join(parts)} {unit}, in brackets {100 * share:g} % of them are smaller"
 
 
-def _far_points(adjustment):
+def _far_points(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:
     found = adjustment.far_points
     if found is not None:
         number = f"{count(len(found.id), 'point')} at any distance"
         yield "", f"and {number}, {found.at_infinity.sum()} of them at infinity"
 
 
-def _worst(adjustment) -> str:
+def _worst(adjustment: "Adjustment") -> str:
     found = adjustment.residuals
     tau = np.abs(np.nan_to_num(found["tau"]))
     if not tau.max(initial=0.0) > 0:
@@ -133,14 +138,14 @@ def _worst(adjustment) -> str:
     return f"{significant(tau[i])} ({what}, {found['axis'][i]})"
 
 
-def short(adjustment) -> str:
+def short(adjustment: "Adjustment") -> str:
     """The result in about fifteen lines; one that was not solved shows no numbers of a solution."""
     head = f"Adjustment {clean(adjustment.network.name)!r}"
     return "\n".join([head, *facts(summary(adjustment), indent=2)])
 
 
-def html(adjustment) -> str:
-    """The same facts as a small self-contained HTML; everything from files is escaped."""
+def html(adjustment: "Adjustment") -> str:
+    """The facts of the summary as a small self-contained HTML; everything from files is escaped."""
     cell = 'style="text-align:left;vertical-align:top;padding:2px 12px 2px 0"'
     colour = "#2a6f4e" if adjustment.converged else "#a33b2c"
     rows = "".join(

@@ -1,6 +1,10 @@
 """The adjusted unknowns in a protocol: cameras, images, points, each with its precision."""
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.network.columns import count, list_some
@@ -20,21 +24,23 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.types import present
 
-CRITICAL_T = 2.0
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+
 CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
-FEW_CAMERAS = 8
 ROLE_WORDS = {"tie": "tie", "control": "ctrl", "fixed": "fix", "check": "check"}
 
 
 # --- cameras --------------------------------------------------------------------------------
 
 
-def cameras(adjustment) -> list[str]:
+def cameras(adjustment: "Adjustment") -> list[str]:
     """Every camera in full; many cameras as one table a model."""
     tables, models = adjustment.cameras, _models(adjustment)
     lines = []
-    if len(tables) > FEW_CAMERAS:
+    if len(tables) > 8:  # half a page each: more would hide the rest of the report
         return [*heading(f"Cameras ({len(tables)})"), *_many_cameras(adjustment)]
     for camera, entry in tables.items():
         lines += heading(f"Camera {clean(camera)}")
@@ -43,21 +49,24 @@ def cameras(adjustment) -> list[str]:
     return lines
 
 
-def _models(adjustment) -> dict[str, CameraModel]:
+def _models(adjustment: "Adjustment") -> dict[str, CameraModel]:
     """The camera models by name."""
     return {str(camera.model): get_model(camera.model) for camera in adjustment.network.cameras}
 
 
-def _one_camera(entry, model: CameraModel) -> list[str]:
+def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     lines = _equations(model)
+    # Student's t at 95 %: 1.96 where the redundancy is large, 2 as in `Adjustment.insignificant`
+    critical_t = 2.0
     rows, held = [], []
     for name, found in entry["parameters"].items():
+        # held ones follow in one line
         if not found["free"]:
             held.append(f"{name} {significant(found['value'], WITHOUT_SIGMA)}")
             continue
         value, sigma = estimate(found["value"], found["sigma"])
         t, total = found["t"], found["total_correlation"]
-        mark = "–" if np.isnan(t) else "no" if t < CRITICAL_T else "yes"
+        mark = "–" if np.isnan(t) else "no" if t < critical_t else "yes"
         rows.append((name, value, sigma, significant(t, 3), mark, fixed(100 * total, 1)))
     if rows:
         header = ("parameter", "value", "σ", "t", "significant", "total corr. %")
@@ -68,7 +77,7 @@ def _one_camera(entry, model: CameraModel) -> list[str]:
         lines += ["", *facts([("Tied", ", ".join(" = ".join(group) for group in entry["tied"]))])]
     if rows:
         lines += paragraph(
-            f"t = |value|/σ; no: t < {CRITICAL_T:g}, not different from 0 at about 95 %. Total "
+            f"t = |value|/σ; no: t < {critical_t:g}, not different from 0 at about 95 %. Total "
             "correlation: the share of a parameter that the others of the camera explain."
         )
     free = entry["free"]
@@ -83,7 +92,7 @@ def _equations(model: CameraModel) -> list[str]:
     return facts(rows)
 
 
-def _triangle(names, C) -> list[str]:
+def _triangle(names: Sequence[str], C: Float[np.ndarray, "n n"]) -> list[str]:
     """The lower triangle of a correlation matrix."""
     width = max(5, max(map(len, names)))
     first = max(map(len, names))
@@ -94,7 +103,7 @@ def _triangle(names, C) -> list[str]:
     return lines
 
 
-def _many_cameras(adjustment) -> list[str]:
+def _many_cameras(adjustment: "Adjustment") -> list[str]:
     """Two lines a camera, value and σ; one table a model."""
     lines = []
     tables = adjustment.cameras
@@ -111,6 +120,7 @@ def _many_cameras(adjustment) -> list[str]:
             ]
             rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
         lines += [*_equations(model), ""]
+        # six columns of values fit in the width of a page
         for start in range(0, len(names), 6):
             part = slice(start, start + 6)
             header = ("camera", *names[part])
@@ -119,7 +129,7 @@ def _many_cameras(adjustment) -> list[str]:
     return lines[:-1]
 
 
-def validity(adjustment, camera: str) -> str:
+def validity(adjustment: "Adjustment", camera: str) -> str:
     """Whether the distortion is one-to-one over the image of a camera."""
     reach = adjustment.distortion_reach[camera]
     if reach.radius <= 0:
@@ -135,7 +145,7 @@ def validity(adjustment, camera: str) -> str:
 # --- images ---------------------------------------------------------------------------------
 
 
-def images(adjustment, most: int) -> list[str]:
+def images(adjustment: "Adjustment", most: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
     found = adjustment.images
     unit, angle = adjustment.image_unit, adjustment.network.angle_unit
@@ -169,7 +179,7 @@ def _left_out(total: int, most: int, noun: str, file: str) -> list[str]:
 # --- points ---------------------------------------------------------------------------------
 
 
-def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[str]:
+def points(adjustment: "Adjustment", most: int, accuracy_unit: float | None = None) -> list[str]:
     """Precision of the points in summary, rays a point, then the list."""
     lines = heading("Points: precision")
     lines += _precision(adjustment, accuracy_unit)
@@ -197,11 +207,12 @@ SUMMARY = (
 """Of the σ of the points. A handful of hardly determined points would make their mean and RMS."""
 
 
-def _precision(adjustment, accuracy_unit) -> list[str]:
+def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[str]:
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
     free = adjustment.problem.system.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
+    # points at infinity have no coordinates whose σ could be counted
     free &= adjustment.located[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
@@ -209,8 +220,8 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     together = sigma[free]
     places = column_decimals(together)
     rows = [
-        (name, *(fixed(float(of(s)), places) if len(s) else "–" for s in (*columns, together)))
-        for name, of in SUMMARY
+        (name, *(fixed(float(reduce(s)), places) if len(s) else "–" for s in (*columns, together)))
+        for name, reduce in SUMMARY
     ]
     scale = float(np.median(together)) if accuracy_unit is None else float(accuracy_unit)
     meaning = "the median of all" if accuracy_unit is None else "as chosen"
@@ -229,11 +240,11 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     return [head, *first, "", note, *second]
 
 
-def _rays(rays) -> list[str]:
+def _rays(rays: Int[np.ndarray, " points"]) -> list[str]:
     """How many points have how many rays."""
     seen = np.unique(rays)
     groups = [(int(n), int(n)) for n in seen]
-    if len(groups) > 12:
+    if len(groups) > 12:  # classes of equal ratio instead
         edges = np.unique(np.round(np.geomspace(max(seen[0], 1), seen[-1] + 1, 11)).astype(int))
         groups = [(0, 0), *((int(a), int(b) - 1) for a, b in zip(edges, edges[1:]))]
     counted = [int(((rays >= a) & (rays <= b)).sum()) for a, b in groups]
@@ -245,7 +256,7 @@ def _rays(rays) -> list[str]:
     return ["", *table(("rays", "points", ""), rows, "rrl")]
 
 
-def _list_of_points(adjustment, most) -> list[str]:
+def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
     found = adjustment.points
     total = len(found["id"])
     shown = np.arange(min(total, most))
@@ -272,30 +283,33 @@ def _list_of_points(adjustment, most) -> list[str]:
 # --- points at any distance -----------------------------------------------------------------
 
 
-def far_points(adjustment, most: int) -> list[str]:
+def far_points(adjustment: "Adjustment", most: int) -> list[str]:
     """Direction and distance of the points whose rays are nearly parallel, those at infinity
     first."""
     found = adjustment.table("far_points")
     if not found:
         return []
-    of = adjustment.network
+    network = adjustment.network
     order = np.lexsort((-found["distance"], ~found["at_infinity"]))
     rows = [
         (
-            found["id"][i],
+            str(found["id"][i]),
             *(f"{found[f'u{axis}'][i]:.6f}" for axis in "XYZ"),
-            significant(found["su"][i]),
-            "at infinity" if found["at_infinity"][i] else significant(found["distance"][i], 4),
-            significant(found["nearer"][i]),
-            "∞" if np.isinf(found["farther"][i]) else significant(found["farther"][i]),
+            significant(float(found["su"][i])),
+            "at infinity"
+            if found["at_infinity"][i]
+            else significant(float(found["distance"][i]), 4),
+            significant(float(found["nearer"][i])),
+            "∞" if np.isinf(found["farther"][i]) else significant(float(found["farther"][i])),
         )
         for i in order[:most]
     ]
-    place = ", ".join(significant(x, 8) for x in adjustment.far_points.origin)
+    place = ", ".join(significant(x, 8) for x in present(adjustment.far_points).origin)
+    angle = network.angle_unit
     lines = [
         *heading(f"Points at any distance: directions from {place}"),
-        f"Their rays are nearly parallel. σ in {of.angle_unit}; distance, and from where to where",
-        f"one σ of the inverse distance reaches, in {clean(of.object_unit)}.",
+        f"Their rays are nearly parallel. σ in {angle}; distance, and from where to where",
+        f"one σ of the inverse distance reaches, in {clean(network.object_unit)}.",
         "",
         *table(("point", "uX", "uY", "uZ", "σ", "distance", "from", "to"), rows, "lrrrrrrr"),
     ]
@@ -305,7 +319,7 @@ def far_points(adjustment, most: int) -> list[str]:
 # --- further kinds of observations ----------------------------------------------------------
 
 
-def further(adjustment, most: int) -> list[str]:
+def further(adjustment: "Adjustment", most: int) -> list[str]:
     """The unknowns of further kinds of observations, a line each."""
     lines = []
     for name, found in adjustment.further_unknowns.items():

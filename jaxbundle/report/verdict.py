@@ -7,9 +7,10 @@ were stated are contradicted.
 """
 
 from collections.abc import Container, Iterable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import level_of_one
 from jaxbundle.network.columns import count
@@ -18,12 +19,16 @@ from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
 from jaxbundle.statistics.misfit import LARGEST_REMOVED, contradicts
+from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 GOOD, NOTED, DOUBTFUL, BAD = "met", "noted", "doubtful", "not met"
 LEVEL = 0.001
-"""Probability that a good result fails a test of the verdict."""
-WEAK_SHARE = 0.05
-"""Share of weakly controlled observations that is noted."""
+"""Probability that a good result fails a test of the verdict: the level at which data snooping is
+done by convention (Baarda, 1968: α₀ = 0.1 %), so that the verdict and the removal of blunders
+agree."""
 
 
 class Finding(NamedTuple):
@@ -49,7 +54,7 @@ class Verdict(NamedTuple):
     findings: tuple[Finding, ...]
 
 
-def judge(adjustment) -> list[Finding]:
+def judge(adjustment: "Adjustment") -> list[Finding]:
     """The findings of a solved adjustment."""
     return [
         _fit(adjustment),
@@ -77,15 +82,19 @@ def in_words(findings: list[Finding], warnings: int) -> tuple[str, str]:
 
 
 def conclude(
-    adjustment, findings: Iterable[Finding] = (), without: Container[str] = (), warnings: int = 0
+    adjustment: "Adjustment",
+    findings: Iterable[Finding] = (),
+    without: Container[str] = (),
+    warnings: int = 0,
 ) -> Verdict:
     """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
     those of the adjustment, and with further `warnings`."""
+    # those of the command first: they are about its own question
     found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
     return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
 
 
-def _fit(adjustment) -> Finding:
+def _fit(adjustment: "Adjustment") -> Finding:
     return judge_fit(
         adjustment.global_test(),
         chi_squared(adjustment),
@@ -122,7 +131,9 @@ def _judge_fit(found: dict, words: str, sigma0: float) -> Finding:
     return Finding(about, BAD, words, f"residuals {times} (χ² test)")
 
 
-def _tested(adjustment, rows) -> tuple[float, float, str]:
+def _tested(
+    adjustment: "Adjustment", rows: Bool[np.ndarray, " n"] | slice
+) -> tuple[float, float, str]:
     """The largest |τ| of some observations, NaN if none of them is controlled; its critical value
     among so many; both in words."""
     tau = np.abs(adjustment.residuals["tau"][rows])
@@ -136,7 +147,7 @@ def _tested(adjustment, rows) -> tuple[float, float, str]:
     return largest, limit, words
 
 
-def _control(adjustment) -> Finding:
+def _control(adjustment: "Adjustment") -> Finding:
     points = adjustment.problem.network.points
     number = {role: int(points.has_role(role).sum()) for role in ("control", "fixed")}
     if not any(number.values()):
@@ -154,7 +165,7 @@ def _control(adjustment) -> Finding:
     return Finding("Control", GOOD, words)
 
 
-def _free_network(adjustment) -> Finding:
+def _free_network(adjustment: "Adjustment") -> Finding:
     """Without control a network is complete: in its datum, which is named."""
     open_part = open_datum(adjustment)
     if not open_part:
@@ -169,7 +180,7 @@ def _free_network(adjustment) -> Finding:
     return Finding("Control", NOTED, words, "free network")
 
 
-def _held_control(adjustment, parts: str) -> Finding:
+def _held_control(adjustment: "Adjustment", parts: str) -> Finding:
     """Points without σ are exact: their errors are in the image residuals, and three of them fit
     any network."""
     rows, points = adjustment.residuals, adjustment.problem.network.points
@@ -177,13 +188,14 @@ def _held_control(adjustment, parts: str) -> Finding:
     own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
     largest, limit, said = _tested(adjustment, own)
     words, brief = f"{parts} held exactly, because no σ is stated; ", "control held exactly"
+    # three points are a similarity: they fit any network
     if len(ids) <= 3 or np.isnan(largest):
         return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ", brief)
     state = GOOD if largest <= limit else DOUBTFUL
     return Finding("Control", state, f"{words}largest |τ| of their image points {said}", brief)
 
 
-def _checks(adjustment) -> list[Finding]:
+def _checks(adjustment: "Adjustment") -> list[Finding]:
     found = adjustment.check_points
     if found is None:
         return []
@@ -191,8 +203,8 @@ def _checks(adjustment) -> list[Finding]:
     rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    given = np.concatenate(adjustment.check[0].sigma.T)
-    s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))
+    given = np.concatenate(present(adjustment.check)[0].sigma.T)
+    s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
     known = (s > 0) & np.isfinite(d)
     largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)
     limit = critical_value(adjustment, level=level_of_one(LEVEL, int(known.sum())))
@@ -206,26 +218,34 @@ def _checks(adjustment) -> list[Finding]:
     return [Finding("Check points", state, words, brief)]
 
 
-def describe_reliability(r: np.ndarray, thing: str = "observation") -> Finding:
+def describe_reliability(
+    r: Float[np.ndarray, " n"], thing: str = "observation", max_weak_share: float = 0.05
+) -> Finding:
     """The finding about redundancy numbers: blunders in weakly controlled observations hardly show,
-    which a design can change and an adjustment cannot."""
+    which a design can change and an adjustment cannot.
+
+    **Arguments:** `max_weak_share` of weakly controlled observations that is not noted: a few stand
+    at the edge of every network.
+    """
     weak, loose = count_weak(r)
     words = (
         f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), thing)} weakly "
         f"controlled (r < 0.1), {loose} uncontrolled"
     )
     brief = f"{weak} of {count(len(r), thing)} weakly controlled"
-    return Finding("Reliability", NOTED if weak > WEAK_SHARE * len(r) else GOOD, words, brief)
+    state = NOTED if weak > max_weak_share * len(r) else GOOD
+    return Finding("Reliability", state, words, brief)
 
 
-def _blunders(adjustment) -> Finding:
+def _blunders(adjustment: "Adjustment") -> Finding:
     tau = np.abs(adjustment.residuals["tau"])
-    of_one, expected = critical_value(adjustment, level=LEVEL), LEVEL * len(tau)
-    over = int((tau > of_one).sum())
+    critical, expected = critical_value(adjustment, level=LEVEL), LEVEL * len(tau)
+    over = int((tau > critical).sum())
     largest, limit, said = _tested(adjustment, slice(None))
     words = (
-        f"{over} of {count(len(tau), 'observation')} over the critical value {significant(of_one)} "
-        f"of |τ| at {100 * LEVEL:g} % (by chance about {significant(expected, 2)}); largest {said}"
+        f"{over} of {count(len(tau), 'observation')} over the critical value "
+        f"{significant(critical)} of |τ| at {100 * LEVEL:g} % (by chance about "
+        f"{significant(expected, 2)}); largest {said}"
     )
     removed, suspects = len(adjustment.removed), len(adjustment.suspects)
     if removed or suspects:
@@ -237,6 +257,7 @@ def _blunders(adjustment) -> Finding:
     if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
+    # more than chance explains, but none that stands out: σ of some are too small
     many = over > explained_by_chance(len(tau))
     return Finding("Blunders", NOTED if many else GOOD, words, count(over, "large residual"))
 
@@ -244,11 +265,12 @@ def _blunders(adjustment) -> Finding:
 def explained_by_chance(number: float, level: float = LEVEL) -> float:
     """The largest number of rejections among good observations that chance explains: their mean,
     three standard deviations, and one always."""
+    # the number is binomial, its variance n·p·(1 − p) ≈ n·p
     expected = level * number
     return expected + 3 * np.sqrt(expected) + 1
 
 
-def _left_out(adjustment) -> list[Finding]:
+def _left_out(adjustment: "Adjustment") -> list[Finding]:
     """What was left out although it was measured often enough: a note if a test rejects as many by
     chance, or if rays do not determine so few points; photographs never are."""
     network = adjustment.problem.network

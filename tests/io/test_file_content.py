@@ -13,7 +13,7 @@ from test_hostile_files import KINDS, made, read
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.photomodeler_camera import header_camera
 from jaxbundle.io.text.csv_tables import read_text, read_toml
-from jaxbundle.io.text.rows import Row
+from jaxbundle.io.text.rows import TextRow
 from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.file_content import check_plain, parse_json, parse_toml, read_content
@@ -58,7 +58,7 @@ def test_a_number_of_400_digits_is_read_or_refused_with_its_file(kind, tmp_path)
 
 
 def test_an_exponent_of_400_digits_is_zero():
-    row = Row("file", 1, f"7.4 3.6 2.6 7.2 5.4 4.9e-{LONG} 0 0 0 0")
+    row = TextRow("file", 1, f"7.4 3.6 2.6 7.2 5.4 4.9e-{LONG} 0 0 0 0")
     values, half = header_camera(row)
     assert values[5] == 0 and half[5] == pytest.approx(0.5e-5)
 

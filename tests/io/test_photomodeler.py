@@ -13,7 +13,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.networks.photomodeler import is_photomodeler
-from jaxbundle.io.networks.photomodeler_points import Block, renumber_smart
+from jaxbundle.io.networks.photomodeler_points import PhotoModelerBlock, renumber_smart
 
 BROWN = CAMERAS["brown"]
 NAMES = ("a.jpg", "b.jpg", "c.jpg")
@@ -160,9 +160,11 @@ def test_a_repeated_id_that_is_no_smart_point_is_refused(tmp_path):
 
 def renumbered(listed, marked):
     """Ids of object points and of image points, those of smart points with a minus."""
-    objects = Block([str(k) for k in listed], np.zeros((len(listed), 6)), [*range(len(listed))])
+    objects = PhotoModelerBlock(
+        [str(k) for k in listed], np.zeros((len(listed), 6)), [*range(len(listed))]
+    )
     values = np.array([[1.0, 1.0, *[float(k > 0)] * 2] for k in marked])
-    marks = Block([str(abs(k)) for k in marked], values, [*range(len(marked))])
+    marks = PhotoModelerBlock([str(abs(k)) for k in marked], values, [*range(len(marked))])
     renumber_smart(Path("export.txt"), objects, marks)
     return [[int(id) for id in block.id] for block in (objects, marks)]
 

@@ -14,11 +14,9 @@ Sigma = Annotated[
     float, typer.Option(min=0, help="standard deviation: degrees, metres, per second")
 ]
 
-FEWEST_DRAWS = 20
-
 
 @pushbroom.command(example="out/flight/scanner.toml --attitude-white 0.01")
-def accuracy(
+def accuracy(  # noqa: PLR0913 - the options of the command
     scanner: ScannerFile,
     truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,
     attitude_bias: Sigma = 0.0,
@@ -67,10 +65,10 @@ def accuracy(
     from jaxbundle.pushbroom.terrain import Terrain
 
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
-    if 0 < draws < FEWEST_DRAWS:
+    fewest = 20  # the RMS of n draws is uncertain by up to 1/√n, here 22 %
+    if 0 < draws < fewest:
         raise InputError(
-            f"--draws {draws}: too few for an RMS; at least {FEWEST_DRAWS}, 1000 are "
-            "accurate to 3 %"
+            f"--draws {draws}: too few for an RMS; at least {fewest}, 1000 are accurate to 3 %"
         )
     if map_ is not None:
         _check_map(map_, table)

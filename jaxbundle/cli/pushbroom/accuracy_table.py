@@ -88,5 +88,5 @@ def set_out(table: AccuracyTable) -> str:
     return "\n".join(text)
 
 
-def _degrees(angle):
+def _degrees(angle: float) -> float:
     return float(f"{np.degrees(angle):.6g}")

@@ -1,7 +1,7 @@
 """`jaxbundle pushbroom correct`: rectify an image to a map."""
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -10,9 +10,13 @@ from jaxbundle.cli.app import Quiet, choice
 from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
+if TYPE_CHECKING:
+    from jaxbundle.io.scanner.scanner import ScannerInput
+    from jaxbundle.pushbroom.image import PushbroomImage
+
 
 @pushbroom.command(example="out/flight/scanner.toml out/flight/image.tif --out out/map.tif")
-def correct(
+def correct(  # noqa: PLR0913 - the options of the command
     scanner: ScannerFile,
     image: Annotated[Path, typer.Argument(help="the image: a raster of all lines and pixels")],
     out: Annotated[Path, typer.Option(help="GeoTIFF to write")],
@@ -57,6 +61,7 @@ def correct(
         _check_target("--error-map", error_map, image)
         if error_map.absolute() == out.absolute():
             raise InputError(f"--error-map {error_map} is also --out; give another name")
+    # an ellipsoid hides nothing of itself where an image looks down
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_scanner(scanner)
@@ -111,7 +116,7 @@ def _check_target(option: str, path: Path, image: Path) -> None:
         raise InputError(f"{option} {path} is the image itself; give another name")
 
 
-def _truth(path: Path, file):
+def _truth(path: Path, file: "ScannerInput") -> "PushbroomImage":
     """The true image, which must match the scanner file."""
     from jaxbundle.cli.pushbroom.shared import open_scanner
 

@@ -8,7 +8,7 @@ import typer
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-BEYOND_GAP = "found beyond a place without height"
+GAP_REASON = "found beyond a place without height"
 
 
 @pushbroom.command(example="out/flight/scanner.toml --grid 3x3 --csv out/points.csv")
@@ -76,6 +76,6 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    reasons = [OFF_IMAGE, reason, BEYOND_GAP]
+    reasons = [OFF_IMAGE, reason, GAP_REASON]
     columns["status"] = np.select([off, missed, over], reasons, "found").tolist()
     write_rows(columns, csv, json, {"scanner": file.name})

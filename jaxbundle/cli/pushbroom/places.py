@@ -1,5 +1,6 @@
 """Positions in a line scanner image: from a table, or a grid over it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ OUTPUT_COLUMNS = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count
 """Further columns written by `locate` and `project`: their tables are accepted as input."""
 
 
-def places(image: PushbroomImage, points: Path | None, grid: str):
+def places(
+    image: PushbroomImage, points: Path | None, grid: str
+) -> tuple[Sequence[str], np.ndarray, np.ndarray, Source]:
     """Ids, lines, pixels and their source: a table, or a grid over the image.
 
     **Raises:** `InputError`.

@@ -8,9 +8,6 @@ import typer
 from jaxbundle.cli.pushbroom.app import Csv, Json, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-MOST_LINES = 4
-"""Largest number of lines reported for one point."""
-
 
 @pushbroom.command(example="out/flight/scanner.toml --points out/points.csv")
 def project(
@@ -33,7 +30,9 @@ def project(
     file = open_scanner(scanner)
     table = with_points(read_csv(points))
     X = points_of(table, file.earth)
-    found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST_LINES)
+    # where lines overlap, as of a platform that sways, several see one point
+    most = 4
+    found = project_points(file.image, make_search(file.image, file.earth), X, most=most)
     line, pixel = np.asarray(found.line), np.asarray(found.pixel)
     status, count = np.asarray(found.status), np.asarray(found.count)
     if (status != Status.SEEN).all():
@@ -48,7 +47,7 @@ def project(
             f"{table.source(first)}: not in the image but {Status(int(status[first])).meaning} "
             f"({len(unseen)} of {len(status)} points)"
         )
-    first = (np.arange(MOST_LINES) == 0)[:, None]
+    first = (np.arange(most) == 0)[:, None]
     solution, point = np.nonzero(~np.isnan(line) | (first & (count == 0)))
     order = np.lexsort((solution, point))
     solution, point = solution[order], point[order]

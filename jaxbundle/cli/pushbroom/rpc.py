@@ -13,8 +13,6 @@ from jaxbundle.errors import InputError, NotSolvedError
 rpc = Application(help="Rational polynomial coefficients (RPC00B).")
 pushbroom.add_typer(rpc, name="rpc")
 
-LARGEST_RESIDUAL = 0.5
-"""A fit with larger residuals, in pixels, is reported."""
 GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
@@ -70,7 +68,7 @@ def fit(
         )
     write_rpc(out, found.rpc)
     largest = max(found.check.largest.max(), *(v for k, v in head.items() if "largest" in k), 0.0)
-    if largest > LARGEST_RESIDUAL:
+    if largest > 0.5:  # pixel: places may then fall into the neighbouring one
         warn(
             f"{source}: residuals up to {largest:.3g} pixel: the coefficients do not follow "
             "jitter faster than a cubic over the image; cut it into shorter pieces, or use the "
@@ -165,6 +163,7 @@ def compensate(
     )
     changed, left = apply_bias(given, found.bias)
     write_rpc(out, changed)
+    # the same terms in lines and in samples
     k = len(found.cofactor) // 2
     names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
     values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]

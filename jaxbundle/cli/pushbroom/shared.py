@@ -16,7 +16,7 @@ from jaxbundle.io.rasters.geoid import add_geoid
 from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.fingerprints import files_read
 from jaxbundle.network.columns import Columns
@@ -61,7 +61,7 @@ def surface_of(
     return Height(level=height, earth=earth)
 
 
-def open_scanner(path: Path) -> Scanner:
+def open_scanner(path: Path) -> ScannerInput:
     """A scanner file; its warnings go to standard error."""
     file = read_scanner(path)
     for warning in file.warnings:
@@ -111,7 +111,10 @@ def write_rows(
     columns: Mapping[str, Column], csv: Path | None, json_: str, head: Mapping | None = None
 ) -> None:
     """A table as CSV or JSON, in a file or on standard output."""
-    columns = {name: _plain(values) for name, values in columns.items()}
+    columns = {
+        name: values.tolist() if isinstance(values, np.ndarray) else list(values)
+        for name, values in columns.items()
+    }
     rows = list(zip(*columns.values()))
     if json_:
         rows = [dict(zip(columns, row)) for row in rows]
@@ -120,6 +123,7 @@ def write_rows(
             write_json(text)
         else:
             write_text(Path(json_), text)
+    # NaN, which is not equal to itself, is an empty cell
     rows = [["" if v != v else v for v in row] for row in zip(*columns.values())]
     if csv is not None and str(csv) != "-":
         write_csv(csv, list(columns), rows)
@@ -127,10 +131,6 @@ def write_rows(
         print(",".join(columns))
         for row in rows:
             print(",".join(map(str, row)))
-
-
-def _plain(values):
-    return values.tolist() if isinstance(values, np.ndarray) else list(values)
 
 
 def warn(message: str) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count, list_some
@@ -39,19 +39,28 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     **Raises:** `InputError` naming file, line and photograph.
     """
     path, number = Path(path), len(require_board(board).ids)
-    at, views, reduced = None, {}, {}
-    for row in Rows(path):
+    legend, views, reduced = None, {}, {}
+    for row in TextRows(path):
+        # vnlog: the first line of one # is the legend, those of ## and #! are comments
         if row.text.startswith("#"):
-            at = _legend(row) if at is None and not row.text.startswith(("##", "#!")) else at
+            if legend is None and not row.text.startswith(("##", "#!")):
+                legend = row.text.lstrip("#").split()
+                if not {*COLUMNS} <= {*legend}:
+                    raise row.error(
+                        f"columns {' '.join(legend)}; {', '.join(COLUMNS)} are expected"
+                    )
             continue
-        if at is None:
+        if legend is None:
             raise row.error("a line '# filename x y …' is expected before the first point")
-        if len(row) != len(at):
-            raise row.error(f"{len(row)} values where {len(at)} are expected ({', '.join(at)})")
-        given = dict(zip(at, row.words))
-        views.setdefault(given["filename"], []).append(_point(row, given))
-        if given.get("level", "0").isdigit() and int(given.get("level", "0")) > 0:
-            reduced[given["filename"]] = None
+        if len(row) != len(legend):
+            raise row.error(
+                f"{len(row)} values where {len(legend)} are expected ({', '.join(legend)})"
+            )
+        cells = dict(zip(legend, row.words))
+        views.setdefault(cells["filename"], []).append(_point(row, cells))
+        if cells.get("level", "0").isdigit() and int(cells.get("level", "0")) > 0:
+            reduced[cells["filename"]] = None
+    # One row of "-" stands for a whole photograph, unless the board itself has one point.
     failed = [
         name
         for name, points in views.items()
@@ -66,40 +75,31 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     names = [name for name in views if name not in failed]
     xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
     w, h = (int(n) for n in image_size)
-    told = (
-        [
+    warnings = ()
+    if reduced:
+        warnings = (
             f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
-            f"less precise: {list_some(reduced)}"
-        ]
-        if reduced
-        else []
-    )
+            f"less precise: {list_some(reduced)}",
+        )
     return BoardViews(
         board,
         tuple(names),
         (w, h),
         xy,
         tuple((name, "no board found") for name in failed),
-        tuple(told),
+        warnings,
     )
 
 
-def _legend(row: Row) -> list[str]:
-    names = row.text.lstrip("#").split()
-    if not {*COLUMNS} <= {*names}:
-        raise row.error(f"columns {' '.join(names)}; {', '.join(COLUMNS)} are expected")
-    return names
-
-
-def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
+def _point(row: TextRow, cells: dict[str, str]) -> tuple[float, float]:
     """A point; NaN if it was not found, or is ignored."""
-    if NO_COORDINATE in (given["x"], given["y"]):
+    if NO_COORDINATE in (cells["x"], cells["y"]):
         return np.nan, np.nan
-    own = Row(row.path, row.number, f"{given['x']} {given['y']}")
-    x, y = own.numbers(("x", "y"))
+    # the columns may stand in any order and apart: as a row of their own they get its messages
+    x, y = TextRow(row.path, row.number, f"{cells['x']} {cells['y']}").numbers(("x", "y"))
     for name in QUALITY:
-        if given.get(name, NO_COORDINATE) != NO_COORDINATE:
-            (value,) = Row(row.path, row.number, given[name]).numbers((name,))
+        if cells.get(name, NO_COORDINATE) != NO_COORDINATE:
+            (value,) = TextRow(row.path, row.number, cells[name]).numbers((name,))
             if value < 0 or (name == "weight" and value == 0):
                 return np.nan, np.nan
     return float(x), float(y)
@@ -116,6 +116,7 @@ def write_corners(views: BoardViews, path: str | Path) -> None:
             raise InputError(f"{path}: photograph {name!r}: a name cannot have blanks, nor begin #")
     lines = [f"# {' '.join(COLUMNS)} level"]
     for name, points in zip(views.names, views.xy.tolist()):
+        # x != x: NaN, a point that was not found
         lines += [f"{name} - - -" if x != x else f"{name} {x!r} {y!r} 0" for x, y in points]
     lines += [f"{name} - - -" for name in failed]
     write_text(Path(path), "\n".join(lines) + "\n")

@@ -22,6 +22,7 @@ from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import Look
 from jaxbundle.system.file_content import read_content
 
+SqlValue = str | int | bytes | None
 TABLES = """
 CREATE TABLE IF NOT EXISTS photographs
     (path TEXT PRIMARY KEY, size INTEGER, changed INTEGER, content TEXT);
@@ -31,12 +32,13 @@ CREATE TABLE IF NOT EXISTS boards
 """
 
 
-MEASUREMENT = 2
-"""Number of the method of measurement: corners by an earlier one are searched again."""
+MEASUREMENT_VERSION = 2
+"""Number of the method of measurement, part of the keys in the file: corners by an earlier one are
+searched again. Raise it when `measure` finds other coordinates in the same photograph."""
 
 
 def _key(board: Board) -> str:
-    return f"{board!r}, measurement {MEASUREMENT}"
+    return f"{board!r}, measurement {MEASUREMENT_VERSION}"
 
 
 class KeptCorners:
@@ -48,6 +50,7 @@ class KeptCorners:
     def __init__(self, path: str | Path):
         self.path = path
         try:
+            # autocommit: a search result is on the disk before the next photograph is opened
             self._file = sqlite3.connect(path, isolation_level=None)
             self._file.executescript(TABLES)
         except sqlite3.Error as error:
@@ -56,7 +59,7 @@ class KeptCorners:
     def __enter__(self) -> "KeptCorners":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def content(self, photograph: Path) -> str:
@@ -65,9 +68,11 @@ class KeptCorners:
             state = os.stat(photograph)
         except OSError:
             return ""
+        # a name of bytes that are not UTF-8 has no text that SQLite would take
         path = os.fsencode(os.path.abspath(photograph)).decode(errors="backslashreplace")
         now = state.st_size, state.st_mtime_ns
         known = self._first("SELECT size, changed, content FROM photographs WHERE path = ?", path)
+        # reading thousands of photographs again would take minutes
         if known is not None and known[:2] == now:
             return known[2]
         try:
@@ -80,22 +85,26 @@ class KeptCorners:
 
     def look(self, content: str, board: Board) -> Look | None:
         """The search result of a board in a photograph of this content; None: not searched."""
-        found = self._first(
+        result = self._first(
             "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
             content,
             _key(board),
         )
-        if found is None:
+        if result is None:
             return None
-        columns, rows, xy, why = found
+        columns, rows, xy, why = result
         if xy is None:
             return why
         return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)
 
     def keep(self, content: str, board: Board, look: Look) -> None:
         """Add a search result; it is in the file when this returns."""
-        (columns, rows), xy = ((None, None), None) if isinstance(look, str) else look
-        points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
+        columns, rows, points, why = None, None, None, None
+        if isinstance(look, str):
+            why = look
+        else:
+            (columns, rows), xy = look
+            points = np.ascontiguousarray(xy, "<f8").tobytes()
         self._write(
             "INSERT OR REPLACE INTO boards VALUES (?, ?, ?, ?, ?, ?)",
             content,
@@ -103,18 +112,18 @@ class KeptCorners:
             columns,
             rows,
             points,
-            look if xy is None else None,
+            why,
         )
 
-    def _first(self, question: str, *given) -> tuple | None:
+    def _first(self, question: str, *values: SqlValue) -> tuple | None:
         try:
-            return self._file.execute(question, given).fetchone()
+            return self._file.execute(question, values).fetchone()
         except sqlite3.Error as error:
             raise self._error(error) from None
 
-    def _write(self, order: str, *given) -> None:
+    def _write(self, order: str, *values: SqlValue) -> None:
         try:
-            self._file.execute(order, given)
+            self._file.execute(order, values)
         except sqlite3.Error as error:
             raise self._error(error) from None
 

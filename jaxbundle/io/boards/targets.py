@@ -44,6 +44,7 @@ def read_target(path: str | Path) -> Board:
         if asymmetric not in CIRCLES:
             raise InputError(f"{path}: asymmetricGrid is {show(asymmetric)}; True or False")
         return Board(columns, rows, fields.number("spacingMeters"), CIRCLES[asymmetric])
+    # Kalibr allows oblong fields; a Board has one spacing
     across, along = fields.number("rowSpacingMeters"), fields.number("colSpacingMeters")
     if across != along:
         raise InputError(
@@ -62,7 +63,7 @@ def write_target(board: Board, path: str | Path) -> None:
         raise InputError(f"{path}: Kalibr has no board of kind charuco")
     if board.kind == "aprilgrid" and board.marker:
         lines = [f"tagCols: {board.columns}", f"tagRows: {board.rows}"]
-        gap = board.square / board.marker - 1
+        gap = board.square / board.marker - 1  # tagSpacing is relative to tagSize
         lines += [f"tagSize: {board.marker!r}", f"tagSpacing: {gap!r}"]
         write_text(Path(path), "\n".join(["target_type: 'aprilgrid'", *lines]) + "\n")
         return

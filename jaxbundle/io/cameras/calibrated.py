@@ -1,6 +1,8 @@
 """Cameras with the covariance of their parameters, from the JSON of `adjust` and `calibrate`."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -56,25 +58,31 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
         raise InputError(f"{path}: not the result of adjust or calibrate: {what}") from None
 
 
-def _calibrate(path, id, entry, about) -> Calibrated:
+def _calibrate(
+    path: str | Path, id: str, entry: Mapping[str, Any], settings: Mapping[str, Any]
+) -> Calibrated:
+    """The camera of an entry of `cameras`; `settings`: those of its calibration, in the JSON."""
     parameters = entry["parameters"]
     row = {"id": id, "model": entry["model"]} | {n: p["value"] for n, p in parameters.items()}
-    if about.get("image_size"):
-        row["image_size"] = about["image_size"]
+    if settings.get("image_size"):
+        row["image_size"] = settings["image_size"]
     (camera,) = make_cameras([row], f"{path}, ")
     free = [name for name, p in parameters.items() if p["free"]]
     sigma = np.array([float(parameters[name]["sigma"]) for name in free])
     known = entry["correlations"]
-    one = {name: _find_tied(name, parameters, known) for name in free}
-    R = np.array(
-        [[1.0 if one[a] == one[b] else float(known[one[a]][one[b]]) for b in free] for a in free]
-    ).reshape(len(free), len(free))
+    # The JSON has one row for a group of tied parameters: they are fully correlated, ρ = 1.
+    listed = {name: _find_tied(name, parameters, known) for name in free}
+    correlation = lambda a, b: 1.0 if a == b else float(known[a][b])
+    R = np.array([[correlation(listed[a], listed[b]) for b in free] for a in free])
+    R = R.reshape(len(free), len(free))  # without free parameters [0, 0]
     if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
         raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
-    return camera, (free, sigma[:, None] * R * sigma)
+    return camera, (free, sigma[:, None] * R * sigma)  # Q = diag(σ)·R·diag(σ)
 
 
-def _find_tied(name: str, parameters, known) -> str:
+def _find_tied(
+    name: str, parameters: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]
+) -> str:
     """The parameter with the correlations of this one: itself, or the first of tied ones, such as
     fx and fy, with the same value and σ."""
     if name in known:

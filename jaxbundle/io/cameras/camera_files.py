@@ -38,6 +38,7 @@ def is_camera_file(path: Path) -> bool:
     """Whether a file holds only cameras."""
     if path.name.lower() in COLMAP_FILES and path.is_file():
         return True
+    # a project and a column map are TOML with cameras too, but hold a network
     if _is_toml(path):
         return not is_column_map(path) and "project" not in read_toml(path)
     return is_opencv(path) or is_opensfm_cameras(path) or is_autocal(path)

@@ -12,16 +12,21 @@ Source: Kalibr's wiki, "Multiple camera calibration"; its results.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.kalibr import MODELS
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.rows import Row
+from jaxbundle.io.text.rows import TextRow
 from jaxbundle.network.build import make_cameras
 from jaxbundle.system.file_content import beginning
+
+if TYPE_CHECKING:
+    from jaxbundle.io.cameras.calibrated import Calibrated
 
 HEAD = b"Camera-system parameters"
 CAMERA = re.compile(r"^\s*(cam\d+)\s*\(.*\):\s*$", re.M)
@@ -35,21 +40,21 @@ def is_kalibr_results(path: Path) -> bool:
     return path.suffix.lower() == ".txt" and HEAD in beginning(path, 10_000)
 
 
-def read_kalibr_results(path: str | Path) -> list:
+def read_kalibr_results(path: str | Path) -> list["Calibrated"]:
     """The cameras of a file: each with the names of its parameters and their covariance.
 
     **Raises:** `InputError` naming file and camera.
     """
     path = Path(path)
     text = read_text(path)
-    found = list(CAMERA.finditer(text))
-    ends = [one.start() for one in found[1:]] + [len(text)]
-    if not found:
+    heads = list(CAMERA.finditer(text))
+    ends = [head.start() for head in heads[1:]] + [len(text)]
+    if not heads:
         raise InputError(f"{path}: there is no camera cam0 in it")
-    return [_camera(path, one[1], text[one.end() : end]) for one, end in zip(found, ends)]
+    return [_camera(path, head[1], text[head.end() : end]) for head, end in zip(heads, ends)]
 
 
-def _camera(path: Path, id: str, text: str):
+def _camera(path: Path, id: str, text: str) -> "Calibrated":
     where = f"{path}, {id}"
     line = re.search(r"type:.*?(\w+)'?>", text)
     if line is None:
@@ -57,7 +62,7 @@ def _camera(path: Path, id: str, text: str):
     name = line[1]
     kind = (
         next((k for word, k in CAMERAS.items() if word in name), name),
-        next(k for word, k in DISTORTIONS.items() if word in name),
+        next(k for word, k in DISTORTIONS.items() if word in name),  # "" is in every name
     )
     if kind not in MODELS:
         raise InputError(f"{where}: cameras of type {name} are not known here")
@@ -70,7 +75,9 @@ def _camera(path: Path, id: str, text: str):
     return camera, (list(sigma), np.diag(np.square([*sigma.values()])))
 
 
-def _values(where: str, what: str, text: str, names) -> tuple[dict, dict]:
+def _values(
+    where: str, what: str, text: str, names: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float]]:
     """Values and σ of a line."""
     found = re.search(VALUES.format(what), text)
     if found is None:
@@ -80,7 +87,7 @@ def _values(where: str, what: str, text: str, names) -> tuple[dict, dict]:
         words = part.replace(",", " ").split()
         if len(words) != len(names):
             raise InputError(f"{where}: {what} has {len(words)} numbers; {len(names)} are expected")
-        row = Row(Path(where), 0, " ".join(words))
+        row = TextRow(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))
         except InputError:

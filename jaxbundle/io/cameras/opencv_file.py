@@ -35,19 +35,22 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import project
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.losses import check_others_zero, size_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.network.columns import show
 from jaxbundle.network.rules import check_camera
@@ -58,17 +61,19 @@ YAML = (".yaml", ".yml")
 SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
-OF_A_MESSAGE = b"distortion_model"
+MESSAGE_KEY = b"distortion_model"
 """Required in addition to a lone `k` in a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-LENGTHS = (4, 5, 8, 12)
+COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
+"""Lengths of a vector of distortion coefficients that OpenCV accepts (`calibrateCamera`); the last
+two of 14 are the tilt."""
 FISHEYE = ("equidistant", "fisheye")
 
 
 def is_opencv(path: Path) -> bool:
     """Whether a file has a name of this kind and mentions a camera matrix."""
     text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    names = MATRIX if OF_A_MESSAGE in text else MATRIX[:-1]
+    names = MATRIX if MESSAGE_KEY in text else MATRIX[:-1]
     return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in names)
 
 
@@ -76,7 +81,12 @@ def read_entries(path: Path) -> dict[str, Any]:
     """The entries of a YAML or JSON file."""
     text = read_text(path)
     is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
-    return _from_json(path, text) if is_json else parse_yaml(path, text, lenient=True)
+    if not is_json:
+        return parse_yaml(path, text, lenient=True)
+    document = parse_json(path, text)
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: an object with camera_matrix is expected")
+    return document
 
 
 def matrix_in(
@@ -107,7 +117,8 @@ def read_opencv(
     coefficients = _coefficients(path, entries)
     coefficients, tilt = coefficients[: len(ORDER)], coefficients[len(ORDER) :]
     parameters = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-    fisheye = entries.get("distortion_model") in FISHEYE or _is_one(entries.get("fisheye_model"))
+    flag = entries.get("fisheye_model")
+    fisheye = entries.get("distortion_model") in FISHEYE or (_is_number(flag) and flag == 1)
     if fisheye:
         if any(coefficients[4:]) or any(tilt):
             raise InputError(
@@ -147,11 +158,12 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
     return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
 
 
-def _image(name: str, p: Mapping, X, Y, Z):
+def _image(name: str, p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """Pixels of a ray in a camera with a skew and a tilted sensor."""
     model, own = get_model(name), p["camera"]
-    one = own | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
-    xy = project(model, tuple(one[key] for key in model.parameters), X, -Y, -Z)
+    # The homography acts on [x'', y''] before fx, fy, cx, cy do: the model is asked without them.
+    plain = own | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    xy = project(model, tuple(plain[key] for key in model.parameters), X, -Y, -Z)
     x, y, s = p["H"] @ jnp.stack([*xy, 1.0])
     u = own["fx"] * x / s + p["skew"] * y / s + own["cx"]
     return jnp.stack([u, own["fy"] * y / s + own["cy"]])
@@ -160,7 +172,8 @@ def _image(name: str, p: Mapping, X, Y, Z):
 FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt")}
 
 
-def _tilt(tx: float, ty: float) -> np.ndarray:
+def _tilt(tx: float, ty: float) -> Float[np.ndarray, "3 3"]:
+    """The homography of a tilted sensor (the module's docstring)."""
     cx, sx, cy, sy = np.cos(tx), np.sin(tx), np.cos(ty), np.sin(ty)
     about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     R = about_y @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
@@ -195,7 +208,7 @@ def opencv_entries(camera: Camera) -> dict[str, Any]:
     K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
     values = [p[name] for name in (("k1", "k2", "k3", "k4") if fisheye else ORDER)]
     if not fisheye:
-        values = values[: next(n for n in LENGTHS if not any(values[n:]))]
+        values = values[: next(n for n in COEFFICIENT_COUNTS if not any(values[n:]))]
     entries: dict[str, Any] = {}
     if camera.image_size is not None:
         entries |= dict(zip(("image_width", "image_height"), camera.image_size))
@@ -224,6 +237,7 @@ def ros_text(
     fisheye = camera.model == "kannala-brandt"
     names = ("k1", "k2", "k3", "k4") if fisheye else ORDER[:8]
     p, (w, h) = check_others_zero(camera, "ROS", names), size_of(camera, "ROS")
+    # plumb_bob, with five coefficients, is the usual one: if they suffice
     rational = any(p[name] for name in names[5:])
     kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
     values = [p[name] for name in (names if fisheye or rational else names[:5])]
@@ -256,13 +270,12 @@ def _as_yaml(entries: Mapping, ros: bool = False) -> str:
     for key, value in entries.items():
         if isinstance(value, tuple):
             rows, columns, data = value
-            numbers = ", ".join(map(repr, map(float, data)))
             lines += [
                 f"{key}:{tag}",
                 f"   rows: {rows}",
                 f"   cols: {columns}",
                 *dt,
-                f"   data: [ {numbers} ]",
+                f"   data: [ {join_numbers(data, ', ')} ]",
             ]
         else:
             lines.append(f"{key}: {json.dumps(value)}")
@@ -285,22 +298,18 @@ def _as_json(entries: Mapping) -> str:
     return json.dumps(document, indent=4) + "\n"
 
 
-def _from_json(path: Path, text: str) -> dict[str, Any]:
-    document = parse_json(path, text)
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: an object with camera_matrix is expected")
-    return document
-
-
-def _matrix(path: Path, entries: Mapping, names, shape):
+def _matrix(
+    path: Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int] | None
+) -> tuple[str, Float[np.ndarray, "..."]]:
+    """The first name there is, and its numbers in the shape; without one as they stand."""
     name = next((name for name in names if name in entries), None)
     if name is None:
         raise InputError(f"{path}: {names[0]} is missing")
     value = entries[name]
     if isinstance(value, Mapping):
-        given = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
+        stated = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
-        whole = [n for n in given if n is not None]
+        whole = [n for n in stated if n is not None]
         if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
             size = len(data) if isinstance(data, list) else "no"
             raise InputError(
@@ -308,12 +317,12 @@ def _matrix(path: Path, entries: Mapping, names, shape):
                 f"{show(value.get('cols'))} columns"
             )
     else:
-        data, given = value, None
+        data, stated = value, None
         if isinstance(value, list) and all(isinstance(row, list) for row in value):
             data = [x for row in value for x in row]
     if not isinstance(data, list) or not all(_is_number(x) for x in data):
         raise InputError(f"{path}: {name}: a list of finite numbers is expected")
-    if shape is not None and (given not in (None, shape) or len(data) != shape[0] * shape[1]):
+    if shape is not None and (stated not in (None, shape) or len(data) != shape[0] * shape[1]):
         raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
     array = np.array(data, float)
     return name, array if shape is None else array.reshape(shape)
@@ -324,40 +333,38 @@ def _coefficients(path: Path, entries: Mapping) -> list[float]:
         return [0.0] * 4
     name, values = _matrix(path, entries, COEFFICIENTS, None)
     values = values.tolist()
-    while values and len(values) not in (*LENGTHS, 14) and values[-1] == 0:
+    # Programs pad with zeros: [k1, k2, p1, p2, k3, 0] is a vector of five.
+    while values and len(values) not in COEFFICIENT_COUNTS and values[-1] == 0:
         values = values[:-1]
     values = values or [0.0] * 4
-    if len(values) not in (*LENGTHS, 14):
+    if len(values) not in COEFFICIENT_COUNTS:
         raise InputError(f"{path}: {name} has {len(values)} values; 4, 5, 8, 12 or 14 are known")
     return values
 
 
 def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
-    given = [entries.get(f"image_{n}", entries.get(n)) for n in ("width", "height")]
-    if given == [None, None]:
+    sides = [entries.get(f"image_{n}", entries.get(n)) for n in ("width", "height")]
+    if sides == [None, None]:
         size = entries.get("image_size", entries.get("image_Size"))
         if size is None:
             return None
-        given = size if isinstance(size, list) and len(size) == 2 else [None, None]
-    width, height = (_whole(x) for x in given)
+        sides = size if isinstance(size, list) and len(size) == 2 else [None, None]
+    width, height = (_whole(x) for x in sides)
     if width is None or height is None:
-        raise InputError(f"{path}: the image size is {show(given)}; two whole numbers expected")
+        raise InputError(f"{path}: the image size is {show(sides)}; two whole numbers expected")
     return width, height
 
 
-def _whole(value) -> int | None:
-    good = _is_number(value) and float(value).is_integer() and 0 < value < 1e9
-    return int(value) if good else None
+def _whole(value: object) -> int | None:
+    if not _is_number(value) or not float(value).is_integer() or not 0 < value < 1e9:
+        return None
+    return int(value)
 
 
-def _is_number(value) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:
         return bool(np.isfinite(float(value)))
-    except OverflowError:
+    except OverflowError:  # a whole number of more than 308 digits
         return False
-
-
-def _is_one(value) -> bool:
-    return _is_number(value) and value == 1

@@ -7,6 +7,7 @@ command line applied.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,11 +30,16 @@ from jaxbundle.network.tables import (
     Source,
 )
 
+PIXEL_CENTRE = 0.5
+"""Coordinates of the centre of the first pixel in programs that count from its corner (COLMAP,
+nerfstudio, Metashape, PhotoModeler); here they are 0 (docs/conventions.md)."""
 RIG, MOMENT = "rig", "0"
 """The rig of a file of calibrated cameras, and its only epoch."""
 
 
-def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
+def foreign_document(
+    name: str, cameras: Iterable[Mapping], **project: str | Sequence[str]
+) -> Document:
     """The project document of a network of another program: measured in pixels, free."""
     settings = {
         "name": name,
@@ -65,6 +71,7 @@ def assemble(
     document = apply_overrides(document, overrides, keys)
     project = dict(document["project"])
     check_settings(project, f"{path}: ")
+    # the tables are in radians; the unit is one of the output
     angle_unit = project.pop("angle_unit", "rad")
     cameras = make_cameras(document["camera"], f"{path}, ")
     if points is not None and len(points) and observations is not None and len(observations):
@@ -80,8 +87,9 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     index = {camera.id: c for c, camera in enumerate(cameras)}
     exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
     none = np.zeros(0, np.int64)
-    of_points = ("sigma_image", "sigma_origin", "datum_points")
-    settings = {k: v for k, v in project.items() if k not in of_points}
+    # these settings concern observations and points, of which there are none
+    unused = ("sigma_image", "sigma_origin", "datum_points")
+    settings = {k: v for k, v in project.items() if k not in unused}
     return Network(
         cameras=tuple(cameras),
         images=Images(
@@ -158,7 +166,7 @@ def image_columns(
     return Columns(columns, source)
 
 
-def entry_of(camera: Camera) -> dict:
+def entry_of(camera: Camera) -> dict[str, Any]:
     """A camera as an entry of a document."""
     sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
     tie = {"tie": camera.tie} if camera.tie else {}

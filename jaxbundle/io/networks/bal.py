@@ -18,15 +18,17 @@ import bz2
 import gzip
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
-from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.assemble import all_parameters, foreign_document
 from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import (
     angles_of,
@@ -42,10 +44,6 @@ from jaxbundle.network.columns import Columns, show
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
-FIRST_LINE, MOST_DIGITS = 200, 18
-"""Characters of the first line, and of a count in it."""
-NUMBER = 64
-"""Characters a number has at most, the blanks around it included."""
 UNREADABLE = (OSError, EOFError, zlib.error)
 MODEL = get_model("snavely")
 
@@ -56,10 +54,9 @@ def is_bal(path: Path) -> bool:
         return False
     try:
         with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
-            words = file.readline(FIRST_LINE).split()
+            return _are_counts(_first_words(file))
     except UNREADABLE:
         return False
-    return _are_counts(words)
 
 
 def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -70,8 +67,8 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     (cameras, points, rows), numbers = _numbers(path)
     observed, numbers = np.split(numbers, [4 * rows])
-    given, position = np.split(numbers, [9 * cameras])
-    observed, given = observed.reshape(-1, 4), given.reshape(-1, 9)
+    poses, position = np.split(numbers, [9 * cameras])
+    observed, poses = observed.reshape(-1, 4), poses.reshape(-1, 9)
     for column, count, what in ((0, cameras, "camera"), (1, points, "point")):
         index = observed[:, column]
         wrong = (index < 0) | (index >= count) | (index % 1 != 0)
@@ -81,31 +78,23 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
                 f"{path}, line {row + 2}: {what} {index[row]:g} does not exist; the first line "
                 f"announces {count}, counted from 0"
             )
-    document = {
-        "project": {
-            "name": path.name.split(".")[0],
-            "datum": "inner",
-            "image_unit": "px",
-            "residuals": "measured",
-            "object_unit": "model",
-        },
-        "camera": [
-            {
-                "id": str(c),
-                "model": MODEL.name,
-                "free": list(MODEL.parameters),
-                **dict(zip(MODEL.parameters, map(float, row))),
-            }
-            for c, row in enumerate(given[:, 6:])
-        ],
-    }
+    camera_entries = [
+        {
+            "id": str(c),
+            "model": MODEL.name,
+            "free": list(MODEL.parameters),
+            **dict(zip(MODEL.parameters, map(float, row))),
+        }
+        for c, row in enumerate(poses[:, 6:])
+    ]
+    document = foreign_document(path.name.split(".")[0], camera_entries)
     document = apply_overrides(document, overrides)
     project = document["project"]
     check_settings(project, f"{path}: ")
     angle_unit = project.pop("angle_unit", "rad")
     return make_network(
         make_cameras(document["camera"], f"{path}, "),
-        _table(path, "camera", _images(given[:, :6])),
+        _table(path, "camera", _images(poses[:, :6])),
         _table(
             path,
             "point",
@@ -139,8 +128,8 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
     images, points, rays = network.images, network.points, network.observations
     need_values(network, "snavely", "BAL")
     R, t = bundler_pose(matrices_of(images.angles), images.position)
-    given = np.array([[*all_parameters(c).values()] for c in network.cameras])[images.camera]
-    cameras = np.concatenate([rotation_vectors_of(R), t, given], 1)
+    interior = np.array([[*all_parameters(c).values()] for c in network.cameras])[images.camera]
+    cameras = np.concatenate([rotation_vectors_of(R), t, interior], 1)
     lines = [f"{len(images)} {len(points)} {len(rays)}"]
     lines += [
         f"{image} {point} {x!r} {y!r}"
@@ -150,11 +139,17 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
     text = ("\n".join(lines) + "\n").encode()
     match path.suffix.lower():
         case ".gz":
-            text = gzip.compress(text, mtime=0)
+            text = gzip.compress(text, mtime=0)  # the same network, the same bytes
         case ".bz2":
             text = bz2.compress(text)
     write_bytes(path, text)
     return describe_losses(network, shared_cameras=True, names=True)
+
+
+def _first_words(file: BinaryIO) -> list[bytes]:
+    """The words of the first line: three counts fit in 200 characters, and a file of another kind
+    without line feeds is not read whole."""
+    return file.readline(200).split()
 
 
 def _are_counts(words: Sequence[bytes]) -> bool:
@@ -168,7 +163,8 @@ def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
         )
-    if max(map(len, first)) > MOST_DIGITS:
+    # the largest size of a file is 2⁶³ − 1 bytes, a number of 19 digits
+    if max(map(len, first)) > 18:
         raise InputError(
             f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
             "than a file can hold"
@@ -176,7 +172,7 @@ def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
     return tuple(map(int, first))
 
 
-def _numbers(path: Path):
+def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
     """The three counts of the first line, and all numbers after it.
 
     No more is read than these require, however much a compressed file unpacks to.
@@ -184,15 +180,17 @@ def _numbers(path: Path):
     suffix = path.suffix.lower()
     try:
         with OPENERS.get(suffix, open)(path, "rb") as file:
-            counts = _counts(path, file.readline(FIRST_LINE).split())
+            counts = _counts(path, _first_words(file))
             cameras, points, rows = counts
             expected = 4 * rows + 9 * cameras + 3 * points
             size = path.stat().st_size
             held = largest_unpacked_size(size) if suffix in OPENERS else size
-            most = min(NUMBER * (expected + 1), held)
+            # A number of 64 bits has 24 characters at most; 64 leave room for blanks around it.
+            most = min(64 * (expected + 1), held)
             text = file.read(most + 1)
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
+    # a file that goes on is read no further
     if len(text) > most:
         raise InputError(
             f"{path}: holds more than {most} characters, too many for the {expected} numbers that "
@@ -201,6 +199,7 @@ def _numbers(path: Path):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # about text that is not a number
+            # without a list of words, which would take several times the memory of the numbers
             numbers = np.fromstring(text, sep=" ")
     except (ValueError, DeprecationWarning):
         raise _not_a_number(path, text) from None
@@ -219,6 +218,7 @@ def _numbers(path: Path):
 def _not_a_number(path: Path, text: bytes) -> InputError:
     for line, row in enumerate(text.splitlines(), 2):
         for word in row.split():
+            # float() reads 1_0 as ten, NumPy does not
             try:
                 good = np.isfinite(float(word)) and b"_" not in word
             except ValueError:
@@ -229,7 +229,7 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
     return InputError(f"{path}: there is something other than numbers")
 
 
-def _images(pose) -> dict:
+def _images(pose: Float[np.ndarray, "images 6"]) -> dict[str, np.ndarray]:
     """Exterior orientation of the images from rotation vectors and shifts."""
     M, centre = exterior_from_bundler(matrices_of_rotation_vectors(pose[:, :3]), pose[:, 3:])
     columns = np.concatenate([centre, angles_of(M)], 1).T
@@ -237,7 +237,7 @@ def _images(pose) -> dict:
     return {"id": ids, "camera": ids, **dict(zip(EXTERIOR, columns))}
 
 
-def _table(path: Path, word: str, columns: dict) -> Columns:
+def _table(path: Path, word: str, columns: Mapping[str, np.ndarray]) -> Columns:
     """A table with row numbers as ids, from 0."""
     first = next(iter(columns.values()))
     return Columns(columns, Source(str(path), np.arange(len(first)), word))

@@ -27,22 +27,22 @@ Sources: Repanšek (2009), section 7.1.2 and appendices; the BINGO reader of an 
 for the orientation of images (Turek).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import assemble, foreign_document
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows
 from jaxbundle.network.columns import Columns, did_you_mean, list_some
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 IMAGE, GEO = "image.dat", "geoin.dat"
-END = "-99"
-ADJUSTED = 3
-SKIPPED = ("RADI", "ADPA")
-KNOWN = ("CAPA", "CONT", "CHCK", *SKIPPED)
+END_OF_PHOTOGRAPH = "-99"
+SKIPPED_STATEMENTS = ("RADI", "ADPA")
+STATEMENTS = ("CAPA", "CONT", "CHCK", *SKIPPED_STATEMENTS)
 INTERIOR = ("c", "x0", "y0")
 ROLES = {"CONT": "fixed", "CHCK": "check"}
 
@@ -67,16 +67,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             raise InputError(f"{folder}: there is no {name} in it")
     photos, rays = _image_coordinates(files[IMAGE])
     cameras, points, skipped = _geo_input(files[GEO])
-    chosen = []
-    for photo, camera, row in photos:
-        if camera is None and len(cameras) == 1:
-            camera = next(iter(cameras))
-        if camera not in cameras:
-            what = f"camera {camera!r}" if camera else "no camera is named, and there are several"
-            raise row.error(
-                f"photograph {photo}: {what}; CAPA statements in {files[GEO]}: {', '.join(cameras)}"
-            )
-        chosen.append(camera)
+    chosen = [_find_camera(*photo, cameras, files[GEO]) for photo in photos]
     none = np.full(len(photos), np.nan)
     lines = np.array([row.number for *_, row in photos])
     images = Columns(
@@ -85,6 +76,7 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
     ids = dict.fromkeys(rays.values["point"])
     known = {row["id"]: row for row in points}
+    # new points are only in image.dat: tie points, without start values
     tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
     table = [*(row for row in points if row["id"] in ids), *tie]
     network = assemble(
@@ -119,15 +111,29 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
 
 
-def _image_coordinates(path: Path):
+def _find_camera(
+    photo: str, camera: str | None, row: TextRow, cameras: Mapping[str, dict], file: Path
+) -> str:
+    """The camera that a photograph names, or the only one."""
+    if camera is None and len(cameras) == 1:
+        return next(iter(cameras))
+    if camera is None or camera not in cameras:
+        what = f"camera {camera!r}" if camera else "no camera is named, and there are several"
+        raise row.error(
+            f"photograph {photo}: {what}; CAPA statements in {file}: {', '.join(cameras)}"
+        )
+    return camera
+
+
+def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, TextRow]], Columns]:
     """Photographs (id, camera or None, line) and the table of image points."""
-    photos: list[tuple[str, str | None, Row]] = []
+    photos: list[tuple[str, str | None, TextRow]] = []
     images, points, values, lines = [], [], [], []
-    begun = False
-    for row in Rows(path, "#"):
+    begun = False  # −99 ends a photograph, after which a point has none
+    for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
-        if row.words[0] == END:
+        if row.words[0] == END_OF_PHOTOGRAPH:
             begun = False
         elif len(row) <= 2:
             photos.append((row.words[0], row.words[1] if len(row) == 2 else None, row))
@@ -148,15 +154,15 @@ def _image_coordinates(path: Path):
     return photos, Columns({"image": images, "point": points, "x": xy[:, 0], "y": xy[:, 1]}, source)
 
 
-def _geo_input(path: Path):
+def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]], list[str]]:
     """Cameras by name, rows of points, and the skipped statements."""
     cameras: dict[str, dict] = {}
     points, skipped = [], {}
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
         keyword = row.words[0].upper()
-        if keyword in SKIPPED:
+        if keyword in SKIPPED_STATEMENTS:
             skipped[keyword] = True
         elif keyword == "CAPA":
             camera = _camera(row)
@@ -178,22 +184,23 @@ def _geo_input(path: Path):
                 }
             )
         else:
+            hint = did_you_mean(keyword, STATEMENTS)
             raise row.error(
-                f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "
-                "remove it if the network does not need it"
+                f"the statement {row.words[0][:20]!r} is not known{hint}; remove it if the network "
+                "does not need it"
             )
     if not cameras:
         raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")
     return cameras, points, list(skipped)
 
 
-def _camera(row: Row) -> dict:
+def _camera(row: TextRow) -> dict[str, Any]:
     key = row.integer(1, "the key of CAPA")
     if len(row) not in (6, 9):
         raise row.error("CAPA key CAMERA c xH yH [σc σx σy] is expected")
     values = row.numbers(INTERIOR, 3, more=True).tolist()
     camera = {"id": row.words[2], "model": "bingo", **dict(zip(INTERIOR, values))}
-    if key == ADJUSTED:
+    if key == 3:  # all three are adjusted; other keys: none
         camera["free"] = list(INTERIOR)
         if len(row) == 9:
             sigma = row.numbers(("σc", "σx", "σy"), 6).tolist()
@@ -201,5 +208,5 @@ def _camera(row: Row) -> dict:
     return camera
 
 
-def _is_comment(row: Row) -> bool:
+def _is_comment(row: TextRow) -> bool:
     return row.words[0] in ("C", "*") or row.words[0].startswith("*")

@@ -21,14 +21,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.networks.losses import describe_losses, need_values
+from jaxbundle.io.networks.losses import GREY, are_numbered_from_0, describe_losses, need_values
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.text.rows import TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Source
@@ -52,7 +53,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    rows = Rows(path)
+    rows = TextRows(path)
     head = rows.take(f"{HEAD!r}")
     if " ".join(head.words) != HEAD:
         raise head.error(f"{HEAD!r} is expected; other versions are not known")
@@ -102,7 +103,14 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )
 
 
-def _cameras(rows: Rows, number: int):
+def _cameras(
+    rows: TextRows, number: int
+) -> tuple[
+    Float[np.ndarray, "cameras 3"],
+    Float[np.ndarray, "cameras 3 3"],
+    Float[np.ndarray, "cameras 3"],
+    Int[np.ndarray, " cameras"],
+]:
     """f, k1, k2; R; t; and lines, of all cameras."""
     interior, R, t, lines = [], [], [], []
     for k in range(number):
@@ -113,7 +121,7 @@ def _cameras(rows: Rows, number: int):
         matrix = [rows.take(f"R of {thing}").numbers(["R"] * 3) for _ in range(3)]
         R.append(np.array(matrix))
         t.append(rows.take(f"t of {thing}").numbers(["t"] * 3))
-        if interior[-1][0] != 0:
+        if interior[-1][0] != 0:  # an image that was not oriented has f = 0 and R = 0
             check_rotations(R[-1], f"{row.place}: R of {thing}")
     return (
         np.array(interior).reshape(-1, 3),
@@ -123,7 +131,9 @@ def _cameras(rows: Rows, number: int):
     )
 
 
-def _points(rows: Rows, number: int, cameras: int):
+def _points(
+    rows: TextRows, number: int, cameras: int
+) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"], Float[np.ndarray, "rays 5"]]:
     """Coordinates; lines; and (camera, point, x, y, line) of all rays."""
     position, lines, rays = [], [], []
     for k in range(number):
@@ -133,14 +143,14 @@ def _points(rows: Rows, number: int, cameras: int):
         lines.append(row.number)
         rows.take(f"colour of {thing}")
         row = rows.take(f"rays of {thing}")
-        given = row.all_numbers("a ray")
+        numbers = row.all_numbers("a ray")
         claimed = row.integer(0, f"the number of rays of {thing}")
-        if len(given) != 1 + 4 * claimed:
+        if len(numbers) != 1 + 4 * claimed:
             raise row.error(
                 f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
-                f"{len(given) - 1}"
+                f"{len(numbers) - 1}"
             )
-        views = given[1:].reshape(-1, 4)
+        views = numbers[1:].reshape(-1, 4)
         for camera in views[:, 0]:
             if not (0 <= camera < cameras and camera % 1 == 0):
                 raise row.error(f"camera {camera:g} does not exist; there are {cameras}, from 0")
@@ -155,6 +165,7 @@ def _names(path: Path, number: int) -> list[str]:
     if path.is_file():
         lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
         names = [words[0].removeprefix("./") for words in lines]
+        # a list of other photographs, or with one twice, names nothing
         if len(names) == number and len(set(names)) == number:
             return names
     return [str(k) for k in range(number)]
@@ -174,15 +185,17 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     lines = [HEAD, f"{len(images)} {len(points)}"]
     for i, c in enumerate(images.camera.tolist()):
         for row in ([*all_parameters(network.cameras[c]).values()], *R[i], t[i]):
-            lines.append(_join(row))
+            lines.append(join_numbers(row))
     key = np.zeros(len(images), int)
+    # the key of a ray is its number in the image, as that of a feature
     of_point: list[list[str]] = [[] for _ in points.id]
     for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
         of_point[point].append(f"{image} {key[image]} {x!r} {y!r}")
         key[image] += 1
     for position, views in zip(points.position, of_point):
-        lines += [_join(position), "128 128 128", " ".join([str(len(views)), *views])]
-    numbered = list(images.id) == [str(k) for k in range(len(images))]
+        colour = " ".join(map(str, GREY))
+        lines += [join_numbers(position), colour, " ".join([str(len(views)), *views])]
+    numbered = are_numbered_from_0(images.id)
     names = path.parent / LIST
     if not numbered:
         if any(character.isspace() for id in images.id for character in id):
@@ -194,12 +207,6 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
         for place, text in zip(temporary, content.values()):
             place.write_bytes(("\n".join(text) + "\n").encode())
     lost = describe_losses(network, shared_cameras=True)
-    return lost if _from_zero(points.id) else (*lost, "names of points, which are numbered from 0")
-
-
-def _from_zero(ids) -> bool:
-    return list(ids) == [str(k) for k in range(len(ids))]
-
-
-def _join(values) -> str:
-    return " ".join(repr(float(value)) for value in values)
+    if are_numbered_from_0(points.id):
+        return lost
+    return (*lost, "names of points, which are numbered from 0")

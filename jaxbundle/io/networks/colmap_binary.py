@@ -14,6 +14,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_model import (
@@ -30,13 +31,12 @@ from jaxbundle.io.networks.colmap_models import (
     parameter_names,
     to_colmap,
 )
-from jaxbundle.io.networks.colmap_text import GREY
-from jaxbundle.io.networks.losses import size_of
+from jaxbundle.io.networks.losses import GREY, size_of
 from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-NONE = np.uint64(2**64 - 1)
+NO_POINT_ID = np.uint64(2**64 - 1)
 
 
 class _Bytes:
@@ -103,13 +103,14 @@ def read_binary_model(folder: Path) -> ColmapModel:
 def read_binary_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.bin by number."""
     file, cameras = _Bytes(path), {}
-    for k in range(file.count("cameras", 24)):
+    for k in range(file.count("cameras", 24)):  # bytes of a camera without parameters
         file.what = f"camera {k + 1}"
         id, model, width, height = file.take("IiQQ")
         if id in cameras:
             raise file.error(f"camera {id} occurs twice")
         name = NAMES.get(model, f"number {model}")
         values = file.numbers(len(parameter_names(name, file.error)), "parameters")
+        # 64 bits of a damaged file may be any size
         if not (0 < width < 10**9 and 0 < height < 10**9):
             raise file.error(f"the image size {width} × {height} is impossible")
         cameras[id] = from_colmap(str(id), name, (width, height), values)
@@ -119,7 +120,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
 
 def _images(path: Path) -> list[ColmapImage]:
     file, images = _Bytes(path), []
-    for k in range(file.count("images", 73)):
+    for k in range(file.count("images", 73)):  # without a name and image points
         file.what = f"image {k + 1}"
         (id,) = file.take("I")
         pose = file.numbers(7, "pose")
@@ -128,10 +129,10 @@ def _images(path: Path) -> list[ColmapImage]:
         points = np.frombuffer(file.raw(24 * file.count("image points", 24)), POINT2D)
         if not np.isfinite(points["xy"]).all():
             raise file.error("an image point is not a finite number")
-        none = points["point"] == NONE
+        none = points["point"] == NO_POINT_ID
         if (points["point"][~none] >= 2**63).any():
             raise file.error("an image point has an impossible object point")
-        point = np.where(none, 0, points["point"]).astype(np.int64) - none
+        point = np.where(none, 0, points["point"]).astype(np.int64) - none  # NO_POINT: −1
         images.append(
             ColmapImage(
                 id,
@@ -149,10 +150,13 @@ def _images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _points(path: Path, images: set[int]):
+def _points(
+    path: Path, images: set[int]
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
+    """Numbers and coordinates of the points; as of the text form."""
     file, ids, positions = _Bytes(path), [], []
     known = np.array(sorted(images), "<u4")
-    for k in range(file.count("points", 51)):
+    for k in range(file.count("points", 51)):  # without a track
         file.what = f"point {k + 1}"
         (id,) = file.take("Q")
         if id >= 2**63:

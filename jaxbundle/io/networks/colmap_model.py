@@ -7,7 +7,7 @@ full pose in `images`; without them COLMAP creates trivial ones.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,14 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
-from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
-from jaxbundle.io.networks.colmap_models import HALF, to_colmap
+from jaxbundle.io.networks.assemble import (
+    PIXEL_CENTRE,
+    assemble,
+    entry_of,
+    foreign_document,
+    image_columns,
+)
+from jaxbundle.io.networks.colmap_models import to_colmap
 from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, list_some
@@ -24,7 +30,8 @@ from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
 NO_POINT = -1
-NO_ERROR = -1.0
+"""Object point of an image point without one, in the text form (COLMAP documentation, "Output
+Format"); the binary form has 2⁶⁴ − 1, the same bits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +67,7 @@ def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]
     return zip(model.point_ids.tolist(), model.points, model.errors.tolist())
 
 
-def check_unique(ids: Sequence[int], place, thing: str) -> None:
+def check_unique(ids: Sequence[int], place: Callable[[int], object], thing: str) -> None:
     """Refuse repeated numbers; `place(k)` names the position of the k-th."""
     values, first, counts = np.unique(np.asarray(ids), return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
@@ -84,6 +91,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
                 f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
             )
+        # of any other length, it is normalised
         if not np.any(image.q):
             raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
     names = [image.name for image in images]
@@ -114,7 +122,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
     )
 
 
-def _observations(path: Path, model: ColmapModel):
+def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, ...]]:
     """The table of image points; the first if an image has several of one object point."""
     index, point, xy = [], [], []
     repeated = []
@@ -127,6 +135,7 @@ def _observations(path: Path, model: ColmapModel):
                 f"{image.place}: image {image.name!r}, image point {unknown[0]}: the object point "
                 f"{image.point[unknown[0]]} is not in points3D"
             )
+        # A track may return to an image; a network has one image point of a point in an image.
         _, first = np.unique(image.point[used], return_index=True)
         if len(first) < len(used):
             repeated += [image.name] * (len(used) - len(first))
@@ -134,7 +143,7 @@ def _observations(path: Path, model: ColmapModel):
         index += [image.name] * len(used)
         point.append(image.point[used])
         xy.append(image.xy[used])
-    xy = np.concatenate(xy) - HALF
+    xy = np.concatenate(xy) - PIXEL_CENTRE
     warnings = (
         f"left out {count(len(repeated), 'image point')} of object points that have another in "
         f"the same image: {list_some(dict.fromkeys(repeated))}",
@@ -159,6 +168,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
     camera_numbers = list(cameras)
     point_numbers = np.array(numbers_of(points.id), np.int64)
     made = []
+    # the rays image by image, in one pass: masks of every image would be quadratic
     order = np.argsort(rays.image, kind="stable")
     parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
     for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
@@ -169,7 +179,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
                 images.id[i],
                 q[i],
                 t[i],
-                rays.xy[mine] + HALF,
+                rays.xy[mine] + PIXEL_CENTRE,
                 point_numbers[rays.point[mine]],
                 f"image {images.id[i]!r}",
             )
@@ -183,20 +193,21 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
         point_numbers,
         points.position,
         points.source,
-        np.nan_to_num(point_errors(network)[0], nan=NO_ERROR),
+        np.nan_to_num(point_errors(network)[0], nan=-1.0),  # COLMAP's error not yet computed
     ), lost
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:
     """The ids if all are whole numbers from 1, else 1, 2, 3, …"""
+    # nine digits: COLMAP's ids have 32 bits
     good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
     return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))
 
 
 def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
     """(image, index of its image point) of every ray, by object point."""
-    found: dict[int, list[tuple[int, int]]] = {int(id): [] for id in model.point_ids}
+    rays: dict[int, list[tuple[int, int]]] = {int(id): [] for id in model.point_ids}
     for image in model.images:
         for k, point in enumerate(image.point.tolist()):
-            found[point].append((image.id, k))
-    return found
+            rays[point].append((image.id, k))
+    return rays

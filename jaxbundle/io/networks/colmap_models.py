@@ -21,12 +21,9 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.assemble import PIXEL_CENTRE, all_parameters
 from jaxbundle.io.networks.losses import size_of
 from jaxbundle.network.tables import Camera
-
-HALF = 0.5
-"""Centre of a pixel relative to its corner."""
 
 _RADIAL = ("f", "cx", "cy", "k1", "k2")
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -82,8 +79,8 @@ def from_colmap(id: str, model: str, size: Sequence[int], values: Iterable[float
     f = p.pop("f", None)
     if f is not None:
         p = {"fx": f, "fy": f} | p
-    p["cx"], p["cy"] = p["cx"] - HALF, p["cy"] - HALF
-    if model == "FOV" and p["omega"] == 0:
+    p["cx"], p["cy"] = p["cx"] - PIXEL_CENTRE, p["cy"] - PIXEL_CENTRE
+    if model == "FOV" and p["omega"] == 0:  # its formula divides by ω; the limit has no distortion
         ours = "opencv"
         del p["omega"]
     tie = (("fx", "fy"),) if f is not None else ()
@@ -94,8 +91,8 @@ def _panorama(width: float, height: float) -> dict[str, float]:
     return {
         "fx": width / (2 * np.pi),
         "fy": height / np.pi,
-        "cx": width / 2 - HALF,
-        "cy": height / 2 - HALF,
+        "cx": width / 2 - PIXEL_CENTRE,
+        "cy": height / 2 - PIXEL_CENTRE,
     }
 
 
@@ -120,12 +117,13 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
         if not np.allclose([p[name] for name in whole], [*whole.values()], rtol=1e-12):
             raise InputError(f"{where}: COLMAP has whole panoramas only, of the image size")
         return "EQUIRECTANGULAR", [float(size[0]), float(size[1])]
-    p["cx"], p["cy"] = p["cx"] + HALF, p["cy"] + HALF
-    given = {name for name, value in p.items() if value != 0 or name in ("cx", "cy")}
+    p["cx"], p["cy"] = p["cx"] + PIXEL_CENTRE, p["cy"] + PIXEL_CENTRE
+    needed = {name for name, value in p.items() if value != 0 or name in ("cx", "cy")}
     if p["fx"] == p["fy"]:
-        given = given - {"fx", "fy"} | {"f"}
+        needed = needed - {"fx", "fy"} | {"f"}
         p["f"] = p["fx"]
     for name, names in candidates:
-        if given <= {*names, *(("f",) if "fx" in names else ())}:
+        # a model of two focal lengths holds equal ones too
+        if needed <= {*names, *(("f",) if "fx" in names else ())}:
             return name, [p[key] for key in names]
     raise InputError(f"{where}: COLMAP has no thin prism (s1 to s4); convert it without them")

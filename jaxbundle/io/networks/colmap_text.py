@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap_model import (
@@ -26,11 +27,10 @@ from jaxbundle.io.networks.colmap_models import (
     parameter_names,
     to_colmap,
 )
-from jaxbundle.io.networks.losses import size_of
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.networks.losses import GREY, size_of
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
 from jaxbundle.network.tables import Camera, Source
 
-GREY = (128, 128, 128)
 QT = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 
 
@@ -45,7 +45,7 @@ def read_text_model(folder: Path) -> ColmapModel:
 def read_text_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.txt by number."""
     cameras: dict[int, Camera] = {}
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         number = row.integer(0, "CAMERA_ID")
         if number in cameras:
             raise row.error(f"camera {number} occurs twice")
@@ -59,7 +59,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 def _images(path: Path) -> list[ColmapImage]:
     # comments are skipped only before heads: the line of image points may be empty
-    rows = Rows(path, "#", blank=True)
+    rows = TextRows(path, "#", blank=True)
     images = []
     while rows.more():
         head = rows.take("an image")
@@ -71,13 +71,14 @@ def _images(path: Path) -> list[ColmapImage]:
                 f"{', '.join(QT)}, CAMERA_ID, NAME"
             )
         pose = head.numbers(QT, 1, more=True)
-        points = rows.take("the image points of an image") if rows.more() else Row(path, 0, "")
+        points = rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
         numbers = points.all_numbers("an image point")
         if len(numbers) % 3:
             raise points.error(
                 f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each image point"
             )
         numbers = numbers.reshape(-1, 3)
+        # beyond 2⁵² floats are all whole: a number there has lost digits
         if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
             raise points.error("a POINT3D_ID is not a whole number")
         images.append(
@@ -96,9 +97,13 @@ def _images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _points(path: Path, images: set[int]):
+def _points(
+    path: Path, images: set[int]
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Source]:
+    """Numbers and coordinates of the points, and their lines; tracks are only checked, since the
+    image points name their object points."""
     ids, positions, lines = [], [], []
-    for row in Rows(path, "#"):
+    for row in TextRows(path, "#"):
         ids.append(row.integer(0, "POINT3D_ID"))
         positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
         lines.append(row.number)
@@ -124,7 +129,7 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
                 f"image {image.name!r}: names in COLMAP's text files have no blanks; rename it, or "
                 "write the binary form"
             )
-        pose = _join([*image.q, *image.t])
+        pose = join_numbers([*image.q, *image.t])
         images.append(f"{image.id} {pose} {image.camera} {image.name}")
         images.append(
             " ".join(
@@ -137,7 +142,7 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
     for id, position, error in rows_of_points(model):
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
         colour = " ".join(map(str, GREY))
-        points.append(f"{id} {_join(position)} {colour} {error!r} {track}".rstrip())
+        points.append(f"{id} {join_numbers(position)} {colour} {error!r} {track}".rstrip())
     texts = {
         "cameras.txt": camera_lines(model.cameras),
         "images.txt": images,
@@ -151,9 +156,5 @@ def camera_lines(cameras: Mapping[int, Camera]) -> list[str]:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in cameras.items():
         (name, values), (width, height) = to_colmap(camera), size_of(camera, "COLMAP")
-        lines.append(f"{number} {name} {width} {height} {_join(values)}")
+        lines.append(f"{number} {name} {width} {height} {join_numbers(values)}")
     return lines
-
-
-def _join(values) -> str:
-    return " ".join(repr(float(value)) for value in values)

@@ -52,7 +52,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.poses import angles_of, apply_in_batches, are_rotations
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
-from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.text.rows import TextRows
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.network.units import ANGLE_UNITS
@@ -70,7 +71,7 @@ KEYS = (
     "rotation",
 )
 SEPARATORS = {"blanks": None, "tab": "\t"}
-UNUSED, REST = "-", "..."
+UNUSED_COLUMN, ANY_FURTHER = "-", "..."
 IDS = ("id", "camera", "role", "image", "point", "from", "to")
 MATRIX = tuple(f"m{i}{k}" for i in "123" for k in "123")
 ROTATIONS: dict[str, tuple[tuple[str, ...], Callable | None]] = {
@@ -98,9 +99,7 @@ def read_column_map(
     path = Path(path)
     document = read_toml(path)
     for key in document:
-        if key not in ("project", "camera", "table"):
-            known = ("project", "camera", "table")
-            raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
+        refuse_unknown(key, ("project", "camera", "table"), f"{path}: ")
     maps, cameras = document.get("table"), document.get("camera", [])
     if not isinstance(maps, dict) or not all(isinstance(m, dict) for m in maps.values()):
         raise InputError(f"{path}: sections [table.images] and so on are expected")
@@ -110,8 +109,7 @@ def read_column_map(
     if not isinstance(project, dict):
         raise InputError(f"{path}: [project] must be a section")
     for name in maps:
-        if name not in TABLES:
-            raise InputError(f"{path}: unknown table {name!r}{did_you_mean(name, TABLES)}")
+        refuse_unknown(name, TABLES, f"{path}: ", "table")
     settings = apply_overrides({"project": project, "camera": cameras}, overrides, SETTINGS)
     settings["project"].setdefault("name", path.stem)
     angle_unit = settings["project"].get("angle_unit", "rad")
@@ -134,17 +132,16 @@ def read_column_map(
 def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     """A table by its map; numbers scaled."""
     for key in entry:
-        if key not in KEYS:
-            raise InputError(f"{where}: unknown key {key!r}{did_you_mean(key, KEYS)}")
+        refuse_unknown(key, KEYS, f"{where}: ")
     file, names = entry.get("file"), entry.get("columns")
     if not isinstance(file, str):
         raise InputError(f"{where}: file is {show(file)}; the name of a file is expected")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
-    more = bool(names) and names[-1] == REST
+    more = bool(names) and names[-1] == ANY_FURTHER
     names = names[:-1] if more else names
-    used = {name: k for k, name in enumerate(names) if name != UNUSED}
-    if len(used) + names.count(UNUSED) < len(names):
+    used = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
+    if len(used) + names.count(UNUSED_COLUMN) < len(names):
         raise InputError(f"{where}: a column occurs twice")
     scale, constant = (_table(where, entry, key) for key in ("scale", "constant"))
     for name, factor in scale.items():
@@ -157,9 +154,12 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         raise InputError(f"{where}: skip is {show(skip)}; a number of lines is expected")
     if decimal not in (".", ","):
         raise InputError(f'{where}: decimal is {show(decimal)}; "." or "," is expected')
+    comment = entry.get("comment", "")
+    if not isinstance(comment, str):
+        raise InputError(f"{where}: comment is {show(comment)}; text is expected")
     texts: dict[str, list[str]] = {name: [] for name in used}
     lines = []
-    for row in Rows(folder / file, _comment(where, entry), separator=_separator(where, entry)):
+    for row in TextRows(folder / file, comment, separator=_separator(where, entry)):
         if row.number <= skip:
             continue
         if len(row) < len(names) or (len(row) > len(names) and not more):
@@ -168,7 +168,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
             )
         for name, k in used.items():
             text = row.words[k]
-            swap = decimal == "," and name not in IDS
+            swap = decimal == "," and name not in IDS  # an id may have a comma
             texts[name].append(text.replace(",", ".") if swap else text)
         lines.append(row.number)
     source = Source(str(folder / file), np.array(lines, np.int64), "line")
@@ -187,21 +187,14 @@ def _table(where: str, entry: Mapping, key: str) -> dict:
 
 
 def _separator(where: str, entry: Mapping) -> str | None:
-    given = entry.get("separator", "blanks")
-    if given in SEPARATORS:
-        return SEPARATORS[given]
-    if not isinstance(given, str) or len(given) != 1:
+    separator = entry.get("separator", "blanks")
+    if separator in SEPARATORS:
+        return SEPARATORS[separator]
+    if not isinstance(separator, str) or len(separator) != 1:
         raise InputError(
-            f"{where}: separator is {show(given)}; blanks, tab or one character is expected"
+            f"{where}: separator is {show(separator)}; blanks, tab or one character is expected"
         )
-    return given
-
-
-def _comment(where: str, entry: Mapping) -> str:
-    given = entry.get("comment", "")
-    if not isinstance(given, str):
-        raise InputError(f"{where}: comment is {show(given)}; text is expected")
-    return given
+    return separator
 
 
 def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Columns:
@@ -215,13 +208,13 @@ def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Col
             raise InputError(f"{where}: rotation {kind}: the column {name!r} is missing")
     if kind == "omega-phi-kappa":
         return columns
-    given = np.stack([columns.numbers(name, required=True) for name in names], 1)
+    numbers = np.stack([columns.numbers(name, required=True) for name in names], 1)
     if formula is None:
-        M = given.reshape(-1, 3, 3)
+        M = numbers.reshape(-1, 3, 3)
         for row in np.flatnonzero(~are_rotations(M))[:1]:
             raise InputError(f"{columns.source(row)}: m11 … m33 are not a rotation matrix")
     else:
-        M = apply_in_batches(formula, given * radians, (3,), (3, 3))
+        M = apply_in_batches(formula, numbers * radians, (3,), (3, 3))
     rest = {name: column for name, column in columns.values.items() if name not in names}
     angles = dict(zip(("omega", "phi", "kappa"), angles_of(M).T / radians))
     return Columns({**rest, **angles}, columns.source)

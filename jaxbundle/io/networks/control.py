@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.poses import angles_of, matrices_of
@@ -31,20 +32,36 @@ from jaxbundle.network.unit_mistakes import name_degrees
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.network import find_start_values
 
-PLAIN = ("id", *AXES, *POINT_SIGMAS)
+BARE_COLUMNS = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
-NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
-WORST_FIT = 0.3
-"""Median residual of a similarity, relative to the RMS distance of the control from its mean, from
-which it is none: of points in random order it is about 1."""
-LARGEST_OFFSET = 0.01
-"""Control farther than this from its position in the input, relative to its extent, is in another
-frame."""
-MILLIMETRES = 1.01
-"""Scale of a similarity to a thousand, or a thousandth, from which start values and control are in
-mm and in m: a scale in an arbitrary unit is within 1 % of them by chance once in hundreds."""
+NAMES = {name.lower(): name for name in (*BARE_COLUMNS, "role", "name", *POINT_ERRORS)}
 EVERY = re.compile(r"every[ -]?(\d+)(st|nd|rd|th)?$", re.IGNORECASE)
 """A selection of check points, such as `every 3rd`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlFrameSettings:
+    """When start values are taken to be in another frame than the control.
+
+    `max_offset`: median distance between control and start values, relative to the extent of the
+    control, up to which both are in one frame. Start values in the frame of the control are off by
+    their own errors, those of another frame by the extent and more: between is nothing.
+
+    `max_misfit`: median residual of the similarity between both, relative to the RMS distance of
+    the control from its mean, above which it is none: of points in random order it is about 1, of
+    start values that are good for anything some hundredths.
+
+    `thousand_tolerance`: how near to 1000 or 1/1000, relative, the scale of the similarity must be
+    for a warning about mm and m: a scale in an arbitrary unit is within 1 % by chance once in some
+    hundred networks.
+    """
+
+    max_offset: float = 0.01
+    max_misfit: float = 0.3
+    thousand_tolerance: float = 0.01
+
+
+FRAME_SETTINGS = ControlFrameSettings()
 
 
 def read_control(path: str | Path) -> Points:
@@ -59,7 +76,9 @@ def read_control(path: str | Path) -> Points:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not lines:
-        raise InputError(f"{path}: the file is empty; rows of {', '.join(PLAIN[:4])} are expected")
+        raise InputError(
+            f"{path}: the file is empty; rows of {', '.join(BARE_COLUMNS[:4])} are expected"
+        )
     separator = _separator(lines[0][1])
     try:
         rows = [_cells(line, separator) for _, line in lines]
@@ -71,10 +90,10 @@ def read_control(path: str | Path) -> Points:
     elif len(rows[0]) not in (4, 7):
         raise InputError(
             f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
-            f"{', '.join(PLAIN[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+            f"{', '.join(BARE_COLUMNS[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
             f"{_split_name(rows[0], separator)}"
         )
-    header = header or PLAIN[: len(rows[0])]
+    header = header or BARE_COLUMNS[: len(rows[0])]
     for (number, _), row in zip(lines, rows):
         if len(row) != len(header):
             raise InputError(
@@ -83,6 +102,7 @@ def read_control(path: str | Path) -> Points:
             )
     source = Source(str(path), np.array([number for number, _ in lines]), "line")
     columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
+    # then a comma is the decimal sign; ids and names keep theirs
     if separator != ",":
         columns = {
             name: column
@@ -95,9 +115,9 @@ def read_control(path: str | Path) -> Points:
 
 def _separator(line: str) -> str | None:
     """The separator of the columns: a comma unless it is a decimal comma between blanks."""
-    found = next((s for s in (";", "\t", ",") if s in line), None)
-    decimal = found == "," and any(len(cell.split()) > 1 for cell in line.split(","))
-    return None if decimal else found
+    separator = next((s for s in (";", "\t", ",") if s in line), None)
+    decimal = separator == "," and any(len(cell.split()) > 1 for cell in line.split(","))
+    return None if decimal else separator
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
@@ -121,6 +141,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
     """The names of the columns; None if the first line is not a header."""
     if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
         return None
+    # other programs call a σ by these names
     names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
     for name, cell in zip(names, cells):
         if name not in NAMES:
@@ -184,16 +205,22 @@ def select_checks(points: Points, selection: Sequence[str]) -> Points:
     return dataclasses.replace(points, role=roles)
 
 
-def with_control(network: Network, control: Points, datum: bool = True) -> Network:
+def with_control(
+    network: Network,
+    control: Points,
+    datum: bool = True,
+    settings: ControlFrameSettings = FRAME_SETTINGS,
+) -> Network:
     """A network with the control of a table.
 
-    **Arguments:** `datum` whether control becomes the datum.
+    **Arguments:** `datum` whether control becomes the datum; `settings`: when the network is
+    transformed into the frame of the control.
 
     **Raises:** `InputError` if no point of the network is in the table.
     """
     index = {id: k for k, id in enumerate(network.points.id)}
     rows = [k for k, id in enumerate(control.id) if id in index]
-    at = np.array([index[control.id[k]] for k in rows], np.int64)
+    places = np.array([index[control.id[k]] for k in rows], np.int64)
     if not rows:
         raise InputError(
             f"{control.source.name}: none of its {len(control)} points is one of the network; it "
@@ -201,11 +228,10 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
         )
     if degrees := name_degrees(control):
         raise InputError(f"{control.source.name}: {degrees}")
-    names = [control.id[k] for k in rows]
-    network = _in_the_frame_of(network, at, control.position[rows], names, control.source.name)
+    network = _transform_into_frame(network, places, control.take(np.array(rows)), settings)
     points = network.points
     named = np.zeros(len(points), bool)
-    named[at] = True
+    named[places] = True
     dropped = [
         id
         for id, role, there in zip(points.id, points.role, named)
@@ -213,12 +239,12 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     ]
     roles = np.array(points.role, dtype=object)
     roles[points.has_role("control", "fixed") & ~named] = "tie"
-    roles[at] = [control.role[k] for k in rows]
+    roles[places] = [control.role[k] for k in rows]
     position, sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
-    position[at], sigma[at] = control.position[rows], control.sigma[rows]
-    given = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
+    position[places], sigma[places] = control.position[rows], control.sigma[rows]
+    changed = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
     network = network.replace(
-        points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **given
+        points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **changed
     )
     lost = [id for id in control.id if id not in index]
     warnings, notes = [], []
@@ -233,45 +259,45 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
     return network.warn(*warnings).note(*notes)
 
 
-def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> Network:
-    """The network with start values transformed so that control points `at` are at `target`.
+def _transform_into_frame(
+    network: Network, places: Int[np.ndarray, " n"], control: Points, settings: ControlFrameSettings
+) -> Network:
+    """The network with start values transformed so that its points in the rows `places` are at the
+    control points.
 
-    **Raises:** `InputError` if they fit no similarity: then it would not be in that frame."""
-    images, points = network.images, network.points
+    **Raises:** `InputError` if they fit no similarity."""
+    images, points, target = network.images, network.points, control.position
+    # Observed orientations are in the frame of the control already; without orientations there is
+    # nothing to transform.
     if np.isfinite(images.sigma).any() or not np.isfinite(images.position).any():
         return network
-    source = points.position[at]
+    source = points.position[places]
     if np.isnan(source).any():
-        source = _intersect(network, at)
+        source = _intersect(network, places)
     known = np.isfinite(source).all(1)
     source, target = source[known], target[known]
-    found = similarity(source, target) if len(source) >= 3 else None
+    # seven parameters of a similarity: three points give nine coordinates
+    transformation = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
-    if found is None:
+    if transformation is None:
         return network
-    if np.median(np.linalg.norm(source - target, axis=1)) <= LARGEST_OFFSET * extent:
+    # the median, here and below: some control points may be misnamed
+    if np.median(np.linalg.norm(source - target, axis=1)) <= settings.max_offset * extent:
         return network
-    A, t = found
+    A, t = transformation
     off = np.linalg.norm(source @ A.T + t - target, axis=1)
-    spread = np.sqrt(np.square(target - target.mean(0)).sum(1).mean())
-    if np.median(off) > WORST_FIT * spread:
-        of = [names[k] for k in np.flatnonzero(known)]
-        worst = (f"{of[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
-        raise InputError(
-            f"{source_name}: the control fits no similarity of the start values of the input: its "
-            f"{count(len(off), 'point')} are within {spread:.3g} {network.object_unit} of their "
-            f"mean and {np.median(off):.3g} off (median), most of all "
-            f"{list_some(worst, 3, str)}; check names and units of the table, or leave out the "
-            "start values of the input"
-        )
-    scale = float(np.cbrt(np.linalg.det(A)))
-    if abs(abs(np.log(scale)) - np.log(1000)) < np.log(MILLIMETRES):
+    _check_similarity(
+        off, control.take(np.flatnonzero(known)), settings.max_misfit, network.object_unit
+    )
+    scale = float(np.cbrt(np.linalg.det(A)))  # A = scale·R, det R = 1
+    if abs(abs(np.log(scale)) - np.log(1000)) < np.log(1 + settings.thousand_tolerance):
         times = "a thousand times" if scale > 1 else "a thousandth"
         network = network.warn(
-            f"the control of {source_name} is {times} "
+            f"the control of {control.source.name} is {times} "
             "as large as the start values: is one of them in mm, the other in m? The result is in "
             "the unit of the control"
         )
+    # X' = scale·R·X + t   ⇒   M·(X − X0) ∝ M·Rᵀ·(X' − X0')
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     return network.replace(
@@ -290,22 +316,38 @@ def _in_the_frame_of(network: Network, at, target, names, source_name: str) -> N
     )
 
 
-def _intersect(network: Network, at):
+def _check_similarity(
+    off: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
+) -> None:
+    """Refuse control that is `off` the similarity by more than `max_misfit` of its spread: the
+    network would not be in its frame."""
+    spread = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
+    if np.median(off) > max_misfit * spread:
+        worst = (f"{control.id[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
+        raise InputError(
+            f"{control.source.name}: the control fits no similarity of the start values of the "
+            f"input: its {count(len(off), 'point')} are within {spread:.3g} {unit} of their mean "
+            f"and {np.median(off):.3g} off (median), most of all {list_some(worst, 3, str)}; check "
+            "names and units of the table, or leave out the start values of the input"
+        )
+
+
+def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """The coordinates of points by the orientations of the input; NaN if there are none."""
     points = network.points
     roles = np.array(points.role, dtype=object)
     position, free = points.position.copy(), np.full_like(points.sigma, np.nan)
-    roles[points.has_role("control", "fixed")], position[at] = "tie", np.nan
-    roles[at] = "tie"
+    roles[points.has_role("control", "fixed")], position[places] = "tie", np.nan
+    roles[places] = "tie"
     start = network.replace(
         points=Points(points.id, tuple(roles.tolist()), position, free, points.source),
         datum="inner",
         datum_points=(),
     )
     try:
-        found = find_start_values(start).network.points
+        intersected = find_start_values(start).network.points
     except (InputError, NotSolvedError):
-        return position[at]
-    known = dict(zip(found.id, found.position))
+        return position[places]
+    known = dict(zip(intersected.id, intersected.position))
     nothing = np.full(3, np.nan)
-    return np.array([known.get(points.id[k], nothing) for k in at])
+    return np.array([known.get(points.id[k], nothing) for k in places])

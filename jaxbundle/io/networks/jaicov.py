@@ -19,26 +19,23 @@ Source: Loesler, JAiCov (Java Aicon Covariance), the columns its readers name; L
 Nahbereichsphotogrammetrie, eq. 2.31, for the rotation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
 from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import matrices_of
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import TextRow, TextRows, join_numbers
 from jaxbundle.io.writing.replacing import replace_files
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Camera, Distances, Network, Source
 
 SUFFIX = ".phc"
 COMPANION_SUFFIXES = (".ior", ".eor", ".obc", ".scale")
-CAP = 0
-"""The order of rotations ω, φ, κ."""
-NOT_ORIENTED = 1
-"""State of an image; 2: approximately, 3: by bundle adjustment."""
 INTERIOR = (
     ("number", "parameter", "c", "x0", "y0", "K1", "K2", "r0"),
     ("K3",),
@@ -62,18 +59,18 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     beside = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
     cameras = _cameras(beside[".ior"])
     images, angles, position, camera, told = _images(beside[".eor"])
-    points, at, datum = _points(beside[".obc"])
+    points, coordinates, datum = _points(beside[".obc"])
     rays, lines, more = _rays(path, points if beside[".obc"].is_file() else None)
     for image in rays["image"]:
         images.setdefault(image, len(images))
     for point in rays["point"]:
         points.setdefault(point, len(points))
-    none = np.full((len(images), 3), np.nan)
-    none[: len(position)], turned = position, none.copy()
-    turned[: len(angles)] = angles
-    of = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
-    where = np.full((len(points), 3), np.nan)
-    where[: len(at)] = at
+    # Images and points that only the image points name follow those of .eor and .obc, as unknown.
+    X0, all_angles = np.full((2, len(images), 3), np.nan)
+    X0[: len(position)], all_angles[: len(angles)] = position, angles
+    used = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
+    X = np.full((len(points), 3), np.nan)
+    X[: len(coordinates)] = coordinates
     network = assemble(
         path,
         foreign_document(
@@ -81,10 +78,14 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         overrides,
         image_columns(
-            Source(str(beside[".eor"]), None, "image"), list(images), of, matrices_of(turned), none
+            Source(str(beside[".eor"]), None, "image"),
+            list(images),
+            used,
+            matrices_of(all_angles),
+            X0,
         ),
         Columns(
-            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", where.T))},
+            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", X.T))},
             Source(str(beside[".obc"]), None, "point"),
         ),
         Columns(rays, Source(str(path), np.array(lines, np.int64), "line")),
@@ -95,51 +96,56 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 def _cameras(file: Path) -> dict[str, dict]:
     """The entries of cameras by number."""
-    rows, cameras = Rows(file, comment="#"), {}
+    rows, cameras = TextRows(file, comment="#"), {}
     while rows.more():
-        given, first = {}, None
+        entry, first = {}, None
         for names in INTERIOR:
             row = rows.take(f"{', '.join(names)} of a camera")
-            given |= dict(zip(names, row.numbers(names, more=True).tolist()))
+            entry |= dict(zip(names, row.numbers(names, more=True).tolist()))
             first = first or row
         assert first is not None
-        size = given["columns"], given["rows"]
-        if not (given["c"] < 0 and min(given["width"], given["height"], *size) > 0):
+        size = entry["columns"], entry["rows"]
+        if not (entry["c"] < 0 and min(entry["width"], entry["height"], *size) > 0):
             raise row.error("c must be negative, the sizes of the sensor positive")
         id = first.words[0]
         if id in cameras:
             raise first.error(f"camera {id} occurs twice")
         values = {
-            name: given[name]
+            name: entry[name]
             for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2", "r0")
         }
         cameras[id] = {
             "id": id,
             "model": "brown-projected",
-            "c": -given["c"],
+            "c": -entry["c"],
             **values,
             "image_size": list(size),
-            "pixel_size": [given["width"] / size[0], given["height"] / size[1]],
+            "pixel_size": [entry["width"] / size[0], entry["height"] / size[1]],
         }
     if not cameras:
         raise InputError(f"{file}: there is no camera in it")
     return cameras
 
 
-def _images(file: Path):
+def _images(
+    file: Path,
+) -> tuple[
+    dict[str, int], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], list[str], list[str]
+]:
     """Row of each image, angles, positions, cameras, and messages."""
     images: dict[str, int] = {}
     angles, position, camera, other = [], [], [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
+    for row in TextRows(file, comment="#") if file.is_file() else ():
         names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
-        given = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
-        if given["active"] == 0:
+        entry = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
+        if entry["active"] == 0:
             continue
-        _new(row, images, "image")
-        good = given["order"] == CAP and given["state"] != NOT_ORIENTED
-        if given["order"] != CAP:
+        _number_row(row, images, "image")
+        # order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment
+        good = entry["order"] == 0 and entry["state"] != 1
+        if entry["order"] != 0:
             other.append(row.words[0])
-        values = [given[name] if good else np.nan for name in names[:6]]
+        values = [entry[name] if good else np.nan for name in names[:6]]
         position.append(values[:3])
         angles.append(values[3:])
         camera.append(row.words[1])
@@ -154,33 +160,36 @@ def _images(file: Path):
     return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, told)
 
 
-def _points(file: Path):
+def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[str]]:
     """Row of each point, coordinates, and the ids of the datum."""
     points: dict[str, int] = {}
-    at, datum = [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
+    coordinates, datum = [], []
+    for row in TextRows(file, comment="#") if file.is_file() else ():
         values = row.numbers(("X", "Y", "Z"), 1, more=True)
+        # short rows, of coordinates alone or with σ, are active points outside the datum
         if len(row) >= 11 and row.words[8] == "0":
             continue
-        _new(row, points, "point")
-        at.append(values)
+        _number_row(row, points, "point")
+        coordinates.append(values)
         if len(row) >= 11 and row.words[10] != "0":
             datum.append(row.words[0])
-    return points, np.reshape(at, (-1, 3)), datum
+    return points, np.reshape(coordinates, (-1, 3)), datum
 
 
-def _new(row: Row, table: dict[str, int], thing: str) -> None:
+def _number_row(row: TextRow, table: dict[str, int], thing: str) -> None:
     if row.words[0] in table:
         raise row.error(f"{thing} {row.words[0]} occurs twice")
     table[row.words[0]] = len(table)
 
 
-def _rays(file: Path, points: dict | None):
+def _rays(
+    file: Path, points: Mapping[str, int] | None
+) -> tuple[dict[str, list], list[int], list[str]]:
     """The columns of image points, their lines, and messages."""
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y", "sx", "sy")}
     lines, unknown = [], []
     names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
-    for row in Rows(file, comment="#"):
+    for row in TextRows(file, comment="#"):
         values = row.numbers(names, 2, more=True)
         image, point = row.words[:2]
         if values[-1] <= 0:
@@ -202,13 +211,15 @@ def _with_distances(network: Network, file: Path) -> Network:
     """The network with the active distances of a file between its points."""
     index, lines = {id: k for k, id in enumerate(network.points.id)}, []
     ends, values = [], []
-    for row in Rows(file, comment="#") if file.is_file() else ():
-        rest = Row(
+    for row in TextRows(file, comment="#") if file.is_file() else ():
+        # the name stands in quotes and may have blanks
+        rest = TextRow(
             row.path,
             row.number,
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
         )
         length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
+        # an end that was left out above leaves nothing to measure
         if active == 0 or not {*rest.words[:2]} <= {*index}:
             continue
         if not (length > 0 and sigma > 0):
@@ -237,26 +248,28 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
     if any(character.isspace() or character in '"#' for id in points.id for character in id):
         raise InputError(f"{path}: names of points cannot have blanks, quotes or #")
     image_ids, camera_ids = _numbers(images.id), _numbers([c.id for c in network.cameras])
+    # without a choice the inner datum is that of all tie points
     datum = {*network.datum_points} or {id for id, r in zip(points.id, points.role) if r == "tie"}
     number = np.bincount(rays.point, minlength=len(points)).tolist()
     content = {
         path: [
-            f"{image_ids[i]} {points.id[p]} {_join(xy)} {_join(s)} 0 0 0 1 0"
+            f"{image_ids[i]} {points.id[p]} {join_numbers(xy)} {join_numbers(s)} 0 0 0 1 0"
             for i, p, xy, s in zip(rays.image, rays.point, rays.xy, rays.sigma)
         ],
         path.with_suffix(".ior"): [
             line for id, c in zip(camera_ids, network.cameras) for line in _interior(id, c)
         ],
         path.with_suffix(".eor"): [
-            f"{id} {camera_ids[c]} {_join(at)} {_join(angles)} {CAP} 1 3"
-            for id, c, at, angles in zip(image_ids, images.camera, images.position, images.angles)
+            # order 0, active, state 3: by bundle adjustment
+            f"{id} {camera_ids[c]} {join_numbers(X0)} {join_numbers(angles)} 0 1 3"
+            for id, c, X0, angles in zip(image_ids, images.camera, images.position, images.angles)
         ],
         path.with_suffix(".obc"): [
-            f"{id} {_join(at)} 0 0 0 {n} 1 1 {int(id in datum)}"
-            for id, at, n in zip(points.id, points.position, number)
+            f"{id} {join_numbers(X)} 0 0 0 {n} 1 1 {int(id in datum)}"
+            for id, X, n in zip(points.id, points.position, number)
         ],
         path.with_suffix(".scale"): [
-            f'{k} "" {points.id[a]} {points.id[b]} {_join((value, sigma))} 1'
+            f'{k} "" {points.id[a]} {points.id[b]} {join_numbers((value, sigma))} 1'
             for k, ((a, b), value, sigma) in enumerate(
                 zip(network.distances.points, network.distances.value, network.distances.sigma)
             )
@@ -273,19 +286,17 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
 
 
 def _numbers(ids: Sequence[str]) -> list[str]:
+    # 18 digits fit in 64 bits
     plain = all(id.isascii() and id.isdigit() and len(id) < 19 for id in ids)
     return list(ids) if plain else [str(k) for k in range(1, len(ids) + 1)]
-
-
-def _join(values) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 def _interior(id: str, camera: Camera) -> list[str]:
     p, (w, h) = all_parameters(camera), size_of(camera, "AICON")
     if camera.pixel_size is None:
         raise InputError(f"camera {camera.id!r}: AICON needs the sensor's size; give pixel_size")
-    given = p | {"c": -p["c"]}
-    lines = [_join(given[name] for name in names if name in given) for names in INTERIOR[:4]]
-    sensor = _join((w * camera.pixel_size[0], h * camera.pixel_size[1]))
+    # in files of AICON c is negative
+    values = p | {"c": -p["c"]}
+    lines = [join_numbers(values[name] for name in names if name in p) for names in INTERIOR[:4]]
+    sensor = join_numbers((w * camera.pixel_size[0], h * camera.pixel_size[1]))
     return [f"{id} 0 {lines[0]}", *lines[1:], f"{sensor} {w} {h}"]

@@ -31,6 +31,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import convert_camera
@@ -41,6 +42,7 @@ from jaxbundle.io.networks.losses import describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.network.further import Rigs
 from jaxbundle.network.tables import Camera, Network
@@ -60,7 +62,7 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
 }
 """Our model, intrinsics and coefficients; the first of a model is written."""
-OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
+OFFERED_MODELS = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
 
 
 def is_kalibr(path: Path) -> bool:
@@ -80,6 +82,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     chain = JsonFields(path, {"": parse_yaml(path, read_text(path))}).objects("")
     chain = {
         id: JsonFields(f"{path}, {id}", chain[id].document)
+        # by number: cam10 after cam9
         for id in sorted(chain, key=_number)
         if re.fullmatch(r"cam\d+", id)
     }
@@ -92,7 +95,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         if k and fields.get("T_cn_cnm1") is not None:
             T = fields.array("T_cn_cnm1", (4, 4))
             check_rotations(T[:3, :3], f"{fields.path}: T_cn_cnm1")
-            R, t = T[:3, :3] @ R, T[:3, :3] @ t + T[:3, 3]
+            R, t = T[:3, :3] @ R, T[:3, :3] @ t + T[:3, 3]  # chained: from cam0 to this one
             mounted.append(id)
         elif k:
             R, t = np.eye(3), np.zeros(3)
@@ -144,21 +147,20 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     mountings, lost = mountings_of(network)
     lines = []
-    for k, given in enumerate(network.cameras):
-        camera, said = _fit(given)
+    for k, original in enumerate(network.cameras):
+        camera, said = _fit(original)
         lost += said
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
         if mountings is not None and k:
-            lines += ["  T_cn_cnm1:", *(f"  - {_list(row)}" for row in mountings[k - 1])]
+            lines += [
+                "  T_cn_cnm1:",
+                *(f"  - [{join_numbers(row, ', ')}]" for row in mountings[k - 1]),
+            ]
     write_text(Path(path), "\n".join(lines) + "\n")
     lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
     lost += ["points"] if len(network.points) else []
     own = any(camera.id != f"cam{k}" for k, camera in enumerate(network.cameras))
     return (*lost, *(["names of cameras"] if own else []))
-
-
-def _list(values) -> str:
-    return f"[{', '.join(repr(float(value)) for value in values)}]"
 
 
 def _fit(camera: Camera) -> tuple[Camera, list[str]]:
@@ -168,19 +170,19 @@ def _fit(camera: Camera) -> tuple[Camera, list[str]]:
     more = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
     if camera.model != "opencv" or not more:
         return camera, []
-    size, found, refused = size_of(camera, "Kalibr"), [], ""
+    size, fits, refused = size_of(camera, "Kalibr"), [], ""
     for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
         try:
-            found.append(
+            fits.append(
                 convert_camera(
                     get_model("opencv"), p, get_model(target), image_size=size, free=free
                 )
             )
         except ValueError as error:
             refused = refused or str(error)
-    if not found:
+    if not fits:
         raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(more)}: {refused}")
-    best = min(found, key=lambda one: one.rms)
+    best = min(fits, key=lambda fit: fit.rms)
     message = (
         f"{', '.join(more)} of camera {camera.id!r}, fitted as "
         f"{'radtan' if best.model == 'opencv' else 'equi'} over the image: largest difference "
@@ -196,12 +198,12 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
     for (kind, distortion), (model, core, coefficients) in MODELS.items():
         named = {*core, *coefficients}
         if model == camera.model and not any(p[name] for name in p if name not in named):
-            values = _list(p[name] for name in coefficients)
+            values = join_numbers((p[name] for name in coefficients), ", ")
             return [
                 f"camera_model: {kind}",
-                f"intrinsics: {_list(p[name] for name in core)}",
+                f"intrinsics: [{join_numbers((p[name] for name in core), ', ')}]",
                 f"distortion_model: {distortion}",
-                f"distortion_coeffs: {values}",
+                f"distortion_coeffs: [{values}]",
                 f"resolution: [{w}, {h}]",
                 f"rostopic: /cam{k}/image_raw",
             ]
@@ -216,17 +218,23 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
     raise InputError(f"camera {camera.id!r}: Kalibr has no {rest}; adjust the camera without")
 
 
-def mountings_of(network: Network) -> tuple[np.ndarray | None, list[str]]:
+def mountings_of(
+    network: Network,
+) -> tuple[Float[np.ndarray, "pairs 4 4"] | None, list[str]]:
     """T from the frame of each camera (x right, y down, z forward) to that of the next
-    [cameras − 1, 4, 4]; else None, and what is lost."""
+    [cameras − 1, 4, 4]; else None, and what is lost.
+
+        x' = R'·X + t',  x = R·X + t   ⇒   x' = (R'·Rᵀ)·x + t' − (R'·Rᵀ)·t
+    """
     images, number = network.images, len(network.cameras)
     if number == 1:
         return None, ["orientations"] if len(images) > 1 else []
-    moments: dict = {}
-    for one in (one for one in network.further if isinstance(one, Rigs)):
+    moments: dict[object, list[int]] = {}
+    for rigs in (kind for kind in network.further if isinstance(kind, Rigs)):
         row = {id: i for i, id in enumerate(images.id)}
-        for rig, epoch, image in zip(one.rig, one.epoch, one.image):
+        for rig, epoch, image in zip(rigs.rig, rigs.epoch, rigs.image):
             moments.setdefault((rig, epoch), []).append(row[image])
+    # one image of every camera, as a file of cameras is read, is a moment too
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
     whole = [
@@ -236,6 +244,7 @@ def mountings_of(network: Network) -> tuple[np.ndarray | None, list[str]]:
     ]
     if not whole or not np.isfinite(images.position[whole[0]]).all():
         return None, ["mountings of the cameras"]
+    # only the orientations that are written must be there
     need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
     rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
     R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])

@@ -11,6 +11,8 @@ from jaxbundle.network.tables import Camera, Network
 PIXEL_MODELS = ("opencv", "kannala-brandt")
 """Camera models common to formats of computer vision."""
 CORE = ("fx", "fy", "cx", "cy")
+GREY = (128, 128, 128)
+"""Red, green, blue of points in formats that require a colour, which a network does not have."""
 
 
 def need_values(network: Network, model: str = "", format: str = "", points: bool = True) -> None:
@@ -24,11 +26,11 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
                 f"camera {camera.id!r}: {format} has no model {str(camera.model)!r}; convert it "
                 f"with --model {model}"
             )
-    images, given = network.images, network.points
+    images, object_points = network.images, network.points
     tables = [
         (images, images.position, "image", "orientation"),
         (images, images.angles, "image", "orientation"),
-        (given, given.position, "point", "coordinates"),
+        (object_points, object_points.position, "point", "coordinates"),
     ]
     for table, values, thing, what in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
@@ -46,21 +48,22 @@ def describe_losses(
     ids become numbers; `rays` whether image points are lost.
     """
     images, points = network.images, network.points
-    found = {
+    lost = {
         "roles and σ of control, fixed and check points": not points.has_role("tie").all(),
         "prior σ of exterior orientations": not np.isnan(images.sigma).all(),
         "σ of image points": len(np.unique(network.observations.sigma)) > 1,
         "distances": len(network.distances) > 0,
-        **{one.TABLE: True for one in network.further},
+        **{kind.TABLE: True for kind in network.further},
         "that images share a camera": shared_cameras and len(network.cameras) < len(images),
         "names of images and points, which are numbered from 0": names
-        and not _numbered(images.id, points.id),
+        and not are_numbered_from_0(images.id, points.id),
         "image points": rays and len(network.observations) > 0,
     }
-    return tuple(what for what, there in found.items() if there)
+    return tuple(what for what, there in lost.items() if there)
 
 
-def _numbered(*ids) -> bool:
+def are_numbered_from_0(*ids: Sequence[str]) -> bool:
+    """Whether the names of each table are 0, 1, 2, …, as a format counts them."""
     return all(list(names) == [str(k) for k in range(len(names))] for names in ids)
 
 

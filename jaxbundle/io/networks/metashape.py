@@ -23,15 +23,18 @@ Source: Agisoft Metashape user manual, sections on formats; exported files.
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.cameras.nearest_camera import NoPlaceError
 from jaxbundle.io.networks.assemble import (
+    PIXEL_CENTRE,
     assemble,
     foreign_document,
     image_columns,
@@ -44,14 +47,12 @@ from jaxbundle.io.networks.metashape_camera import (
     sensor_camera,
 )
 from jaxbundle.io.networks.poses import check_rotations
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.xml_fields import number_in, read_xml
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Network, Points, Source
 from jaxbundle.system.file_content import beginning
 
-LEAST_CONTROL = 3
-ACCURACY = 0.005
-"""Metashape's default σ of markers."""
 LOCAL = "LOCAL_CS"
 
 
@@ -73,7 +74,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
     used = [c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None]
-    left = [label_of(c) for c in cameras if not any(c is u for u in used)]
+    left = [label_of(c) for c in cameras if c not in used]
     if not used:
         raise InputError(f"{path}: no camera is enabled and aligned")
     entries, told = _entries(path, sensors, used)
@@ -101,12 +102,13 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{what}: {list_some(left)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
-        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
-        network = with_control(network, control, datum=not datum)
+        network = with_control(network, control, datum=not choose_datum(overrides))
     return network.warn(*told, *_about_references(chunk, control))
 
 
-def _entries(path: Path, sensors: dict, used: Sequence[ET.Element]):
+def _entries(
+    path: Path, sensors: Mapping[str | None, ET.Element], used: Sequence[ET.Element]
+) -> tuple[dict[str | None, dict[str, Any]], list[str]]:
     """The entries of the sensors of the photographs, by id, and messages about them."""
     entries, told, refused = {}, [], {}
     for camera in used:
@@ -141,7 +143,9 @@ def _chunk(path: Path) -> ET.Element:
     return chunks[0]
 
 
-def _pose(where: str, camera: ET.Element, chunk: ET.Element):
+def _pose(
+    where: str, camera: ET.Element, chunk: ET.Element
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """M and X0, in the chunk's frame or, if it has a transform, in that of the world."""
     T = numbers_of(f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
     to_chunk, centre = T[:3, :3], T[:3, 3]
@@ -154,16 +158,18 @@ def _pose(where: str, camera: ET.Element, chunk: ET.Element):
     if transform is not None and (transform.text or "").strip():
         raise InputError(f"{where}: the transform of the chunk has no <rotation>, as old versions")
     if transform is not None and transform.find("rotation") is not None:
-        of = f"{where}, transform of the chunk"
-        R = numbers_of(f"{of}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
-        t = numbers_of(f"{of}, translation", transform.findtext("translation"), 3)
-        scale = number_in(transform.findtext("scale", ""), f"{of}, scale")
+        place = f"{where}, transform of the chunk"
+        R = numbers_of(f"{place}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
+        t = numbers_of(f"{place}, translation", transform.findtext("translation"), 3)
+        scale = number_in(transform.findtext("scale", ""), f"{place}, scale")
         to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
     check_rotations(to_chunk, f"{where}: the transform")
     return flip_rows(to_chunk.T), centre
 
 
-def _markers(path: Path, chunk: ET.Element, images: dict):
+def _markers(
+    path: Path, chunk: ET.Element, images: Mapping[str | None, str]
+) -> tuple[Columns | None, Columns | None, Points | None]:
     """Tables of points and image points of markers, and control points; each may be None."""
     markers = {m.get("id"): m for m in chunk.iterfind("markers//marker")}
     rows, seen = [], {}
@@ -176,10 +182,12 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
                 continue
             where = f"{path}, marker {label_of(markers[id])!r}, camera {location.get('camera_id')}"
             x, y = (number_in(location.get(k, ""), f"{where}, {k}") for k in "xy")
-            rows.append((images[location.get("camera_id")], id, x - 0.5, y - 0.5))
+            image = images[location.get("camera_id")]
+            rows.append((image, id, x - PIXEL_CENTRE, y - PIXEL_CENTRE))
             seen[id] = None
     if not rows:
         return None, None, None
+    # labels may repeat, ids may not
     names = dict(zip(seen, unique_labels([label_of(markers[id]) for id in seen], list(seen))))
     none = [None] * len(seen)
     image, point, x, y = zip(*rows)
@@ -202,7 +210,7 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
     )
 
 
-def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
+def _references(path: Path, chunk: ET.Element, markers: Mapping[str, ET.Element]) -> Points | None:
     """Control and check points of the markers with a reference in a local system; None if
     they define no datum."""
     if not _is_local(chunk):
@@ -215,20 +223,21 @@ def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
         where = f"{path}, reference of marker {id!r}"
         ids.append(id)
         roles.append("control" if _true(reference.get("enabled")) else "check")
-        position.append([number_in(reference.get(k), f"{where}, {k}") for k in "xyz"])
+        position.append([number_in(reference.get(k, ""), f"{where}, {k}") for k in "xyz"])
         sigma.append(
             [
                 number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
                 for k in ("sx", "sy", "sz")
             ]
         )
-    if roles.count("control") < LEAST_CONTROL:
+    # fewer than three points do not determine the seven parameters of a datum
+    if roles.count("control") < 3:
         return None
     sigma = np.where(np.array(sigma) > 0, sigma, _accuracy(chunk))
     return Points(tuple(ids), tuple(roles), np.array(position), sigma, Source(str(path)))
 
 
-def _about_references(chunk: ET.Element, control: Points | None):
+def _about_references(chunk: ET.Element, control: Points | None) -> Iterator[str]:
     """Messages about the references of markers."""
     if control is not None:
         yield (
@@ -245,6 +254,7 @@ def _about_references(chunk: ET.Element, control: Points | None):
 
 
 def _is_local(chunk: ET.Element) -> bool:
+    # a chunk without a reference is in a local frame
     return (chunk.findtext("reference") or LOCAL).strip().upper().startswith(LOCAL)
 
 
@@ -257,7 +267,7 @@ def _accuracy(chunk: ET.Element) -> float:
                 continue
             if accuracy > 0:
                 return accuracy
-    return ACCURACY
+    return 0.005  # m, the default of Metashape's settings
 
 
 def _true(word: str | None) -> bool:

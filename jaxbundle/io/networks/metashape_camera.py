@@ -24,25 +24,31 @@ appendix.
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
+from jaxbundle.io.networks.assemble import PIXEL_CENTRE
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import show
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-OLD = ("fx", "fy", "skew")
+OLD_COEFFICIENTS = ("fx", "fy", "skew")
 FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye", "equisolid", "equisolid_fisheye")
 TYPES = ("frame", *FISHEYE)
 PIXEL = ("pixel_width", "pixel_height")
 
 
-def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
+def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple[str, ...]]:
     """The entry of a sensor in a document, and warnings about a fit and unknown coefficients.
 
     **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
@@ -71,8 +77,8 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     values = {
         "fx": p["f"] + p["b1"],
         "fy": p["f"],
-        "cx": w / 2 + p["cx"] - 0.5,
-        "cy": h / 2 + p["cy"] - 0.5,
+        "cx": w / 2 + p["cx"] - PIXEL_CENTRE,
+        "cy": h / 2 + p["cy"] - PIXEL_CENTRE,
         "k1": p["k1"],
         "k2": p["k2"],
         "k3": p["k3"],
@@ -80,7 +86,7 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     if not (np.array([w, h, values["fx"], values["fy"]]) > 0).all():
         raise NoPlaceError(f"{where}: sizes and f must be positive")
     entry = {"id": label, "image_size": [w, h]}
-    decentred = p["p1"] != 0 or p["p2"] != 0
+    decentred = p["p1"] != 0 or p["p2"] != 0  # p3 and p4 are factors of these terms
     if kind == "frame":
         values |= {"p1": p["p2"], "p2": p["p1"]}
         rest = {name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))}
@@ -104,38 +110,37 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     return entry | found, (*told, f"sensor {label!r} {why}: {fit}")
 
 
-def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
+def _coefficients(
+    where: str, calibration: ET.Element, w: float, h: float
+) -> tuple[dict[str, float], str]:
     """All coefficients in the current form, and the names of unknown ones that are not 0."""
     tags = [element.tag for element in calibration]
-    twice = next((tag for tag in (*COEFFICIENTS, *OLD) if tags.count(tag) > 1), None)
+    twice = next((tag for tag in (*COEFFICIENTS, *OLD_COEFFICIENTS) if tags.count(tag) > 1), None)
     if twice:
         raise InputError(f"{where}: <{twice}> occurs twice")
-    given = {
+    values = {
         element.tag: number_in(element.text or "", f"{where}, {element.tag}")
         for element in calibration
-        if element.tag in (*COEFFICIENTS, *OLD) or _is_coefficient(element)
+        # k5 and the like are unknown here, but must not be dropped in silence
+        if element.tag in (*COEFFICIENTS, *OLD_COEFFICIENTS)
+        or (re.fullmatch(r"[a-z]\d+", element.tag) and not len(element))
     }
-    old = "f" not in given and "fy" in given
-    known = {*COEFFICIENTS, *OLD} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
-    ignored = [f"{tag} {value:g}" for tag, value in given.items() if tag not in known and value]
-    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in given.items() if k in known}
+    old = "f" not in values and "fy" in values
+    known = {*COEFFICIENTS, *OLD_COEFFICIENTS} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
+    ignored = [f"{tag} {value:g}" for tag, value in values.items() if tag not in known and value]
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in values.items() if k in known}
     if old:
         fy = p.pop("fy")
         p |= {
             "f": fy,
             "b1": p.pop("fx", fy) - fy,
             "b2": p.pop("skew", 0.0),
-            "cx": given.get("cx", w / 2) - w / 2,
-            "cy": given.get("cy", h / 2) - h / 2,
+            "cx": values.get("cx", w / 2) - w / 2,
+            "cy": values.get("cy", h / 2) - h / 2,
             "p1": p["p2"],
             "p2": p["p1"],
         }
     return p, ", ".join(ignored)
-
-
-def _is_coefficient(element: ET.Element) -> bool:
-    """Whether an element has a name like a coefficient, such as k5."""
-    return re.fullmatch(r"[a-z]\d+", element.tag) is not None and not len(element)
 
 
 def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
@@ -146,7 +151,9 @@ def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
     return pixel if min(pixel) > 0 else None
 
 
-def _project_metashape(kind: str, p: dict, X, Y, Z):
+def _project_metashape(
+    kind: str, p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     """The manual's formula, from the centre of the first pixel."""
     if kind == "frame":
         x, y = X / Z, Y / Z
@@ -162,7 +169,7 @@ def _project_metashape(kind: str, p: dict, X, Y, Z):
     xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
     yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
     u = p["w"] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
-    return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - 0.5
+    return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - PIXEL_CENTRE
 
 
 FORMULAS = {kind: partial(_project_metashape, kind) for kind in TYPES}
@@ -173,7 +180,7 @@ def label_of(element: ET.Element) -> str:
     return element.get("label") or element.get("id") or "?"
 
 
-def numbers_of(where: str, text: str | None, n: int) -> np.ndarray:
+def numbers_of(where: str, text: str | None, n: int) -> Float[np.ndarray, " n"]:
     """The given number of finite numbers."""
     words = (text or "").split()
     if len(words) != n:

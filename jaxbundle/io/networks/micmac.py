@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
@@ -30,6 +31,7 @@ from jaxbundle.io.networks.losses import describe_losses, need_values
 from jaxbundle.io.networks.micmac_camera import C2M, M2C, calibration, calibration_lines, document
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.tables import Camera, Network, Source
@@ -60,11 +62,12 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         where, root = _calibration(file, xml)
         if where not in cameras:
             id = where.stem.removeprefix(CALIBRATION if where != file else ORIENTATION)
+            # once for all images that share it
             cameras[where] = calibration(where, root, id)
         C2W, X0 = _pose(xml)
         names.append(file.stem.removeprefix(ORIENTATION))
         used.append(cameras[where].id)
-        rotations.append(C2W.T)
+        rotations.append(C2W.T)  # world → camera, as R of x = R·X + t
         centres.append(X0)
     images = image_columns(
         Source(str(path), None, "file"),
@@ -91,7 +94,7 @@ def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
     raise InputError(f"{file}: FileInterne {name}: there is no such file beside it, nor above")
 
 
-def _pose(xml: XmlFields) -> tuple[np.ndarray, np.ndarray]:
+def _pose(xml: XmlFields) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """The rotation from camera to world, and the projection centre."""
     kind = xml.text("TypeProj", "eProjStenope")
     external = xml.find("Externe")
@@ -136,6 +139,7 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
     need_values(network, points=False)
     images = network.images
     for id in (*images.id, *(camera.id for camera in network.cameras)):
+        # names of files are made of them
         if "/" in id or not id.strip("."):
             raise InputError(f"{folder}: {id!r} cannot be part of the name of a file")
     calibrations = {camera.id: document(calibration_lines(camera)) for camera in network.cameras}
@@ -150,20 +154,19 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
     return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
 
 
-def _orientation(file: str, C2W: np.ndarray, X0: np.ndarray) -> list[str]:
-    text = lambda values: " ".join(repr(float(value)) for value in values)
-    rows = [f"<L{i}>{text(row)}</L{i}>" for i, row in enumerate(C2W, 1)]
+def _orientation(file: str, C2W: Float[np.ndarray, "3 3"], X0: Float[np.ndarray, "3"]) -> list[str]:
+    rows = [f"<L{i}>{join_numbers(row)}</L{i}>" for i, row in enumerate(C2W, 1)]
     return [
         "<OrientationConique>",
         "<OrIntImaM2C>",
-        *(f"<{name}>{text(values)}</{name}>" for name, values in IDENTITY.items()),
+        *(f"<{name}>{join_numbers(values)}</{name}>" for name, values in IDENTITY.items()),
         "</OrIntImaM2C>",
         "<TypeProj>eProjStenope</TypeProj>",
         f"<FileInterne>{html.escape(file, quote=False)}</FileInterne>",
         "<RelativeNameFI>true</RelativeNameFI>",
         "<Externe>",
         f"<KnownConv>{M2C[0]}</KnownConv>",
-        f"<Centre>{text(X0)}</Centre>",
+        f"<Centre>{join_numbers(X0)}</Centre>",
         "<ParamRotation>",
         "<CodageMatr>",
         *rows,

@@ -18,7 +18,7 @@ three coefficients or fewer is exactly `opencv`, with fx and fy tied,
     k1 = R3·F²   k2 = R5·F⁴   k3 = R7·F⁶   p1 = P2·F   p2 = P1·F
 
 With an affinity b1, b2 it is `brown-projected`, and C2M is `brown`, exactly, P2 and b2 with the
-other sign. These are in mm: the pixel size, missing from the file, is taken as `PIXEL`; another
+other sign. These are in mm: the pixel size, missing from the file, is taken as 0.005 mm; another
 would scale c and coefficients, and change nothing in pixels. With more coefficients, or C different
 from PP, the nearest of our models is fitted, as for ModUnif (`micmac_unified`). A separate affine
 part (OrIntGlob) is refused by name. Which point of the first pixel is
@@ -34,6 +34,8 @@ from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar
@@ -50,16 +52,12 @@ from jaxbundle.system.file_content import beginning
 CALIBRATION = "CalibrationInternConique"
 M2C = ("eConvApero_DistM2C", "eConvOriLib")
 C2M = ("eConvApero_DistC2M",)
-ITERATIONS = 12
-"""Newton's method for the image where the distortion leads to the world."""
-PIXEL = 0.005
-"""mm."""
 MODELS = ("opencv", "brown-projected", "brown")
 """Models that can be written."""
-LONGEST = 5
+RADIAL = ("R1", "R2", "R3", "R4", "R5")
 """Coefficients CoeffDist of MicMac's models."""
 AFFINE = ("P1", "P2", "b1", "b2")
-COEFFICIENTS = (*(f"R{i}" for i in range(1, LONGEST + 1)), *AFFINE)
+COEFFICIENTS = (*RADIAL, *AFFINE)
 
 
 def is_autocal(path: Path) -> bool:
@@ -77,8 +75,12 @@ def read_autocal(path: str | Path) -> Camera:
     return calibration(path, read_xml(path), path.stem)
 
 
-def calibration(path: Path, root: ET.Element, id: str) -> Camera:
-    """The camera of the calibration in a document."""
+def calibration(path: Path, root: ET.Element, id: str, pixel_size: float = 0.005) -> Camera:
+    """The camera of the calibration in a document.
+
+    **Arguments:** `pixel_size` [mm] of a model in mm, since the file has none. Any value gives the
+    same image; 5 µm is a common one, so that c in mm looks like that of a lens.
+    """
     whole = XmlFields(path, root, "a calibration of MicMac")
     found = whole.find(CALIBRATION)
     if found is None:
@@ -101,42 +103,45 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
                 f"{path}: ModUnif with KnownConv {direction} is not supported; {M2C[0]} is expected"
             )
         unified = next(kind for kind in kinds if kind.tag == "ModUnif")
-        return unified_camera(id, xml, unified, core, (int(w), int(h)), PIXEL)
+        return unified_camera(id, xml, unified, core, (int(w), int(h)), pixel_size)
     p = core | _distortion(xml, core)
     start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
     odd = {
         "more than three coefficients": p["R4"] or p["R5"],
+        # equal to the last bit: MicMac writes one number twice (PPaEqPPs)
         "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
     }
     has = " and ".join(what for what, there in odd.items() if there)
     size = int(w), int(h)
     if has:
-        foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (PIXEL, PIXEL))
+        foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (pixel_size, pixel_size))
         return fit_camera(id, foreign, str(path), f"has {has}")
+    # without affinity, or any distortion of the other direction, the formulas are the same
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
-    model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {PIXEL:g} mm"
+    model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {pixel_size:g} mm"
     return FittedCamera(
         id,
         model,
-        _in_mm(p, size),
+        _in_mm(p, size, pixel_size),
         image_size=size,
-        pixel_size=(PIXEL, PIXEL),
+        pixel_size=(pixel_size, pixel_size),
         told=f"camera {id!r} is {model}, which is in mm: {told}; in pixels it changes nothing",
     )
 
 
-def _in_mm(p: Mapping[str, float], size: tuple[int, int]) -> dict[str, float]:
-    """The parameters of Brown's model with a pixel of `PIXEL`, y up."""
-    found = {f"K{i}": p[f"R{i}"] / PIXEL ** (2 * i) for i in (1, 2, 3)}
-    x0, y0 = (PIXEL * (p[c] - (n - 1) / 2) for c, n in zip(("cx", "cy"), size))
-    return found | {
-        "c": p["fx"] * PIXEL,
+def _in_mm(p: Mapping[str, float], size: tuple[int, int], pixel: float) -> dict[str, float]:
+    """The parameters of Brown's model in mm, y up."""
+    radial = {f"K{i}": p[f"R{i}"] / pixel ** (2 * i) for i in (1, 2, 3)}
+    x0, y0 = (pixel * (p[c] - (n - 1) / 2) for c, n in zip(("cx", "cy"), size))
+    # y turns round: P2 and b2 are of odd terms in y
+    return radial | {
+        "c": p["fx"] * pixel,
         "x0": x0,
         "y0": -y0,
-        "P1": p["P1"] / PIXEL,
-        "P2": -p["P2"] / PIXEL,
+        "P1": p["P1"] / pixel,
+        "P2": -p["P2"] / pixel,
         "b1": p["b1"],
         "b2": -p["b2"],
     }
@@ -161,11 +166,11 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
     part = XmlFields(xml.path, kinds[0], f"a {kinds[0].tag} of MicMac")
     x, y = part.numbers("CDist", 2)
     R = [number_in(e.text or "", f"{xml.path}: CoeffDist") for e in kinds[0].iter("CoeffDist")]
-    if any(R[LONGEST:]):
-        raise InputError(f"{xml.path}: {len(R)} coefficients CoeffDist; {LONGEST} are known")
-    found = none | {f"R{i}": r for i, r in enumerate(R[:LONGEST], 1)}
-    found |= {name: part.number(name, 0.0) for name in AFFINE}
-    return found | {"x": float(x), "y": float(y)}
+    if any(R[len(RADIAL) :]):
+        raise InputError(f"{xml.path}: {len(R)} coefficients CoeffDist; {len(RADIAL)} are known")
+    coefficients = none | dict(zip(RADIAL, R))
+    coefficients |= {name: part.number(name, 0.0) for name in AFFINE}
+    return coefficients | {"x": float(x), "y": float(y)}
 
 
 def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
@@ -177,10 +182,14 @@ def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     return x + dx, y + y * R + P2 * (r2 + 2 * y * y) + 2 * P1 * x * y
 
 
-_from_world = implicit_inverse(_distort, lambda p, x, y: (x, y), ITERATIONS)
+# Twelve iterations, as in `cameras.fisheye_prism`: Newton's method starts at the point itself and
+# converges quadratically; more only take time.
+_from_world = implicit_inverse(_distort, lambda _, x, y: (x, y), 12)
 
 
-def _image(direction: Formula, p: Mapping, X, Y, Z):
+def _image(
+    direction: Formula, p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     """The image of a ray: `direction` maps from the ideal image."""
     x, y = p["fx"] * X / Z + p["cx"] - p["x"], p["fy"] * Y / Z + p["cy"] - p["y"]
     x, y = direction(tuple(p[name] for name in COEFFICIENTS), x, y)
@@ -197,7 +206,7 @@ def calibration_lines(camera: Camera) -> list[str]:
     **Raises:** `InputError` for another camera, and without image size.
     """
     w, h = size_of(camera, "MicMac")
-    p = _of_brown(camera, w, h) if camera.model in MODELS[1:] else _of_opencv(camera)
+    p = _from_brown(camera, w, h) if camera.model in MODELS[1:] else _from_opencv(camera)
     centre = f"{p['cx']!r} {p['cy']!r}"
     radial = [f"<CDist>{centre}</CDist>"]
     radial += [f"<CoeffDist>{p[f'R{i}']!r}</CoeffDist>" for i in (1, 2, 3)]
@@ -226,16 +235,17 @@ def calibration_lines(camera: Camera) -> list[str]:
     ]
 
 
-def _of_opencv(camera: Camera) -> dict[str, float]:
+def _from_opencv(camera: Camera) -> dict[str, float]:
     p = check_others_zero(camera, "MicMac", ("k1", "k2", "k3", "p1", "p2"))
     if camera.model != MODELS[0]:
         raise InputError(f"camera {camera.id!r}: a fisheye is not written for MicMac")
     f = one_focal_length(camera, "MicMac")
     radial = {f"R{i}": p[f"k{i}"] / f ** (2 * i) for i in (1, 2, 3)}
+    # the decentring terms of OpenCV have their names the other way round
     return p | radial | {"P1": p["p2"] / f, "P2": p["p1"] / f, "b1": 0.0, "b2": 0.0}
 
 
-def _of_brown(camera: Camera, w: int, h: int) -> dict[str, float]:
+def _from_brown(camera: Camera, w: int, h: int) -> dict[str, float]:
     p, (px, py) = all_parameters(camera), camera.pixel_size or (0.0, 1.0)
     if px != py or p["r0"]:
         raise InputError(

@@ -18,20 +18,31 @@ Source: the formulas as MicMac (`phgr_ebner_brown_dist.cpp`) and iTowns' reader 
 them.
 """  # noqa: E501
 
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, root
 from jaxbundle.io.text.xml_fields import XmlFields, number_in
 
-FISHEYE_PARAMS = 24
+UnifiedParameters = Mapping[str, Any]
+"""fx = fy, cx, cy: scalars; `V`, `S`: arrays of Params and Etats."""
 
 
 def unified_camera(
-    id: str, xml: XmlFields, part, core: Mapping[str, float], size: tuple[int, int], pixel: float
+    id: str,
+    xml: XmlFields,
+    part: ET.Element,
+    core: Mapping[str, float],
+    size: tuple[int, int],
+    pixel: float,
 ) -> FittedCamera:
     """The nearest of our cameras; `part`: the element `ModUnif`, `core`: fx = fy, cx, cy.
 
@@ -56,21 +67,24 @@ def unified_camera(
         )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
+    # coefficients that are missing are 0
     V = (V + [0.0] * most)[:most]
     fisheye, start = "FishEye" in kind, dict(core)
     if fisheye:
         start = {"fx": S[0], "fy": S[0], "cx": V[0], "cy": V[1]}
         start |= {f"k{i}": V[1 + i] for i in (1, 2, 3, 4)}
-    given = {**core, "V": jnp.array(V), "S": jnp.array(S)}
-    foreign = Foreign(formula, given, start, size, (pixel, pixel), fisheye)
+    parameters = {**core, "V": jnp.array(V), "S": jnp.array(S)}
+    foreign = Foreign(formula, parameters, start, size, (pixel, pixel), fisheye)
     return fit_camera(id, foreign, str(xml.path), f"is {kind}")
 
 
-def _pinhole(p, X, Y, Z):
+def _pinhole(p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar) -> tuple[Scalar, Scalar]:
     return p["cx"] + p["fx"] * X / Z, p["cy"] + p["fy"] * Y / Z
 
 
-def _polynomial(degree: int, p, X, Y, Z):
+def _polynomial(
+    degree: int, p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     V, S = p["V"], p["S"]
     u, v = _pinhole(p, X, Y, Z)
     if degree < 2:
@@ -79,26 +93,26 @@ def _polynomial(degree: int, p, X, Y, Z):
     x, y = (u - S[1]) / S[0], (v - S[2]) / S[0]
     dx = V[0] * x + V[1] * y - 2 * V[2] * x * x + V[3] * x * y + V[4] * y * y
     dy = -V[0] * y + V[1] * x + V[2] * x * y - 2 * V[3] * y * y + V[5] * x * x
-    at = 6
+    begin = 6  # of the coefficients of degree d: V0 … V5 are those of degrees 1 and 2
     for d in range(3, degree + 1):
         monomials = jnp.stack([x ** (d - k) * y**k for k in range(d + 1)])
-        dx = dx + V[at : at + d + 1] @ monomials
-        dy = dy + V[at + d + 1 : at + 2 * d + 2] @ monomials
-        at += 2 * d + 2
+        dx = dx + V[begin : begin + d + 1] @ monomials
+        dy = dy + V[begin + d + 1 : begin + 2 * d + 2] @ monomials
+        begin += 2 * d + 2
     return jnp.stack([u + S[0] * dx, v + S[0] * dy])
 
 
-def _ebner(p, X, Y, Z):
+def _ebner(p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     x, y = _pinhole(p, X, Y, Z)
     a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11, a12 = p["V"]
-    base = 2 * p["S"][0] ** 2 / 3
+    base = 2 * p["S"][0] ** 2 / 3  # makes x² and y² orthogonal to 1 over a 3 × 3 grid of points
     s, t = x * x - base, y * y - base
     dx = a1 * x + a2 * y - 2 * a3 * s + a4 * x * y + a5 * t + a7 * x * t + a9 * y * s + a11 * s * t
     dy = a2 * x - a1 * y + a3 * x * y - 2 * a4 * t + a6 * s + a8 * y * s + a10 * x * t + a12 * s * t
     return jnp.stack([x + dx, y + dy])
 
 
-def _brown(p, X, Y, Z):
+def _brown(p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     x, y = _pinhole(p, X, Y, Z)
     a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11, a12, a13, a14 = p["V"]
     s, t = x * x, y * y
@@ -108,7 +122,7 @@ def _brown(p, X, Y, Z):
     return jnp.stack([x + dx, y + dy])
 
 
-def _fraser(p, X, Y, Z):
+def _fraser(p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     V = jnp.pad(p["V"], (0, 9 - len(p["V"])))
     x, y = p["fx"] * X / Z, p["fy"] * Y / Z
     r2 = x * x + y * y
@@ -118,8 +132,11 @@ def _fraser(p, X, Y, Z):
     return jnp.stack([p["cx"] + x + dx, p["cy"] + y + dy])
 
 
-def _fisheye(equisolid: bool, p, X, Y, Z):
+def _fisheye(
+    equisolid: bool, p: UnifiedParameters, X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     V, F = p["V"], p["S"][0]
+    # homogeneous: a ray of 90° and beyond has Z ≤ 0
     a = p["fx"] * X + (p["cx"] - V[0]) * Z
     b = p["fy"] * Y + (p["cy"] - V[1]) * Z
     tangent = root(a * a + b * b)
@@ -128,7 +145,7 @@ def _fisheye(equisolid: bool, p, X, Y, Z):
     scale = jnp.where(tangent > 0, rho / jnp.where(tangent > 0, tangent, 1.0), 1 / (F * Z))
     x, y = a * scale, b * scale
     r2 = x * x + y * y
-    radial = 1 + r2 * jnp.polyval(V[11:1:-1], r2)
+    radial = 1 + r2 * jnp.polyval(V[11:1:-1], r2)  # V2 … V11, the highest power first
     dx, dy = V[22] * x + V[23] * y, V[23] * x
     for k in range(5):
         P, Q, n = V[12 + 2 * k], V[13 + 2 * k], 2 * k + 2
@@ -137,21 +154,22 @@ def _fisheye(equisolid: bool, p, X, Y, Z):
     return jnp.stack([V[0] + F * (x * radial + dx), V[1] + F * (y * radial + dy)])
 
 
-def _length(degree: int) -> int:
-    """Params of a polynomial."""
+def _count_params(degree: int) -> int:
+    """Params of a polynomial: the first two degrees share coefficients (a similarity is fixed by
+    the orientation), from the third on every monomial has one in x and one in y."""
     return {0: 0, 1: 2, 2: 6}.get(degree, 6 + sum(2 * d + 2 for d in range(3, degree + 1)))
 
 
 FORMULAS = {
     **{
-        f"eModelePolyDeg{n}": (partial(_polynomial, n), 3 if n > 1 else 0, _length(n))
+        f"eModelePolyDeg{n}": (partial(_polynomial, n), 3 if n > 1 else 0, _count_params(n))
         for n in range(8)
     },
     "eModeleEbner": (_ebner, 1, 12),
     "eModeleDCBrown": (_brown, 1, 14),
     "eModele_DRad_PPaEqPPs": (_fraser, 0, 5),
     "eModele_Fraser_PPaEqPPs": (_fraser, 0, 9),
-    "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, FISHEYE_PARAMS),
-    "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, FISHEYE_PARAMS),
+    "eModele_FishEye_10_5_5": (partial(_fisheye, False), 1, 24),
+    "eModele_EquiSolid_FishEye_10_5_5": (partial(_fisheye, True), 1, 24),
 }
 """By kind: the formula, the number of Etats, the number of Params."""

@@ -35,7 +35,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.cameras.nearest_camera import Foreign, fit_camera, fit_messages
@@ -54,6 +57,7 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network, Source
@@ -73,7 +77,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 CAHVOR = ("alpha", "beta", "r0", "r1", "r2")
 SPLINE = re.compile(r"SPLINED_STEREOGRAPHIC_order=3_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+(?:\.\d+)?)")
 OUR_SPLINE = re.compile(r"spline-(\d+)x(\d+)-(\d+(?:\.\d+)?)")
-OFFERED = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
+OFFERED_MODELS = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
 
 
 def is_mrcal(path: Path) -> bool:
@@ -113,6 +117,8 @@ def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _fields(file: Path) -> JsonFields:
+    # A literal of Python is evaluated without executing anything; what it raises for a text that
+    # is none is not documented as one class.
     try:
         document = ast.literal_eval(read_text(file).strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
@@ -162,13 +168,14 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     )
     if not exact:
         raise InputError(f"{fields.path}: r0 of the intrinsics is {p['r0']:g}; 1 + r0 must be > 0")
+    # with the axis along z the terms of CAHVOR are those of `opencv` (the module's docstring)
     if p["alpha"] == 0 == p["beta"]:
         return Camera(id, "opencv", exact, image_size=(w, h))
     foreign = Foreign(cahvor, p, exact, (w, h))
     return fit_camera(id, foreign, str(fields.path), "is of CAHVOR with a separate axis")
 
 
-def cahvor(p: Mapping, X, Y, Z):
+def cahvor(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The image of a ray by CAHVOR."""
     a, b = p["alpha"], p["beta"]
     o = jnp.stack([jnp.sin(a) * jnp.cos(b), jnp.sin(b), jnp.cos(a) * jnp.cos(b)])
@@ -200,7 +207,7 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
         for kind, more in kinds.items()
         if not any(p[name] for name in p if name not in (*CORE, *more))
     )
-    numbers = lambda values: f"[ {', '.join(repr(float(value)) for value in values)} ]"
+    numbers = lambda values: f"[ {join_numbers(values, ', ')} ]"
     return (
         f"{{\n    'lensmodel':  '{PREFIX}{kind}',\n"
         f"    'intrinsics': {numbers(p[name] for name in (*CORE, *kinds[kind]))},\n"
@@ -232,7 +239,7 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     twice = next((name for name in names if names.count(name) > 1 or not name.strip(".")), None)
     if twice is not None:
         raise InputError(f"{folder}: image {twice!r} does not give a unique file name")
-    texts = [model_text(network.cameras[c], one) for c, one in zip(images.camera, rt)]
+    texts = [model_text(network.cameras[c], pose) for c, pose in zip(images.camera, rt)]
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
         write_text(folder / f"{name}{SUFFIX}", text)

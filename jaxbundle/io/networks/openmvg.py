@@ -33,8 +33,10 @@ Source: openMVG documentation, "SfM_Data", "cameras"; the serialisation of its c
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
@@ -53,6 +55,7 @@ from jaxbundle.io.networks.losses import (
     size_of,
 )
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.network.columns import Columns, count, list_some
@@ -69,12 +72,13 @@ KINDS = {
 """Our model, the field of the coefficients, and their names here."""
 SPHERICAL = "spherical"
 MIRROR = np.array([1.0, -1.0, 1.0])
-NONE = 2**32 - 1
-"""openMVG's index of a missing entry."""
-FIRST = 2**31
-"""The bit of a new number; its name follows."""
-ALIKE = 2**30
-"""The number of an object of the declared class."""
+UNDEFINED_INDEX = 2**32 - 1
+"""Index of a missing entry, the largest of 32 bits (openMVG, `types.hpp`, UndefinedIndexT)."""
+NEW_NUMBER = 2**31
+"""The bit of a new number, whose name or object follows (cereal, `details/helpers.hpp`,
+msb_32bit)."""
+DECLARED_CLASS = 2**30
+"""The number of an object of the declared class (cereal, `details/helpers.hpp`, msb2_32bit)."""
 
 
 def is_openmvg(path: Path) -> bool:
@@ -101,25 +105,14 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
     tie, rays = _structure(scene, "structure", views)
     control, clicks = _structure(scene, "control_points", views)
-    names = {key: _control_name(key, tie) for key in control}
+    # numbers of control points and of structure are counted apart, and may be equal
+    names = {key: f"control {key}" if key in tie else str(key) for key in control}
     seen = {view for view, *_ in (*rays, *clicks)}
     posed = {key for key, view in views.items() if view.get("id_pose") in poses}
     lost = [_name(views[key]) for key in views if key not in posed and key not in seen]
     views = {key: view for key, view in views.items() if key in posed or key in seen}
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
-    told = [
-        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
-        for ids, why in (
-            (left, "of spherical cameras or without intrinsics"),
-            (lost, "without pose and image points"),
-        )
-        if ids
-    ]
-    if any(view.get("use_pose_center_prior") for view in views.values()):
-        told.append("priors of projection centres (use_pose_center_prior) are not read")
-    if mirror is MIRROR:
-        told.append("the scene of spherical cameras is a mirror image: its Y is negated")
     labels = unique_labels([_name(view) for view in views.values()], list(views))
     image_ids = dict(zip(views, labels))
     network = assemble(
@@ -136,38 +129,51 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             },
             Source(str(path), None, "observation"),
         ),
-        told,
+        _describe_unread(views, left, lost, mirror is MIRROR),
     )
-    if control and len(network.points):
-        at = stack_rows(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
-        at = at * mirror
-        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
-        unknown = np.full((len(control), 3), np.nan)
-        table = Points(
-            tuple(names.values()),
-            ("control",) * len(control),
-            at,
-            unknown,
-            Source(str(path), None, "control point"),
+    if not control or not len(network.points):
+        return network
+    place = lambda k: (f"{path}, control_points[{k}]", "X")
+    X = stack_rows(list(control.values()), 3, place) * mirror
+    unknown = np.full((len(control), 3), np.nan)
+    source = Source(str(path), None, "control point")
+    table = Points(tuple(names.values()), ("control",) * len(control), X, unknown, source)
+    return with_control(network, table, datum=not choose_datum(overrides))
+
+
+def _describe_unread(
+    views: Mapping[int, JsonFields], left: Sequence[str], lost: Sequence[str], mirrored: bool
+) -> list[str]:
+    """Messages about what is not read, and about a mirrored scene."""
+    messages = [
+        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
+        for ids, why in (
+            (left, "of spherical cameras or without intrinsics"),
+            (lost, "without pose and image points"),
         )
-        network = with_control(network, table, datum=not datum)
-    return network
+        if ids
+    ]
+    if any(view.get("use_pose_center_prior") for view in views.values()):
+        messages.append("priors of projection centres (use_pose_center_prior) are not read")
+    if mirrored:
+        messages.append("the scene of spherical cameras is a mirror image: its Y is negated")
+    return messages
 
 
 def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
     """The values of a list of keys and values."""
-    found: dict[int, JsonFields] = {}
+    values: dict[int, JsonFields] = {}
     for row in scene.rows(name):
         key = row.integer("key")
-        if key in found:
+        if key in values:
             raise InputError(f"{row.path}: key {key} occurs twice")
-        found[key] = row.of("value")
-    return found
+        values[key] = row.child("value")
+    return values
 
 
 def _data(value: JsonFields) -> JsonFields:
     """The object of a pointer, with inherited fields."""
-    data = value.of("ptr_wrapper.data")
+    data = value.child("ptr_wrapper.data")
     fields, more = {}, data.document
     while isinstance(more, dict):
         fields = {**more, **fields}
@@ -175,15 +181,15 @@ def _data(value: JsonFields) -> JsonFields:
     return JsonFields(data.path, fields)
 
 
-def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]:
+def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, JsonFields]]:
     """The entries of cameras by number, and the fields of spherical ones."""
     names: dict[int, str] = {}
     cameras, spherical = {}, {}
     for key, value in _entries(scene, "intrinsics").items():
-        number = value.integer("polymorphic_id", ALIKE)
+        number = value.integer("polymorphic_id", DECLARED_CLASS)
         if value.get("polymorphic_name") is not None:
-            names[number % FIRST] = value.text("polymorphic_name")
-        name = names.get(number % FIRST, "")
+            names[number % NEW_NUMBER] = value.text("polymorphic_name")
+        name = names.get(number % NEW_NUMBER, "")
         if name == SPHERICAL:
             spherical[key] = _data(value)
             continue
@@ -195,7 +201,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
         model, field, coefficients = KINDS[name]
         data = _data(value)
         f, (cx, cy) = data.number("focal_length"), data.array("principal_point", (2,))
-        given = data.array(field, (len(coefficients),)).tolist() if field else ()
+        values = data.array(field, (len(coefficients),)).tolist() if field else ()
         cameras[key] = {
             "id": str(key),
             "model": model,
@@ -205,12 +211,12 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]
             "fy": f,
             "cx": float(cx),
             "cy": float(cy),
-            **dict(zip(coefficients, given)),
+            **dict(zip(coefficients, values)),
         }
     return cameras, spherical
 
 
-def _sphere(key: int, data: JsonFields) -> dict:
+def _sphere(key: int, data: JsonFields) -> dict[str, Any]:
     """The entry of a spherical camera."""
     w, h = data.integer("width", least=1), data.integer("height", least=1)
     f = max(w, h) / (2 * np.pi)
@@ -225,15 +231,17 @@ def _sphere(key: int, data: JsonFields) -> dict:
     }
 
 
-def _views(scene: JsonFields, cameras: Mapping, spherical: Mapping):
+def _views(
+    scene: JsonFields, cameras: Mapping[int, dict], spherical: Mapping[int, JsonFields]
+) -> tuple[dict[int, JsonFields], list[str]]:
     """The views with a camera, by number, and the names of the others."""
     views, left = {}, []
     for key, value in _entries(scene, "views").items():
         view = _data(value)
-        camera = view.integer("id_intrinsic", NONE)
+        camera = view.integer("id_intrinsic", UNDEFINED_INDEX)
         if camera in cameras:
             views[key] = view
-        elif camera in spherical or camera == NONE:
+        elif camera in spherical or camera == UNDEFINED_INDEX:
             left.append(_name(view))
         else:
             raise InputError(f"{view.path}: id_intrinsic {camera} is not among the intrinsics")
@@ -247,7 +255,11 @@ def _name(view: JsonFields) -> str:
 
 
 def _images(
-    path: Path, views: Mapping, names: Mapping, poses: Mapping, mirror: np.ndarray
+    path: Path,
+    views: Mapping[int, JsonFields],
+    names: Mapping[int, str],
+    poses: Mapping[int, JsonFields],
+    mirror: Float[np.ndarray, "3"],
 ) -> Columns:
     R, X0 = (np.full((len(views), *shape), np.nan) for shape in ((3, 3), (3,)))
     for k, view in enumerate(views.values()):
@@ -257,11 +269,13 @@ def _images(
             check_rotations(R[k], f"{pose.path}: rotation")
     cameras = [view.integer("id_intrinsic") for view in views.values()]
     source = Source(str(path), np.array(list(views)), "view")
-    R = mirror[:, None] * R * mirror
+    R = mirror[:, None] * R * mirror  # S·R·S and S·X0, S = diag(mirror): both frames are mirrored
     return image_columns(source, list(names.values()), cameras, flip_rows(R), X0 * mirror)
 
 
-def _structure(scene: JsonFields, name: str, views: Mapping):
+def _structure(
+    scene: JsonFields, name: str, views: Mapping[int, JsonFields]
+) -> tuple[dict[int, Any], list[tuple[int, int, Any]]]:
     """X of the points by number, and (view, point, x) of the image points."""
     points, rays = {}, []
     for key, value in _entries(scene, name).items():
@@ -273,23 +287,21 @@ def _structure(scene: JsonFields, name: str, views: Mapping):
     return points, rays
 
 
-def _image_points(path: Path, rays: Sequence) -> np.ndarray:
+def _image_points(path: Path, rays: Sequence[tuple[int, int, Any]]) -> Float[np.ndarray, "rays 2"]:
     def place(k: int) -> tuple[str, str]:
         return f"{path}, point {rays[k][1]}, view {rays[k][0]}", "x"
 
     return stack_rows([x for *_, x in rays], 2, place).reshape(-1, 2)
 
 
-def _points(path: Path, tie: Mapping, control: Sequence[str], mirror: np.ndarray) -> Columns:
+def _points(
+    path: Path, tie: Mapping[int, Any], control: Sequence[str], mirror: Float[np.ndarray, "3"]
+) -> Columns:
     place = lambda k: (f"{path}, structure[{k}]", "X")
     known = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
     position = np.concatenate([known, np.full((len(control), 3), np.nan)])
     columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
     return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))
-
-
-def _control_name(key: int, tie: Mapping) -> str:
-    return f"control {key}" if key in tie else str(key)
 
 
 def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -300,28 +312,6 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     need_values(network)
     images, points, rays = network.images, network.points, network.observations
-    sizes = [network.cameras[c].image_size or (0, 0) for c in images.camera.tolist()]
-    views = [
-        _entry(
-            i,
-            {
-                "polymorphic_id": ALIKE,
-                "ptr_wrapper": {
-                    "id": FIRST + i + 1,
-                    "data": {
-                        "local_path": "",
-                        "filename": id,
-                        "width": w,
-                        "height": h,
-                        "id_view": i,
-                        "id_intrinsic": c,
-                        "id_pose": i,
-                    },
-                },
-            },
-        )
-        for i, (id, c, (w, h)) in enumerate(zip(images.id, images.camera.tolist(), sizes))
-    ]
     R = flip_rows(matrices_of(images.angles))
     extrinsics = [
         _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
@@ -344,8 +334,8 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     scene = {
         "sfm_data_version": "0.3",
         "root_path": "",
-        "views": views,
-        "intrinsics": _intrinsics(network.cameras, FIRST + len(images) + 1),
+        "views": _view_entries(network),
+        "intrinsics": _intrinsics(network.cameras, NEW_NUMBER + len(images) + 1),
         "extrinsics": extrinsics,
         "structure": tables[0],
         "control_points": tables[1],
@@ -356,7 +346,19 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     return (*lost, *(("names of points",) if list(map(str, numbers)) != list(points.id) else ()))
 
 
-def _entry(key: int, value: dict) -> dict:
+def _view_entries(network: Network) -> list[dict[str, Any]]:
+    """The entries of the images; their pointers are numbered from 1."""
+    entries = []
+    for i, (id, c) in enumerate(zip(network.images.id, network.images.camera.tolist())):
+        w, h = network.cameras[c].image_size or (0, 0)
+        data = {"local_path": "", "filename": id, "width": w, "height": h}
+        data |= {"id_view": i, "id_intrinsic": c, "id_pose": i}
+        pointer = {"id": NEW_NUMBER + i + 1, "data": data}
+        entries.append(_entry(i, {"polymorphic_id": DECLARED_CLASS, "ptr_wrapper": pointer}))
+    return entries
+
+
+def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
     return {"key": key, "value": value}
 
 
@@ -366,19 +368,21 @@ def _numbers(ids: Sequence[str]) -> list[int]:
     return [int(id) for id in ids] if plain else list(range(len(ids)))
 
 
-def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict]:
+def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict[str, Any]]:
+    """The entries of cameras, whose pointers are numbered from `first`; only the first of a kind
+    has its name."""
     entries, numbers = [], {}
     for k, camera in enumerate(cameras):
         name, data = _intrinsic(camera)
         kind = {"polymorphic_id": numbers.get(name, 0)}
         if name not in numbers:
             numbers[name] = len(numbers) + 1
-            kind = {"polymorphic_id": FIRST + numbers[name], "polymorphic_name": name}
+            kind = {"polymorphic_id": NEW_NUMBER + numbers[name], "polymorphic_name": name}
         entries.append(_entry(k, kind | {"ptr_wrapper": {"id": first + k, "data": data}}))
     return entries
 
 
-def _intrinsic(camera: Camera) -> tuple[str, dict]:
+def _intrinsic(camera: Camera) -> tuple[str, dict[str, Any]]:
     """The smallest kind that holds a camera, and its fields."""
     kinds = {n: (field, c) for n, (model, field, c) in KINDS.items() if model == camera.model}
     most = max((c for _, c in kinds.values()), key=len, default=())

@@ -28,10 +28,14 @@ the tangential part, where the page has 2x, 2y.
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.cameras.nearest_camera import (
@@ -43,6 +47,7 @@ from jaxbundle.io.cameras.nearest_camera import (
 )
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.networks.losses import (
+    GREY,
     check_others_zero,
     describe_losses,
     need_values,
@@ -56,12 +61,13 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
-from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.further import Antennas
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
+from jaxbundle.types import present
 
 RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
     "reconstruction.json",
@@ -71,24 +77,19 @@ RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
 )
 FILES = (RECONSTRUCTION, TRACKS, MODELS)
 HEAD = "OPENSFM_TRACKS_VERSION_v"
-VERSION = 2
-DOP = 15.0
-"""OpenSfM's default σ of a position, metres."""
-LEAST_POSITIONS = 3
-"""Fewer do not define a datum."""
-ONE = ("focal",)
-TWO = ("focal_x", "focal_y")
+ONE_FOCAL_LENGTH = ("focal",)
+TWO_FOCAL_LENGTHS = ("focal_x", "focal_y")
 KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
-    "perspective": ("opencv", ONE, ("k1", "k2")),
-    "simple_radial": ("opencv", TWO, ("k1",)),
-    "radial": ("opencv", TWO, ("k1", "k2")),
-    "brown": ("opencv", TWO, ("k1", "k2", "k3", "p1", "p2")),
-    "fisheye": ("kannala-brandt", ONE, ("k1", "k2")),
-    "fisheye_opencv": ("kannala-brandt", TWO, ("k1", "k2", "k3", "k4")),
+    "perspective": ("opencv", ONE_FOCAL_LENGTH, ("k1", "k2")),
+    "simple_radial": ("opencv", TWO_FOCAL_LENGTHS, ("k1",)),
+    "radial": ("opencv", TWO_FOCAL_LENGTHS, ("k1", "k2")),
+    "brown": ("opencv", TWO_FOCAL_LENGTHS, ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("kannala-brandt", ONE_FOCAL_LENGTH, ("k1", "k2")),
+    "fisheye_opencv": ("kannala-brandt", TWO_FOCAL_LENGTHS, ("k1", "k2", "k3", "k4")),
 }
 """Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
-FITTED = ("fisheye62", "fisheye624", "dual")
+FITTED_KINDS = ("fisheye62", "fisheye624", "dual")
 SPHERICAL = ("spherical", "equirectangular")
 
 
@@ -184,6 +185,7 @@ def _largest(file: Path) -> tuple[JsonFields, list[str]]:
     largest = int(np.argmax(sizes))
     scene = JsonFields(file, scenes[largest].document)
     others = sum(sizes) - sizes[largest]
+    # Each part has its own datum: they cannot be one network.
     if len(scenes) == 1:
         return scene, []
     return scene, [
@@ -210,23 +212,24 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         f = max(size) / (2 * np.pi)
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
-    if kind not in (*KINDS, *FITTED):
-        known = ", ".join((*KINDS, *FITTED, *SPHERICAL))
+    if kind not in (*KINDS, *FITTED_KINDS):
+        known = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
         raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
-    one = kind in ("perspective", "fisheye", "dual")
-    f = [max(size) * fields.number(name) for name in ("focal", "focal") if one] or [
-        max(size) * fields.number(name) for name in TWO
+    single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
+    f = [
+        max(size) * fields.number(name)
+        for name in (ONE_FOCAL_LENGTH * 2 if single else TWO_FOCAL_LENGTHS)
     ]
     c = [
-        max(size) * (0.0 if one else fields.number(name, 0.0)) + (n - 1) / 2
+        max(size) * (0.0 if single else fields.number(name, 0.0)) + (n - 1) / 2
         for name, n in zip(("c_x", "c_y"), size)
     ]
     core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (*f, *c)))
     if kind in KINDS:
         model, _, names = KINDS[kind]
-        given = {name: fields.number(name, 0.0) for name in names}
-        tie = (("fx", "fy"),) if one else ()
-        return Camera(id, model, core | given, image_size=size, tie=tie)
+        coefficients = {name: fields.number(name, 0.0) for name in names}
+        tie = (("fx", "fy"),) if single else ()
+        return Camera(id, model, core | coefficients, image_size=size, tie=tie)
     if kind == "dual":
         own = {"l": fields.number("transition", 0.5)}
         own |= {name: fields.number(name, 0.0) for name in ("k1", "k2")}
@@ -243,9 +246,10 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     return fit_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
 
 
-def _prism(p: Mapping, X, Y, Z):
+def _prism(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """fisheye624: decentring and thin prism are of the image of the angle, as the radial part."""
     off = root(X * X + Y * Y)
+    # θ/|[X, Y]|, whose limit on the axis is 1/Z
     scale = jnp.where(off > 0, jnp.arctan2(off, Z) / jnp.where(off > 0, off, 1.0), 1 / Z)
     x, y = X * scale, Y * scale
     t2 = x * x + y * y
@@ -256,7 +260,7 @@ def _prism(p: Mapping, X, Y, Z):
     return jnp.stack([p["fx"] * xd + p["cx"], p["fy"] * yd + p["cy"]])
 
 
-def _dual(p: Mapping, X, Y, Z):
+def _dual(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """Between a perspective image and one of the angle."""
     off = root(X * X + Y * Y)
     angle = jnp.arctan2(off, Z)
@@ -281,27 +285,33 @@ def _images(file: Path, shots: Mapping[str, JsonFields]) -> Columns:
 
 def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
     """The observed projection centres, if they define a datum."""
-    given = {id: shot for id, shot in shots.items() if shot.get("gps_position") is not None}
-    if len(given) < LEAST_POSITIONS:
+    observed = {id: shot for id, shot in shots.items() if shot.get("gps_position") is not None}
+    if len(observed) < 3:  # do not determine the seven parameters of a datum
         return ()
-    at = np.array([shot.array("gps_position", (3,)) for shot in given.values()])
-    sigma = np.array([shot.number("gps_dop", DOP) for shot in given.values()])
-    sigma = np.where(sigma > 0, sigma, DOP)
+    X0 = np.array([shot.array("gps_position", (3,)) for shot in observed.values()])
+    default = 15.0  # m, OpenSfM's default of gps_dop
+    sigma = np.array([shot.number("gps_dop", default) for shot in observed.values()])
+    sigma = np.where(sigma > 0, sigma, default)
     columns = {
-        "image": list(given),
-        **dict(zip("XYZ", at.T)),
+        "image": list(observed),
+        **dict(zip("XYZ", X0.T)),
         **{f"s{axis}": sigma for axis in "XYZ"},
     }
     return (Antennas.of(Columns(columns, Source("shots", None, "gps_position")), {}, 1.0),)
 
 
-def _tracks(file: Path, cameras: Mapping, shots: Mapping, points: Mapping):
+def _tracks(
+    file: Path,
+    cameras: Mapping[str, Camera],
+    shots: Mapping[str, JsonFields],
+    points: Mapping[str, JsonFields],
+) -> tuple[Columns | None, int]:
     """The table of image points, None without tracks; how many have no point."""
     if not file.is_file():
         return None, 0
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
     lines, missing = [], 0
-    for row in Rows(file, separator="\t"):
+    for row in TextRows(file, separator="\t"):
         if row.text.startswith(HEAD):
             version = row.text.removeprefix(HEAD).strip()
             if version not in ("1", "2", "3"):
@@ -310,13 +320,14 @@ def _tracks(file: Path, cameras: Mapping, shots: Mapping, points: Mapping):
         if len(row) < 5:
             raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
         image, point = row.words[:2]
+        # of a photograph without orientation, or of a camera that was refused
         if image not in shots:
             continue
         if point not in points:
             missing += 1
             continue
         x, y = row.numbers(("x", "y"), 3, more=True)
-        w, h = cameras[shots[image].text("camera")].image_size
+        w, h = present(cameras[shots[image].text("camera")].image_size)
         values = (image, point, max(w, h) * x + (w - 1) / 2, max(w, h) * y + (h - 1) / 2)
         for column, value in zip(columns.values(), values):
             column.append(value)
@@ -360,23 +371,26 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
         id: {"camera": camera.id, "rotation": v, "translation": at}
         for id, camera, v, at in zip(images.id, used, turn.tolist(), t.tolist())
     }
-    measured = [one for one in network.further if isinstance(one, Antennas) and not one.settings]
-    for one in measured:
-        for id, at, C in zip(one.image, one.position.tolist(), one.covariance):
-            shots[id] |= {"gps_position": at, "gps_dop": float(np.sqrt(np.trace(C) / 3))}
+    # gps_position is the projection centre: antennas with a lever arm are not
+    measured = [
+        kind for kind in network.further if isinstance(kind, Antennas) and not kind.settings
+    ]
+    for antennas in measured:
+        for id, X0, C in zip(antennas.image, antennas.position.tolist(), antennas.covariance):
+            shots[id] |= {"gps_position": X0, "gps_dop": float(np.sqrt(np.trace(C) / 3))}
     scene = {
         "cameras": cameras,
         "shots": shots,
         "points": {
-            id: {"coordinates": at, "color": [128.0, 128.0, 128.0]}
-            for id, at in zip(points.id, points.position.tolist())
+            id: {"coordinates": X, "color": [*map(float, GREY)]}
+            for id, X in zip(points.id, points.position.tolist())
         },
     }
     folder.mkdir(exist_ok=True)
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
     write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
-    rest = tuple(one for one in network.further if not any(one is m for m in measured))
+    rest = tuple(kind for kind in network.further if not any(kind is m for m in measured))
     return describe_losses(network.replace(further=rest))
 
 
@@ -385,7 +399,7 @@ def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable
     for id in (*images.id, *points.id):
         if any(character in id for character in "\t\n\r"):
             raise InputError(f"{TRACKS}: {id!r}: names of images and points cannot have tabs")
-    yield f"{HEAD}{VERSION}\n"
+    yield f"{HEAD}2\n"
     for k, (i, p, (u, v)) in enumerate(
         zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist())
     ):
@@ -402,7 +416,7 @@ def write_opensfm_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     write_text(Path(path), json.dumps(fields, indent=1) + "\n")
 
 
-def _camera_fields(camera: Camera) -> dict:
+def _camera_fields(camera: Camera) -> dict[str, Any]:
     """The fields of a camera, of the smallest kind that holds it."""
     kinds = {name: rest for name, (model, *rest) in KINDS.items() if model == camera.model}
     most = max((names for _, names in kinds.values()), key=len, default=())
@@ -414,11 +428,11 @@ def _camera_fields(camera: Camera) -> dict:
     name = next(
         name
         for name, (focal, names) in kinds.items()
-        if (centred or focal == TWO) and not any(p[k] for k in most if k not in names)
+        if (centred or focal == TWO_FOCAL_LENGTHS) and not any(p[k] for k in most if k not in names)
     )
     focal, names = kinds[name]
     fields = {"projection_type": name, "width": w, "height": h}
-    if focal == ONE:
+    if focal == ONE_FOCAL_LENGTH:
         fields["focal"] = one_focal_length(camera, "OpenSfM") / s
     else:
         fields |= {"focal_x": p["fx"] / s, "focal_y": p["fy"] / s, "c_x": c[0], "c_y": c[1]}

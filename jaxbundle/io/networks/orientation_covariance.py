@@ -44,18 +44,16 @@ class OrientationCovariance:
 
 
 def write_orientation_covariance(
-    found: OrientationCovariance, path: str | Path, radians: float
+    covariance: OrientationCovariance, path: str | Path, radians: float
 ) -> None:
     """Write the file; `radians`: the unit of angles."""
-    sigma = np.sqrt(np.diagonal(found.matrix))
-    R = found.matrix / np.outer(sigma, sigma)
-    unit = np.array(
-        [radians if name in ANGLES and kind == "image" else 1.0 for kind, _, name in found.unknowns]
-    )
+    sigma = np.sqrt(np.diagonal(covariance.matrix))
+    R = covariance.matrix / np.outer(sigma, sigma)
+    unit = np.array([_unit(kind, name, radians) for kind, _, name in covariance.unknowns])
     n = len(sigma)
     rows = (
         (*unknown, s, *R[k, : k + 1].tolist(), *[""] * (n - k - 1))
-        for k, (unknown, s) in enumerate(zip(found.unknowns, (sigma / unit).tolist()))
+        for k, (unknown, s) in enumerate(zip(covariance.unknowns, (sigma / unit).tolist()))
     )
     write_csv(Path(path), (*HEAD, *(str(k + 1) for k in range(n))), rows)
 
@@ -68,15 +66,14 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
     n = len(table)
     columns = tuple(str(k + 1) for k in range(n))
     table.check_names((*HEAD, *columns))
+    # Only the lower triangle is written: R = L + Lᵀ − I, and Q = diag(σ)·R·diag(σ).
     numbers = np.full((n, n + 1), np.nan)
     for j, name in enumerate(("sigma", *columns)):
         for k, text in enumerate(table.values[name]):
             if j == 0 or k >= j - 1:
                 numbers[k, j] = _number(table.source(k), name, text)
     kinds, ids, names = (table.values[name] for name in HEAD[:3])
-    unit = np.array(
-        [radians if name in ANGLES and kind == "image" else 1.0 for kind, name in zip(kinds, names)]
-    )
+    unit = np.array([_unit(kind, name, radians) for kind, name in zip(kinds, names)])
     sigma, lower = numbers[:, 0] * unit, np.tril(np.nan_to_num(numbers[:, 1:]), -1)
     R = lower + lower.T + np.eye(n)
     unknowns = tuple(
@@ -85,11 +82,17 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
     return OrientationCovariance(unknowns, np.outer(sigma, sigma) * R)
 
 
-def _number(where, name, text) -> float:
+def _unit(kind: str, parameter: str, radians: float) -> float:
+    """The unit of an unknown: a camera may have a parameter with the name of an angle."""
+    return radians if parameter in ANGLES and kind == "image" else 1.0
+
+
+def _number(where: str, name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = np.nan
+    # 1e-9: a correlation of 1 may be rounded above it
     if not np.isfinite(value) or (value <= 0 if name == "sigma" else abs(value) > 1 + 1e-9):
         what = "a σ above 0" if name == "sigma" else "a correlation"
         raise InputError(f"{where}: {name} is {text!r}; {what} is expected")

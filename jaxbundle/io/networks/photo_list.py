@@ -54,8 +54,8 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     }
     document = apply_overrides(document, overrides)
     project = document["project"]
-    given = "sigma_image" in project or project.get("sigma_origin") == UNIT
-    if not given:
+    without_sigma = "sigma_image" in project or project.get("sigma_origin") == UNIT
+    if not without_sigma:
         _check_sigmas(path, (*photos, *image_points, *object_points))
     tables = {
         "images": _columns(path, photos, PHOTO, camera=["cam"] * len(photos)),
@@ -63,20 +63,23 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         "observations": _columns(
             path,
             image_points,
-            IMAGE_POINT if given else (*IMAGE_POINT, "sx", "sy"),
+            IMAGE_POINT if without_sigma else (*IMAGE_POINT, "sx", "sy"),
             id="point",
             image=[row.photo for row in image_points],
         ),
     }
     network = network_of(document, tables, str(path))
-    if given:
+    if without_sigma:
         return network.note("the σ of the file are ignored, also those of photographs and points")
     return network.note(
         "σ of photographs and object points are ignored: their values are start values only"
     )
 
 
-def _columns(path, rows, names, id="id", **more) -> Columns:
+def _columns(
+    path: Path, rows: Sequence["_Row"], names: Sequence[str], id: str = "id", **more: Sequence[str]
+) -> Columns:
+    """The table of some lines: their ids in the column `id`, their first values by `names`."""
     source = Source(str(path), np.array([row.line for row in rows]), "line")
     values = {name: [row.values[k] for row in rows] for k, name in enumerate(names)}
     return Columns({id: [row.id for row in rows], **more, **values}, source)
@@ -126,6 +129,7 @@ class _Parser:
         focal = self._focal_length()
         photos, image_points, object_points = [], [], []
         counted = "line 1 gives the focal length"
+        # 7 words are an object point, 13 or more a photograph, whose name may have blanks
         while self._more() and len(self.lines[self.next][1]) != 7:
             number, words = self.lines[self.next]
             if len(words) < 13:
@@ -170,6 +174,7 @@ class _Parser:
         if not self._more():
             raise self._error(photo.line, f"the file ends after {photo}")
         number, words = self.lines[self.next]
+        # nine digits: int() of a longer text is no count, and may take minutes
         if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
                 number,
@@ -208,6 +213,7 @@ class _Parser:
             number = float(word)
         except ValueError:
             number = None
+        # float() reads 1_0 as ten
         if number is None or "_" in word or (finite and not math.isfinite(number)):
             raise self._error(line, f"{what} is {word!r}; a number is expected")
         return number

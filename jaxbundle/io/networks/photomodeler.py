@@ -40,8 +40,9 @@ Source: the file itself, as read by the Damped Bundle Adjustment Toolbox (Börli
 
 import dataclasses
 import ntpath
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -56,11 +57,16 @@ from jaxbundle.io.networks.photomodeler_camera import (
     photo_camera,
     rounding_warnings,
 )
-from jaxbundle.io.networks.photomodeler_points import Block, point_table, ray_table, renumber_smart
+from jaxbundle.io.networks.photomodeler_points import (
+    PhotoModelerBlock,
+    point_table,
+    ray_table,
+    renumber_smart,
+)
 from jaxbundle.io.networks.poses import matrices_of
-from jaxbundle.io.networks.settings import apply_overrides
-from jaxbundle.io.text.rows import Row, Rows
-from jaxbundle.network.columns import Columns, count, list_some
+from jaxbundle.io.networks.settings import Document, apply_overrides
+from jaxbundle.io.text.rows import TextRow, TextRows
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning
 
@@ -85,7 +91,8 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     **Raises:** `InputError` naming file and line, or that the image size is missing.
     """
     path = Path(path)
-    rows = Rows(path, blank=True, fallback="latin-1")
+    rows = TextRows(path, blank=True, fallback="latin-1")
+    # exports differ in the empty lines before the title
     while rows.more() and not rows.next_words():
         rows.take("the title")
     rows.take("the title")
@@ -93,8 +100,8 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
         _take(rows, what)
         for what in ("tolerance and iterations", "default σ", "the default camera", "its σ")
     ]
-    given = head[0].all_numbers("tolerance, iterations, width, height")
-    size = given[2:4].tolist() if len(given) >= 4 else None
+    numbers = head[0].all_numbers("tolerance, iterations, width, height")
+    size = numbers[2:4].tolist() if len(numbers) >= 4 else None
     photos = _photos(rows, header_camera(head[2]))
     if not photos:
         raise head[3].error("no photograph follows")
@@ -107,6 +114,7 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     if len(control):
         document["project"]["datum"] = "control"
     outer = np.array([photo.outer for photo in photos])
+    # One photograph may be the origin; several at the same place are not oriented.
     nowhere = (outer == 0).all(1)
     if nowhere.sum() > 1:
         outer[nowhere] = np.nan
@@ -114,23 +122,22 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
         Source(str(path), np.array([photo.line for photo in photos]), "line"),
         list(names.values()),
         cameras,
-        matrices_of(np.radians(outer[:, :2:-1])),
+        matrices_of(np.radians(outer[:, :2:-1])),  # κ, φ, ω in the file
         outer[:, :3],
     )
     rest = [override for override in overrides if override not in of_camera]
     network = assemble(path, document, rest, images, points, ray_table(path, marks, names))
-    return network.warn(*_warnings(points, renumbered), *rounding_warnings(network.cameras, half))
-
-
-def _warnings(points: Columns, renumbered: str):
-    if renumbered:
-        yield renumbered
+    warnings = [renumbered] if renumbered else []
     lost = [id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)]
     if lost:
-        yield f"{count(len(lost), 'point')} without coordinates in the file: {list_some(lost)}"
+        count_of_lost = count(len(lost), "point")
+        warnings.append(f"{count_of_lost} without coordinates in the file: {list_some(lost)}")
+    return network.warn(*warnings, *rounding_warnings(network.cameras, half))
 
 
-def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[str]):
+def _document(
+    path: Path, photos: Sequence["Photo"], size: Sequence[float] | None, overrides: Sequence[str]
+) -> tuple[Document, list[str], list[str], Float[np.ndarray, "cameras 10"]]:
     """Settings and cameras with overrides; the camera of each photograph; the
     overrides used; and half a unit of the last decimal of the values of each camera."""
     distinct, first, camera = np.unique(
@@ -147,12 +154,12 @@ def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[s
     of_camera = [override for override in overrides if override.startswith("camera.")]
     document = apply_overrides(document, of_camera)
     for entry, values in zip(document["camera"], distinct):
-        _complete(path, entry, values)
+        _add_pixel_size(path, entry, values)
     half = np.array([photos[k].half_unit for k in first])
     return document, [names[c] for c in camera.reshape(-1)], of_camera, half
 
 
-def _complete(path: Path, entry: dict, values) -> None:
+def _add_pixel_size(path: Path, entry: dict[str, Any], values: Inner) -> None:
     """The pixel size, from the format and the image size."""
     if "image_size" not in entry:
         raise InputError(
@@ -180,7 +187,7 @@ class Photo:
     half_unit: Inner
 
 
-def _photos(rows: Rows, header) -> list[Photo]:
+def _photos(rows: TextRows, header: tuple[Inner, Inner] | None) -> list[Photo]:
     photos: list[Photo] = []
     while rows.next_words():
         row = rows.take("a photograph")
@@ -199,23 +206,24 @@ def _photos(rows: Rows, header) -> list[Photo]:
     return photos
 
 
-def _read_numbered(rows: Rows, number: int, what: str) -> Row:
+def _read_numbered(rows: TextRows, number: int, what: str) -> TextRow:
     row = _take(rows, f"{what} of photograph {number}")
+    # a line that was lost would shift all values after it
     if row.integer(0, f"the number of the photograph before {what}") != number:
         raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
     return row
 
 
-def _points(rows: Rows, what: str) -> Block:
+def _points(rows: TextRows, what: str) -> PhotoModelerBlock:
     ids, values, lines = [], [], []
     for row in _block(rows):
         ids.append(str(row.integer(0, f"the number of one of the {what}")))
         values.append(row.numbers(POINT, 1))
         lines.append(row.number)
-    return Block(ids, np.array(values).reshape(-1, 6), lines)
+    return PhotoModelerBlock(ids, np.array(values).reshape(-1, 6), lines)
 
 
-def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
+def _marks(rows: TextRows, names: Mapping[int, str]) -> PhotoModelerBlock:
     ids, values, lines, photos = [], [], [], []
     for row in _block(rows):
         photo = row.integer(0, "the number of a photograph")
@@ -228,10 +236,10 @@ def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
         ids.append(str(row.integer(1, "the number of a point")))
         values.append(row.numbers(RAY, 2))
         lines.append(row.number)
-    return Block(ids, np.array(values).reshape(-1, 4), lines, photos)
+    return PhotoModelerBlock(ids, np.array(values).reshape(-1, 4), lines, photos)
 
 
-def _block(rows: Rows):
+def _block(rows: TextRows) -> Iterator[TextRow]:
     """Lines to the next empty one; without it the file is truncated."""
     while True:
         row = _take(rows, "an empty line after the last of a block")
@@ -240,14 +248,14 @@ def _block(rows: Rows):
         yield row
 
 
-def _take(rows: Rows, what: str) -> Row:
+def _take(rows: TextRows, what: str) -> TextRow:
     """The next line of numbers, a decimal comma read as a point."""
     row = rows.take(what)
-    return Row(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
+    return TextRow(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
 
 
 def _names(files: Sequence[str]) -> list[str]:
     """File names without their folders, if they differ; a repeated file is numbered."""
-    short = [ntpath.basename(name) for name in files]
+    short = [ntpath.basename(name) for name in files]  # paths of Windows, on any system
     names = short if len(set(short)) == len(short) else list(files)
     return [f"{name}#{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]

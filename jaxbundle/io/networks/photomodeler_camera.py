@@ -12,40 +12,38 @@ the last decimal; otherwise it has another camera with the rounded numbers.
 
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.io.text.rows import Row
+from jaxbundle.io.text.rows import TextRow
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Camera
 
 INNER = ("c", "xp", "yp", "xs", "ys", "K1", "K2", "K3", "P1", "P2")
-DECIMALS = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
-"""Minimum decimals of the numbers of a photograph: a bare 0 is not rounded to whole units."""
-LARGEST_ROUNDING = 0.1
-"""Pixels in the corner of the image: coarser digits of a camera give a warning."""
 
 Inner = Float[np.ndarray, "10"]
 
 
-def header_camera(row: Row) -> tuple[Inner, Inner] | None:
+def header_camera(row: TextRow) -> tuple[Inner, Inner] | None:
     """The default camera, and half a unit of its last decimals; None without ten numbers."""
     return (row.numbers(INNER), _half_units(row.words)) if len(row) == len(INNER) else None
 
 
-def photo_camera(row: Row, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
+def photo_camera(row: TextRow, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
     """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
     the header's if it is the same."""
     own, half = row.numbers(INNER, 1), _half_units(row.words[1:])
-    if header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all():
+    if header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all():  # a tie is half
         return header
     return own, half
 
 
 def _half_units(words: Sequence[str]) -> Inner:
-    given = [_decimals(word) for word in words]
-    return 0.5 * 10.0 ** -np.maximum(given, DECIMALS).astype(float)
+    # The file prints c, xp, yp with 3 decimals and the rest with 5; a bare 0 has them too.
+    printed = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
+    return 0.5 * 10.0 ** -np.maximum([_decimals(word) for word in words], printed).astype(float)
 
 
 def _decimals(word: str) -> int:
@@ -55,7 +53,7 @@ def _decimals(word: str) -> int:
         return 0
 
 
-def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:
+def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict[str, Any]:
     """The entry of a document; `size` of the image in pixels."""
     c, xp, yp, xs, ys, K1, K2, K3, P1, P2 = values.tolist()
     entry = {
@@ -74,17 +72,19 @@ def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:
 
 
 def rounding_warnings(
-    cameras: Sequence[Camera], half: Float[np.ndarray, "cameras 10"]
+    cameras: Sequence[Camera], half: Float[np.ndarray, "cameras 10"], max_effect: float = 0.1
 ) -> list[str]:
-    """Warnings about cameras whose rounding exceeds `LARGEST_ROUNDING` pixels in the corner of the
+    """Warnings about cameras whose rounding exceeds `max_effect` pixels in the corner of the
     image; parameters that are 0 or free are not counted.
 
-    **Arguments:** `half` half a unit of the last decimal of each value.
+    **Arguments:** `half` half a unit of the last decimal of each value; `max_effect`: about the
+    precision of a good image point, which rounding should not exceed.
     """
     told = []
     for camera, open in zip(cameras, half):
         size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
         r = float(np.linalg.norm(size * pixel)) / 2
+        # derivatives of the image in the corner by the parameters, mm: ∂x/∂c = r/c, ∂Δr/∂K1 = r³ …
         slopes = {
             "c": r / camera.parameters["c"],
             "K1": r**3,
@@ -98,7 +98,7 @@ def rounding_warnings(
             for name, slope in slopes.items()
             if camera.parameters[name] != 0 and name not in camera.free
         }
-        coarse = {name: cost for name, cost in costs.items() if cost > LARGEST_ROUNDING}
+        coarse = {name: cost for name, cost in costs.items() if cost > max_effect}
         if coarse:
             costs = (f"{name} to {cost:.2g} px" for name, cost in coarse.items())
             worst = list_some(costs, as_text=str)

@@ -12,21 +12,24 @@ Grussenmeyer 2013).
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.networks.assemble import PIXEL_CENTRE
 from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import Source
 
 
 @dataclasses.dataclass
-class Block:
+class PhotoModelerBlock:
     """Rows of a block: ids, numbers, lines, and for image points the photograph's number."""
 
     id: list[str]
-    values: np.ndarray
+    values: Float[np.ndarray, "rows n"]
     line: list[int]
     photo: list[int] = dataclasses.field(default_factory=list)
 
@@ -34,7 +37,7 @@ class Block:
         return len(self.id)
 
 
-def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
+def renumber_smart(path: Path, objects: PhotoModelerBlock, marks: PhotoModelerBlock) -> str:
     """Give smart points with the id of another point new ids, in place.
 
     **Returns:** a message about renumbered points; empty if none was.
@@ -51,9 +54,9 @@ def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
     repeated = of_smart & (of_others | {id for id, at in listed.items() if len(at) > 1})
     if not repeated:
         return ""
-    above = 10 ** max(len(id) for id in (*objects.id, *marks.id))
+    above = 10 ** max(len(id) for id in (*objects.id, *marks.id))  # above every id
     other = {id: str(above + int(id)) for id in sorted(repeated, key=int)}
-    for k in _smart_objects(path, objects, listed, repeated, (of_smart, of_others)):
+    for k in _find_smart_rows(path, objects, listed, repeated, of_smart, of_others):
         objects.id[k] = other[objects.id[k]]
     marks.id[:] = [other.get(id, id) if s else id for id, s in zip(marks.id, smart)]
     return (
@@ -63,7 +66,14 @@ def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
     )
 
 
-def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
+def _find_smart_rows(
+    path: Path,
+    objects: PhotoModelerBlock,
+    listed: Mapping[str, Sequence[int]],
+    repeated: set[str],
+    of_smart: set[str],
+    of_others: set[str],
+) -> list[int]:
     """The rows of smart points among the object points with a repeated id: the second of two; of
     one, by the neighbouring rows."""
     twice = {id: at for id, at in listed.items() if id in repeated and len(at) > 1}
@@ -74,7 +84,6 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
                 f"{len(at)} times; at most a point marked by hand and a smart point have the same "
                 "id"
             )
-    of_smart, of_others = of
     once = [at[0] for id, at in listed.items() if id in repeated and len(at) == 1]
     only = lambda ids: [k for id in ids for k in listed.get(id, ())]
     first_smart = min(
@@ -82,6 +91,8 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
         default=len(objects),
     )
     last_other = max([at[0] for at in twice.values()] + only(of_others - of_smart), default=-1)
+    # The list has the points marked by hand, ids ascending, then the smart points, ids ascending
+    # again: where they descend the first time, the second part begins.
     numbers = [int(id) for id in objects.id]
     descent = next(
         (
@@ -91,7 +102,7 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
         ),
         None,
     )
-    found = [at[1] for at in twice.values()]
+    smart_rows = [at[1] for at in twice.values()]
     for k in once:
         after, before = k > first_smart, k < last_other
         if after == before and (after or descent is None):
@@ -100,12 +111,14 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
                 "point marked by hand and of a smart point (σ 0), but is in the object points "
                 "only once, and it is unclear for which; give one of the two another id"
             )
-        if after or (not before and k >= descent):
-            found.append(k)
-    return found
+        if after or (not before and descent is not None and k >= descent):
+            smart_rows.append(k)
+    return smart_rows
 
 
-def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -> Columns:
+def point_table(
+    path: Path, control: PhotoModelerBlock, objects: PhotoModelerBlock, marked: list[str]
+) -> Columns:
     """Control points as given, then the other object points, then points marked in
     photographs without coordinates."""
     taken = set(control.id)
@@ -128,7 +141,7 @@ def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -
     return Columns(columns, Source(str(path), np.array(lines, np.int64), "line"))
 
 
-def ray_table(path: Path, marks: Block, names: dict[int, str]) -> Columns:
+def ray_table(path: Path, marks: PhotoModelerBlock, names: dict[int, str]) -> Columns:
     """The image points, from the centre of the first pixel; σ 0 becomes the default."""
     if not len(marks):
         raise InputError(f"{path}: there are no image points")
@@ -138,8 +151,8 @@ def ray_table(path: Path, marks: Block, names: dict[int, str]) -> Columns:
         {
             "image": [names[photo] for photo in marks.photo],
             "point": marks.id,
-            "x": values[:, 0] - 0.5,
-            "y": values[:, 1] - 0.5,
+            "x": values[:, 0] - PIXEL_CENTRE,
+            "y": values[:, 1] - PIXEL_CENTRE,
             "sx": sigma[:, 0],
             "sy": sigma[:, 1],
         },

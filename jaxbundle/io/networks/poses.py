@@ -3,20 +3,18 @@
 All are computed in batches of one shape, so that any number of images shares one compiled program.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import numpy as np
+from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxbundle import geometry
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import local_x64
 from jaxbundle.system.programs import compile_once
-
-AT_ONCE = 256
-ORTHOGONAL = 1e-4
-"""How far R·Rᵀ of a file may be from the identity: they have six digits or so."""
 
 Matrices = Float[np.ndarray, "images 3 3"]
 Triples = Float[np.ndarray, "images 3"]
@@ -53,10 +51,16 @@ def matrices_of_rotation_vectors(v: Triples) -> Matrices:
     return apply_in_batches(geometry.matrix_from_rotation_vector, v, (3,), (3, 3))
 
 
-def are_rotations(R: Float[np.ndarray, "*images 3 3"]) -> Bool[np.ndarray, "*images"]:
-    """Which matrices of a file are rotations."""
+def are_rotations(
+    R: Float[np.ndarray, "*images 3 3"], tolerance: float = 1e-4
+) -> Bool[np.ndarray, "*images"]:
+    """Which matrices of a file are rotations.
+
+    **Arguments:** `tolerance` of R·Rᵀ relative to the identity: files have six digits or so of R;
+    larger, and a matrix with a typing error in its fourth digit passes.
+    """
     off = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
-    return np.asarray((off <= ORTHOGONAL) & (np.linalg.det(R) > 0))
+    return np.asarray((off <= tolerance) & (np.linalg.det(R) > 0))
 
 
 def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
@@ -68,20 +72,29 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
 
 
 @partial(compile_once, static=0)
-def _batch(function, rows):
+def _batch(function: Callable[..., Array], rows: Float[np.ndarray, "batch ..."]) -> Array:
     return jax.vmap(function)(rows)
 
 
-def apply_in_batches(function, rows, shape, result_shape):
+def apply_in_batches(
+    function: Callable[..., Array],
+    rows: Float[np.ndarray, "images ..."],
+    shape: tuple[int, ...],
+    result_shape: tuple[int, ...],
+    batch_size: int = 256,
+) -> Float[np.ndarray, "images ..."]:
     """A function of one image's array applied to all, in batches of one shape.
 
-    **Arguments:** `rows` [images, *shape]. **Returns:** [images, *result_shape].
+    **Arguments:** `rows` [images, *shape]; `batch_size`: larger wastes work on the zeros that fill
+    up the last batch (a dozen images are common), smaller makes more calls; not critical.
+
+    **Returns:** [images, *result_shape].
     """
     rows = np.reshape(rows, (-1, *shape))
     results = np.zeros((len(rows), *result_shape))
     with local_x64():
-        for begin in range(0, len(rows), AT_ONCE):
-            part = rows[begin : begin + AT_ONCE]
-            batch = np.concatenate([part, np.zeros((AT_ONCE - len(part), *shape))])
-            results[begin : begin + AT_ONCE] = np.asarray(_batch(function, batch))[: len(part)]
+        for begin in range(0, len(rows), batch_size):
+            part = rows[begin : begin + batch_size]
+            batch = np.concatenate([part, np.zeros((batch_size - len(part), *shape))])
+            results[begin : begin + batch_size] = np.asarray(_batch(function, batch))[: len(part)]
     return results

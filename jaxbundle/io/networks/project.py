@@ -32,12 +32,13 @@ Small tables may be part of the file, one `[[image]]`, `[[point]]`, `[[observati
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, is_own
@@ -51,6 +52,7 @@ from jaxbundle.io.networks.settings import (
     network_of,
 )
 from jaxbundle.io.text.csv_tables import read_csv, read_toml, write_csv, write_text
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.toml_text import assignments
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.build import (
@@ -62,8 +64,8 @@ from jaxbundle.network.build import (
     POINT_COLUMNS,
     POINT_SIGMAS,
 )
-from jaxbundle.network.columns import Columns, as_columns, did_you_mean
-from jaxbundle.network.further import KINDS, SECTIONS, Further
+from jaxbundle.network.columns import Columns, as_columns
+from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.further.base import among
 from jaxbundle.network.rules import AXES
 from jaxbundle.network.tables import STATED, UNIT, Camera, Network, Source, require_network
@@ -82,9 +84,10 @@ INLINE = {
 }
 """The tables and the name of one of their rows in the TOML file."""
 
-UNIT_DIGITS = 1e-12
-"""Relative rounding of a unit of weight converted between pixels and millimetres."""
-WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "x", "y")}
+OPTIONAL_WHERE_ORIENTED = {
+    "points": ("id", "role", *AXES),
+    "observations": ("image", "point", "x", "y"),
+}
 """Tables not required for oriented images, and their columns."""
 
 
@@ -108,9 +111,9 @@ def read_project(
     tables = {
         table: _read_table(document, table, path)
         for table in TABLES
-        if not (oriented and table in WITHOUT and _is_absent(document, table))
+        if not (oriented and table in OPTIONAL_WHERE_ORIENTED and _is_absent(document, table))
     }
-    for table, columns in WITHOUT.items() if oriented else ():
+    for table, columns in OPTIONAL_WHERE_ORIENTED.items() if oriented else ():
         found = tables.get(table)
         if found is None:
             found = Columns(dict.fromkeys(columns, ()), Source(table))
@@ -137,10 +140,8 @@ def project_file(path: Path) -> Path:
 
 def _read_document(path: Path) -> Document:
     document = read_toml(path)
-    known = ("project", "camera", *INLINE.values(), *SECTIONS)
     for key, value in document.items():
-        if key not in known:
-            raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
+        refuse_unknown(key, ("project", "camera", *INLINE.values(), *SECTIONS), f"{path}: ")
         if key in SECTIONS and not isinstance(value, dict):
             table = next(table for table, kind in KINDS.items() if kind.SECTION == key)
             raise InputError(
@@ -229,7 +230,8 @@ def fill_project(network: Network, folder: Path) -> None:
         {np.inf: "free"},
     )
     origin = rays.sigma_origin
-    if origin == UNIT and np.allclose(sigma, 1.0, rtol=UNIT_DIGITS, atol=0):
+    # 1e-12: the conversion between pixels and millimetres rounds 1 to a few eps (2e-16)
+    if origin == UNIT and np.allclose(sigma, 1.0, rtol=1e-12, atol=0):
         # Nobody gave them: where none are written, they are units of weight again.
         sigma, origin = np.full_like(sigma, np.nan), STATED
     _write_table(
@@ -246,12 +248,26 @@ def fill_project(network: Network, folder: Path) -> None:
         ends = [[points.id[p] for p in column] for column in distances.points.T]
         values = np.stack([distances.value, distances.sigma], 1)
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
-    for further in among(network):
-        _write_further(folder, further, radians)
+    for kind in among(network):
+        columns = {
+            name: column
+            if isinstance(column, tuple)
+            else [x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column]
+            for name, column in kind.columns(radians).items()
+        }
+        write_csv(folder / f"{kind.TABLE}.csv", tuple(columns), zip(*columns.values()))
     write_text(folder / FILE_NAME, _document_text(network, origin))
 
 
-def _write_table(path, header, ids, values, sigma_header, sigma, words):
+def _write_table(
+    path: Path,
+    header: Sequence[str],
+    ids: Sequence[Sequence[str]],
+    values: Float[np.ndarray, "rows n"],
+    sigma_header: Sequence[str],
+    sigma: Float[np.ndarray, "rows m"],
+    words: Mapping[float, str],
+) -> None:
     """Ids, numbers and σ if given; `words` replace special values of σ."""
     with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
     rows = (
@@ -261,26 +277,19 @@ def _write_table(path, header, ids, values, sigma_header, sigma, words):
     write_csv(path, (*header, *(sigma_header if with_sigma else ())), rows)
 
 
-def _write_further(folder: Path, further: Further, radians: float) -> None:
-    """The table of a further kind."""
-    columns = {
-        name: column
-        if isinstance(column, tuple)
-        else [x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column]
-        for name, column in further.columns(radians).items()
-    }
-    write_csv(folder / f"{further.TABLE}.csv", tuple(columns), zip(*columns.values()))
-
-
-def _cells(numbers, words=MappingProxyType({})):
+def _cells(
+    numbers: Iterable[float], words: Mapping[float, str] = MappingProxyType({})
+) -> Iterator[str]:
+    # x != x: NaN, an empty cell
     return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
 
 
 def _document_text(network: Network, origin: str) -> str:
     said = (*network.warnings, *network.notes)
     lines = [f"# {' '.join(line.split())}" for line in said]
-    of_sigma = "sigma_image", "sigma_origin"
-    settings = {key: getattr(network, key) for key in SETTINGS if key not in of_sigma}
+    # every σ stands in observations.csv
+    in_tables = "sigma_image", "sigma_origin"
+    settings = {key: getattr(network, key) for key in SETTINGS if key not in in_tables}
     if origin != STATED:
         settings["sigma_origin"] = origin
     further = among(network)
@@ -290,32 +299,26 @@ def _document_text(network: Network, origin: str) -> str:
     if not network.datum_points:
         del settings["datum_points"]
     lines += ["[project]", *assignments(settings)]
-    for one in further:
-        if one.SECTION and one.settings:
-            lines += ["", f"[{one.SECTION}]", *assignments(one.settings)]
+    for kind in further:
+        if kind.SECTION and kind.settings:
+            lines += ["", f"[{kind.SECTION}]", *assignments(kind.settings)]
     return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
 
 
 def cameras_text(cameras: Sequence[Camera]) -> str:
     """Cameras as the `[[camera]]` entries of a TOML file."""
-    entries = (
-        [*_of_own(camera), "[[camera]]", *assignments(_camera_entry(camera)), ""]
-        for camera in cameras
-    )
-    return "\n".join(line for entry in entries for line in entry)
+    lines = []
+    for camera in cameras:
+        if is_own(camera.model):  # a file can name the model, but not hold its formula
+            lines.append(
+                f"# {str(camera.model)!r} is a model of the user's own: give the object to "
+                "jaxbundle.read_network(path, models=[…])"
+            )
+        lines += ["[[camera]]", *assignments(_camera_entry(camera)), ""]
+    return "\n".join(lines)
 
 
-def _of_own(camera: Camera) -> Sequence[str]:
-    """A remark on a model that a file can only name."""
-    if not is_own(camera.model):
-        return ()
-    return (
-        f"# {str(camera.model)!r} is a model of the user's own: give the object to "
-        "jaxbundle.read_network(path, models=[…])",
-    )
-
-
-def _camera_entry(camera: Camera) -> dict:
+def _camera_entry(camera: Camera) -> dict[str, Any]:
     entry: dict[str, Any] = {"id": camera.id, "model": str(camera.model)}
     for name in ("image_size", "pixel_size"):
         if getattr(camera, name) is not None:

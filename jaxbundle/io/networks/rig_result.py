@@ -22,6 +22,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -58,8 +59,8 @@ def is_rig_result(path: Path) -> bool:
 
 def file_of_line(path: Path) -> Path:
     """The file of a line, `FILE.jsonl#KEY`; any other path as it is."""
-    found = LINE.fullmatch(str(path))
-    return Path(found[1]) if found else path
+    match = LINE.fullmatch(str(path))
+    return Path(match[1]) if match else path
 
 
 def is_rig_line(path: Path) -> bool:
@@ -74,7 +75,7 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     file = file_of_line(path)
-    key = str(path)[len(str(file)) + 1 :] or None
+    key = str(path)[len(str(file)) + 1 :] or None  # after the #
     rigs = {row["key"]: row for row in _rows(file) if "mounting" in row.get("further_unknowns", {})}
     if not rigs:
         raise InputError(f"{file}: no rig is in it; expected lines of jaxbundle batch --rig")
@@ -96,9 +97,8 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         cameras, pixel = [], row.get("settings", {}).get("pixel_size")
         for id in mountings:
             entry = row["cameras"][id]
-            values, about = entry["parameters"], {"image_size": row["image_size"][id]}
-            about["pixel_size"] = pixel and [pixel, pixel]
-            cameras.append(_camera(where, id, values, entry["model"], about))
+            sizes = {"image_size": row["image_size"][id], "pixel_size": pixel and [pixel, pixel]}
+            cameras.append(_camera(where, id, entry["parameters"], entry["model"], sizes))
         bases = [np.array([m[x] for x in ("X0", "Y0", "Z0")]) for m in mountings.values()]
         angles = np.array([[m[x] for x in ("omega", "phi", "kappa")] for m in mountings.values()])
         turns = [np.asarray(matrix_from_omega_phi_kappa(row)) for row in angles]
@@ -110,7 +110,7 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     return network_of_rig(file, cameras, turns, bases, overrides)
 
 
-def _rows(file: Path) -> Iterator[dict]:
+def _rows(file: Path) -> Iterator[dict[str, Any]]:
     for number, line in enumerate(read_text(file).splitlines(), 1):
         try:
             row = json.loads(line)
@@ -139,8 +139,8 @@ def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         cameras = []
         for id in mountings:
             (entry,) = parts[id]["cameras"].values()
-            about = parts[id].get("calibration", {})
-            cameras.append(_camera(str(path), id, rig["cameras"][id], entry["model"], about))
+            sizes = parts[id].get("calibration", {})
+            cameras.append(_camera(str(path), id, rig["cameras"][id], entry["model"], sizes))
         bases = [np.array(m["base"], float).reshape(3) for m in mountings.values()]
         turns = [np.array(m["rotation"], float).reshape(3, 3) for m in mountings.values()]
     except InputError:
@@ -170,12 +170,15 @@ def network_of_rig(
     return rig_network(path, cameras, R, t, overrides, warnings=[IN_BOARD_UNITS], unit=UNIT)
 
 
-def _camera(where: str, id: str, values: Mapping, model: str, about: Mapping) -> Camera:
+def _camera(
+    where: str,
+    id: str,
+    values: Mapping[str, Mapping[str, Any]],
+    model: str,
+    sizes: Mapping[str, Any],
+) -> Camera:
     row = {"id": id, "model": model}
     row |= {name: value["value"] for name, value in values.items()}
-    if about.get("image_size"):
-        row["image_size"] = about["image_size"]
-    if about.get("pixel_size"):
-        row["pixel_size"] = about["pixel_size"]
+    row |= {name: sizes[name] for name in ("image_size", "pixel_size") if sizes.get(name)}
     (camera,) = make_cameras([row], where)
     return camera

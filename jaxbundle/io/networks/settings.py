@@ -10,8 +10,9 @@ from typing import Any
 
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, did_you_mean, list_some, show
+from jaxbundle.network.columns import Columns, list_some, show
 from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import SIGMA_ORIGINS, STATED, Network
@@ -23,10 +24,16 @@ SETTINGS = (*TEXT, "sigma_image", "sigma_origin", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
 )
-ALL = "*"
+ALL_CAMERAS = "*"
 """Means all cameras, unless one has this id."""
 
 Document = dict[str, Any]
+
+
+def choose_datum(overrides: Sequence[str]) -> bool:
+    """Whether the settings of the command line choose the datum: then control of a file does not
+    become the datum by itself."""
+    return any(override.partition("=")[0].strip() == "datum" for override in overrides)
 
 
 def apply_overrides(
@@ -38,46 +45,43 @@ def apply_overrides(
     cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
     observations.
     """
+    # the document of the caller stays as the file has it
     document = copy.deepcopy(document)
     for override in overrides:
         key, equals, text = (part.strip() for part in override.partition("="))
         if not equals:
             raise InputError(f"--set {override}: expected KEY=VALUE")
         if key == "free":
-            _override_cameras(document["camera"], f"camera.{ALL}.free", text)
+            _override_cameras(document["camera"], f"camera.{ALL_CAMERAS}.free", text)
         elif key.startswith("camera."):
             _override_cameras(document["camera"], key, text)
         elif key.partition(".")[0] in SECTIONS:
             _override_section(document, key, text)
         elif key in keys:
-            document["project"][key] = _project_value(key, text)
+            value = _words(text) if key == "datum_points" else text
+            document["project"][key] = _number(key, text) if key == "sigma_image" else value
         else:
             known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
             raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
     return document
 
 
-def _project_value(key: str, text: str):
-    if key == "sigma_image":
-        return _number(key, text)
-    return _words(text) if key == "datum_points" else text
-
-
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
+    # the longest id first: "a.b" may be an id beside "a"
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
         if rest.startswith(f"{ids[c]}."):
             _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
             return
-    if not rest.startswith(f"{ALL}."):
+    if not rest.startswith(f"{ALL_CAMERAS}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
-            f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL)), 12, str)}"
+            f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL_CAMERAS)), 12, str)}"
         )
     for camera in cameras:
-        _override_camera(camera, key, rest.removeprefix(f"{ALL}."), text)
+        _override_camera(camera, key, rest.removeprefix(f"{ALL_CAMERAS}."), text)
 
 
 def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
@@ -116,6 +120,7 @@ def _override_section(document: Document, key: str, text: str) -> None:
         values = [float(word) for word in words]
     except ValueError:
         values = words
+    # a list of one is still a list
     several = name == "free" or text.startswith("[") or len(values) != 1
     settings[name] = values if several else values[0]
 
@@ -150,8 +155,7 @@ def network_of(
 def check_settings(project: Mapping[str, Any], where: str) -> None:
     """Refuse unknown keys and impossible values of `[project]`."""
     for key, value in project.items():
-        if key not in (*SETTINGS, *TABLES):
-            raise InputError(f"{where}unknown key {key!r}{did_you_mean(key, (*SETTINGS, *TABLES))}")
+        refuse_unknown(key, (*SETTINGS, *TABLES), where)
         if key in (*TEXT, *TABLES) and not isinstance(value, str):
             raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
         if key in CHOICES:

@@ -23,7 +23,7 @@ Source: OpenCV 4 documentation, calib3d; ROS, sensor_msgs/CameraInfo.
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -49,7 +49,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
 ROS_FILES = ("*.yaml",)
-OF_A_FISHEYE = "fisheye_model", "distortion_model"
+FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
 NAMES = (
     ("M1", "D1", "M2", "D2"),
     ("K1", "D1", "K2", "D2"),
@@ -97,12 +97,13 @@ def rectify(
     z = np.array([0, 0, 1.0]) + R[2]  # both optical axes, in the first's frame
     z = z - (z @ first) * first
     z = z / np.linalg.norm(z)
+    # right-handed: x × y = z, whichever of both lies along the base
     axes = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
     R1 = np.stack([*axes, z])
     R2 = R1 @ R.T
     p = [all_parameters(camera) for camera in cameras]
-    f = np.mean([one[name] for one in p for name in ("fx", "fy")])
-    c = [np.mean([one[name] for one in p]) for name in ("cx", "cy")]
+    f = np.mean([values[name] for values in p for name in ("fx", "fy")])
+    c = [np.mean([values[name] for values in p]) for name in ("cx", "cy")]
     P1 = np.array([[f, 0, c[0], 0], [0, f, c[1], 0], [0, 0, 1, 0]])
     P2 = P1.copy()
     P2[:, 3] = P1[:, :3] @ np.where(np.arange(3) == k, R2 @ T, 0)
@@ -110,7 +111,9 @@ def rectify(
     return Rectification(R1, R2, P1, P2)
 
 
-def _pair(network: Network, what: str):
+def _pair(
+    network: Network, what: str
+) -> tuple[Sequence[Camera], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], list[str]]:
     """Both cameras, R, T, and what is lost."""
     if len(network.cameras) != 2:
         raise InputError(f"{what} holds two cameras, got {len(network.cameras)}")
@@ -119,7 +122,7 @@ def _pair(network: Network, what: str):
         raise InputError(
             f"{what} holds the mounting of two cameras; a rig, or one image of each, is expected"
         )
-    lost += [one for one in describe_losses(network, rays=True) if one != Rigs.TABLE]
+    lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
     lost += ["points"] if len(network.points) else []
     return network.cameras, mountings[0, :3, :3], mountings[0, :3, 3], lost
 
@@ -136,18 +139,18 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
     kinds = {str(camera.model) for camera in cameras}
     if len(kinds) > 1:
         raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")
-    entries: dict = {}
+    entries: dict[str, Any] = {}
     for k, camera in enumerate(cameras, 1):
         own = opencv_entries(camera)
         names = NAMES[0][2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
-        entries |= {name: own[name] for name in OF_A_FISHEYE if name in own}
-    found = rectify(cameras, R, T)
+        entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
+    rectified = rectify(cameras, R, T)
     entries |= {"R": (3, 3, R.ravel()), "T": (3, 1, T)}
-    entries |= {name: (*M.shape, M.ravel()) for name, M in found._asdict().items()}
-    entries |= {"Q": (4, 4, found.Q.ravel())}
+    entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
+    entries |= {"Q": (4, 4, rectified.Q.ravel())}
     write_text(path, file_text(entries, path.suffix.lower() == ".json"))
     return tuple(lost)
 
@@ -170,7 +173,7 @@ def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Netwo
     cameras = []
     for k in (1, 2):
         matrix, coefficients = names[2 * k - 2 : 2 * k]
-        own = {name: entries[name] for name in OF_A_FISHEYE if name in entries}
+        own = {name: entries[name] for name in FISHEYE_ENTRIES if name in entries}
         for size in ("image_width", "image_height"):
             if (value := entries.get(f"{size}_{k}", entries.get(size))) is not None:
                 own[size] = value
@@ -191,12 +194,11 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     **Returns, raises:** as `write_opencv_stereo`.
     """
     cameras, R, T, lost = _pair(network, "a pair of ROS")
-    found = rectify(cameras, R, T)
-    texts = [
-        ros_text(camera, *parts)
-        for camera, parts in zip(cameras, ((found.R1, found.P1), (found.R2, found.P2)))
-    ]
+    rectified = rectify(cameras, R, T)
+    parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
+    texts = [ros_text(camera, *part) for camera, part in zip(cameras, parts)]
     names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
+    # some systems do not tell the letters of a name from capitals
     if len({name.casefold() for name in names}) < 2:
         raise InputError(f"{folder}: the names of the cameras give the same file {names[0]}.yaml")
     folder.mkdir(exist_ok=True)
@@ -233,6 +235,7 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         shift = np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0])
         name = entries.get("camera_name")
         parts.append((read_opencv(file, entries, str(name or file.stem)), R, shift))
+    # the one without a shift is the first, whatever the files are called
     parts.sort(key=lambda part: bool(part[2].any()))
     (left, R1, none), (right, R2, shift) = parts
     if none.any() or not shift.any():

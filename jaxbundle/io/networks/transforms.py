@@ -19,13 +19,23 @@ Source: nerfstudio documentation, "Data conventions"; instant-ngp, "Tips for tra
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
+from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, fit_camera, fit_messages
-from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import (
+    PIXEL_CENTRE,
+    assemble,
+    entry_of,
+    foreign_document,
+    image_columns,
+)
 from jaxbundle.io.networks.losses import check_others_zero, describe_losses, need_values, size_of
 from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text, write_text
@@ -34,17 +44,17 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
 
-HALF = 0.5
-"""Centre of a pixel relative to its corner."""
 MODELS = {
     "OPENCV": ("opencv", ("k1", "k2", "k3", "p1", "p2")),
     "PINHOLE": ("opencv", ()),
     "SIMPLE_PINHOLE": ("opencv", ()),
     "OPENCV_FISHEYE": ("kannala-brandt", ("k1", "k2", "k3", "k4")),
 }
-INTRINSICS = ("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y",
-              "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")  # fmt: skip
-UNDONE = ("applied_transform", "applied_scale", "scale", "offset")
+INTRINSICS = (
+    *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y"),
+    *("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
+)
+APPLIED_TRANSFORMATIONS = ("applied_transform", "applied_scale", "scale", "offset")
 
 
 def is_transforms(path: Path) -> bool:
@@ -67,6 +77,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     why = None
     for frame in file.rows("frames"):
         name, fields = frame.text("file_path"), _intrinsics(file, frame)
+        # frames may repeat the intrinsics, in any order of the keys
         key = json.dumps(fields.document, sort_keys=True)
         try:
             if key not in cameras:
@@ -80,6 +91,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
         used.append(cameras[key].id)
+        # the file has camera → world, M world → camera
         M.append(T[:3, :3].T)
         X0.append(T[:3, 3])
     if not names:
@@ -88,7 +100,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if twice:
         raise InputError(f"{path}: two frames have the file_path {twice!r}")
     told = [f"{why}; left out {count(len(lost), 'frame')}: {list_some(lost)}"] if lost else []
-    undone = [name for name in UNDONE if file.get(name) is not None]
+    undone = [name for name in APPLIED_TRANSFORMATIONS if file.get(name) is not None]
     if undone:
         told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
     images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
@@ -101,13 +113,13 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     """The camera fields of a frame, missing ones from the file."""
     own = any(name in frame.document for name in INTRINSICS)
-    given = {
+    values = {
         name: value
-        for source in (file, frame)
+        for source in (file, frame)  # the frame's own replace those of the file
         for name in INTRINSICS
         if (value := source.get(name)) is not None
     }
-    return JsonFields(frame.path if own else file.path, given)
+    return JsonFields(frame.path if own else file.path, values)
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
@@ -125,16 +137,17 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     fx = _focal_length(fields, "x", size and size[0], None)
     fy = _focal_length(fields, "y", size and size[1], fx)
     middle = (size[0] / 2, size[1] / 2) if size else (None, None)
-    c = [fields.number(f"c{axis}", n) - HALF for axis, n in zip("xy", middle)]
-    core = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
-    given = {name: fields.number(name, 0.0) for name in names}
+    c = [fields.number(f"c{axis}", n) - PIXEL_CENTRE for axis, n in zip("xy", middle)]
+    core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
+    coefficients = {name: fields.number(name, 0.0) for name in names}
     k4 = fields.number("k4", 0.0) if kind == "OPENCV" else 0.0
     if k4 == 0:
         tie = (("fx", "fy"),) if fields.get("fl_y") is None and fx == fy else ()
-        return Camera(id, model, core | given, image_size=size, tie=tie)
+        return Camera(id, model, core | coefficients, image_size=size, tie=tie)
     if size is None:
         raise InputError(f"{fields.path}: w is missing; k4 is not 0: a fit needs the image size")
-    foreign = Foreign(polynomial, core | given | {"k4": k4}, core | given, size)
+    start = core | coefficients
+    foreign = Foreign(polynomial, start | {"k4": k4}, start, size)
     return fit_camera(id, foreign, str(fields.path), f"has k4 {k4:g}")
 
 
@@ -147,7 +160,7 @@ def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float 
     return fields.number(f"fl_{axis}", other)
 
 
-def polynomial(p: Mapping, X, Y, Z):
+def polynomial(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The distortion of OPENCV with k4."""
     x, y = X / Z, Y / Z
     r2 = x * x + y * y
@@ -165,26 +178,25 @@ def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
     **Returns:** messages about what the format cannot hold.
     """
     need_values(network, points=False)
-    images, one = network.images, len(network.cameras) == 1
+    images, single = network.images, len(network.cameras) == 1
     fields = [_fields(camera) for camera in network.cameras]
     T = np.tile(np.eye(4), (len(images), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = matrices_of(images.angles).transpose(0, 2, 1), images.position
     frames = [
-        {"file_path": id, "transform_matrix": t, **({} if one else fields[c])}
+        {"file_path": id, "transform_matrix": t, **({} if single else fields[c])}
         for id, t, c in zip(images.id, T.tolist(), images.camera.tolist())
     ]
-    document = (fields[0] if one else {}) | {"frames": frames}
+    document = (fields[0] if single else {}) | {"frames": frames}
     write_text(Path(path), json.dumps(document, indent=1) + "\n")
     return (*describe_losses(network, rays=True), *(("points",) if len(network.points) else ()))
 
 
-def _fields(camera: Camera) -> dict:
+def _fields(camera: Camera) -> dict[str, Any]:
     fisheye = camera.model == "kannala-brandt"
     kind = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     names = MODELS[kind][1]
     p = check_others_zero(camera, "nerfstudio", names)
     w, h = size_of(camera, "nerfstudio")
-    return {
-        "camera_model": kind, "w": w, "h": h, "fl_x": p["fx"], "fl_y": p["fy"],
-        "cx": p["cx"] + HALF, "cy": p["cy"] + HALF, **{name: p[name] for name in names},
-    }  # fmt: skip
+    fields = {"camera_model": kind, "w": w, "h": h, "fl_x": p["fx"], "fl_y": p["fy"]}
+    fields |= {"cx": p["cx"] + PIXEL_CENTRE, "cy": p["cy"] + PIXEL_CENTRE}
+    return fields | {name: p[name] for name in names}

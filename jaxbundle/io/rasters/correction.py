@@ -2,16 +2,19 @@
 
 import itertools
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
 from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
-from jaxbundle.pushbroom.correct import BLOCK, block_places
+from jaxbundle.pushbroom.correct import BLOCK, Nodes, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
@@ -19,18 +22,15 @@ from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Progress
+from jaxbundle.types import AnyArray, Progress
 
-MARGIN = 3
-"""Pixels that resampling may require beyond the outermost position."""
-WINDOW_STEP = 128
-"""Windows of the image are widened to a multiple of this, or an eighth: few shapes to compile."""
-WINDOW = 2**22
-"""Image values, of all bands, in memory for a part of a block."""
-BORDER = 33
-"""Points along each border of the image that bound the map."""
-MOST_PIXELS = 10_000
-"""Pixels of a map relative to those of the image: more indicate a wrong spacing."""
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+Part = tuple[slice, slice]
+"""Rows and columns of a block."""
+Window = tuple[tuple[int, int], tuple[int, int]]
+"""First and last line, first and last pixel of an image."""
 
 _resample = compile_once(resample, 3)
 _locate = compile_once(locate_lines, ())
@@ -42,16 +42,21 @@ def map_of(
     system: MapSystem,
     size: float | None,
     model: str | Path | None = None,
+    border: int = 33,
+    max_pixels: float = 10_000,
 ) -> MapGrid:
     """The pixels of a map of the whole image, by default with its size on the ground.
 
-    `model` names the file of a terrain in messages.
+    **Arguments:** `model` names the file of a terrain in messages; `border`: points along each
+    border of the image that bound the map, enough for the bends of a track and of a terrain: what
+    they miss is cut off, except for the margin of a pixel; `max_pixels` of the map for one of the
+    image: more indicate a wrong spacing, such as metres where the map is in degrees.
 
     **Raises:** `InputError` if the image shows nothing of the surface, its map does not hold
     together, or is too large.
     """
-    lines = np.linspace(-0.5, image.lines - 0.5, BORDER)
-    pixels = np.linspace(-0.5, image.pixels - 0.5, BORDER)
+    lines = np.linspace(-0.5, image.lines - 0.5, border)
+    pixels = np.linspace(-0.5, image.pixels - 0.5, border)
     inner = np.clip(lines, 0, image.lines - 1)  # the tables may end at the outer lines' centres
     X = np.asarray(_locate(image, surface, inner, pixels))
     if not np.isfinite(X).any():
@@ -67,8 +72,9 @@ def map_of(
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
+        # two digits: a round size that a reader can repeat
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
-    grid = grid_around(x, y, size, MOST_PIXELS * image.lines * image.pixels)
+    grid = grid_around(x, y, size, max_pixels * image.lines * image.pixels)
     # a line beyond the outermost centres, outside the border
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
@@ -100,9 +106,9 @@ def write_corrected(
                     f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
                     f"{image.lines} of {image.pixels}"
                 )
-            reading = threading.Lock()
+            reading = threading.Lock()  # GDAL: one thread at a time in a data set
 
-            def block(nodes):
+            def block(nodes: Nodes) -> Float[np.ndarray, "bands rows columns"] | None:
                 places = block_places(image, search, surface, nodes, occlusion)
                 if places is None:
                     return None
@@ -116,22 +122,38 @@ def write_corrected(
         raise unreadable(source, error) from None
 
 
-def _values(bands, reading, image, places, resampling):
+def _values(
+    bands: "DatasetReader",
+    reading: threading.Lock,
+    image: PushbroomImage,
+    places: tuple[Float[AnyArray, "rows columns"], Float[AnyArray, "rows columns"]],
+    resampling: Resampling,
+) -> Float[np.ndarray, "bands rows columns"]:
     """All bands at the positions of a block."""
     line, pixel = (np.asarray(p) for p in places)
     values = np.full((bands.count, *line.shape), np.nan)
-    for part, window in _parts(line, pixel, image, WINDOW / bands.count):
+    # 2²² values of all bands are 32 MB of doubles in memory for each of the two workers.
+    for part, window in _parts(line, pixel, image, 2**22 / bands.count):
+        # only reading is locked, the other worker computes meanwhile
         with reading:
             seen = bands.read(window=window)
-        pad = [(0, -n % max(WINDOW_STEP, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
+        # Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for
+        # every shape, and there are only a few shapes then.
+        pad = [(0, -n % max(128, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
         seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
         (top, _), (left, _) = window
         values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
     return values
 
 
-def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
-    """Quarters of a block, quartered again until each covers few enough pixels of the image.
+def _parts(
+    line: Float[np.ndarray, "rows columns"],
+    pixel: Float[np.ndarray, "rows columns"],
+    image: PushbroomImage,
+    most: float,
+    part: Part = (slice(0, BLOCK), slice(0, BLOCK)),
+) -> Iterator[tuple[Part, Window]]:
+    """Quarters of a block, quartered again until each covers at most `most` pixels of the image.
 
     Each as slices of the block, with the required rows and columns of the image. Parts outside the
     image are left out.
@@ -139,16 +161,20 @@ def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
     seen = line[part], pixel[part]
     if not np.isfinite(seen[0]).any():
         return
-    window = tuple(
-        (max(int(np.nanmin(v)) - MARGIN, 0), min(int(np.nanmax(v)) + MARGIN + 1, size))
+    # the cubic kernel, the widest, reaches 2 pixels beyond a position; 3 leave one for rounding
+    margin = 3
+    lines, pixels = (
+        (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
         for v, size in zip(seen, (image.lines, image.pixels))
     )
+    window = lines, pixels
     side = part[0].stop - part[0].start
-    if side == 1 or (window[0][1] - window[0][0]) * (window[1][1] - window[1][0]) <= most:
+    # a single place cannot be halved, whatever it needs
+    if side == 1 or (lines[1] - lines[0]) * (pixels[1] - pixels[0]) <= most:
         yield part, window
         return
     halves = [
         [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
     ]
-    for quarter in itertools.product(*halves):
-        yield from _parts(line, pixel, image, most, quarter)
+    for rows, columns in itertools.product(*halves):
+        yield from _parts(line, pixel, image, most, (rows, columns))

@@ -10,7 +10,7 @@ from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.correct import block_errors, block_places
+from jaxbundle.pushbroom.correct import Nodes, block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.surfaces import Surface
@@ -35,9 +35,9 @@ def write_error_map(
     East and north (X and Y in a local frame) of map minus truth, and their length, metres;
     NaN outside the image. Returns the RMS of the length.
     """
-    squares = []
+    squares = []  # sums and numbers of each block: the map itself may not fit in memory
 
-    def block(nodes):
+    def block(nodes: Nodes) -> Float[np.ndarray, "3 rows columns"] | None:
         places = block_places(image, search, surface, nodes)
         if places is None:
             return None

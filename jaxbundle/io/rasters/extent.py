@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
@@ -17,13 +18,8 @@ from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once
 
 HEIGHTS = -12_000.0, 25_000.0
-"""Metres: limits for the Earth with its sea floor, the Moon and Mars."""
-PLACES = 17
-"""Lines and pixels of the lattice."""
-MARGIN = 0.03
-"""Margin on each side, relative to the size."""
-POLE = 85.0
-"""Beyond this latitude, in degrees, all longitudes may be visible."""
+"""Metres, limits for the Earth with its sea floor, the Moon and Mars: the deepest place of all is
+the Mariana Trench (−11 km), the highest Olympus Mons (22 km)."""
 
 
 class Extent(NamedTuple):
@@ -41,9 +37,12 @@ class Extent(NamedTuple):
         )
 
 
-def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
-    """The visible extent of an image; None if it shows the horizon or the pole."""
-    lines, pixels = (np.linspace(0, n - 1, PLACES) for n in (image.lines, image.pixels))
+def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> Extent | None:
+    """The visible extent of an image; None if it shows the horizon or the pole.
+
+    **Arguments:** `places`: lines and pixels of the lattice; what bends between them must stay in
+    the margin of the extent, 3 % of its size."""
+    lines, pixels = (np.linspace(0, n - 1, places) for n in (image.lines, image.pixels))
     low, high = (
         np.asarray(_locate(image, Height(level=h, earth=earth), lines, pixels)) for h in HEIGHTS
     )
@@ -54,13 +53,15 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
     high = np.where(np.isfinite(high), high, P)
     X = np.stack([low, high], axis=1)
     longitude, latitude, _ = (np.degrees(np.asarray(v)) for v in _geodetic(earth, tuple(X)))
-    middle = longitude[0, PLACES // 2, PLACES // 2]
+    middle = longitude[0, places // 2, places // 2]
     longitude = longitude - 360 * np.round((longitude - middle) / 360)
     return _around(longitude, latitude)
 
 
 def rpc_extent(rpc: Rpc) -> Extent | None:
     """The validity domain of coefficients."""
+    # Normalised coordinates are in ±1 by definition; a fifth more for images that reach beyond, not
+    # critical: only more terrain is read.
     ends = np.array([-1.0, 1.0])
     return _around(
         float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * 1.2 * ends,
@@ -68,10 +69,14 @@ def rpc_extent(rpc: Rpc) -> Extent | None:
     )
 
 
-def _around(longitude, latitude):
-    if np.abs(latitude).max() > POLE or np.ptp(longitude) > 180:
+def _around(
+    longitude: Float[np.ndarray, "..."], latitude: Float[np.ndarray, "..."]
+) -> Extent | None:
+    """The extent of points with a margin; None at a pole, where all longitudes may be visible."""
+    # within 5° (560 km) of a pole an image may contain it
+    if np.abs(latitude).max() > 85 or np.ptp(longitude) > 180:
         return None
-    wider = MARGIN * np.ptp(longitude), MARGIN * np.ptp(latitude)
+    wider = 0.03 * np.ptp(longitude), 0.03 * np.ptp(latitude)  # the bends between the rays
     return Extent(
         float(longitude.min() - wider[0]),
         float(latitude.min() - wider[1]),

@@ -17,9 +17,6 @@ from jaxbundle.io.rasters.extent import Extent
 from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
 
-EDGE = 1e-6
-"""Tolerance for points beyond the last cell due to rounding, cells."""
-
 
 def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
     """Terrain with heights above the ellipsoid, from heights above the geoid.
@@ -49,7 +46,7 @@ def undulations(
 ) -> Float[np.ndarray, "rows columns"]:
     """N in metres at longitudes × latitudes in degrees; NaN outside the grid."""
     if not Path(geoid).exists():
-        return _of_proj(geoid, longitude, latitude)
+        return _undulations_by_proj(geoid, longitude, latitude)
     extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
     grid = read_terrain(geoid, WGS84, extent)
     heights, (x0, y0), (dx, dy) = np.asarray(grid.heights), *np.degrees([grid.origin, grid.step])
@@ -58,21 +55,30 @@ def undulations(
     return _bilinear(heights, (latitude - y0) / dy, (longitude - x0) / dx)
 
 
-def _bilinear(values, row, column):
+def _bilinear(
+    values: Float[np.ndarray, "grid_rows grid_columns"],
+    row: Float[np.ndarray, " rows"],
+    column: Float[np.ndarray, " columns"],
+) -> Float[np.ndarray, "rows columns"]:
     """Values at rows × columns; NaN outside, or if a NaN has a weight."""
+    edge = 1e-6  # cells: by rounding of degrees a point of the border may lie beyond it
     inside = lambda place, n: np.where(
-        (place >= -EDGE) & (place <= n - 1 + EDGE), np.clip(place, 0, n - 1), np.nan
+        (place >= -edge) & (place <= n - 1 + edge), np.clip(place, 0, n - 1), np.nan
     )
     (i, u), (k, v) = (
         (np.clip(np.nan_to_num(np.floor(p)).astype(int), 0, n - 2), p)
         for p, n in zip(map(inside, (row, column), values.shape), values.shape)
     )
     u, v = (u - i)[:, None], v - k
+    # a NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN
     rows = np.where(u == 0, 0, u * values[i + 1]) + np.where(u == 1, 0, (1 - u) * values[i])
     return np.where(v == 0, 0, v * rows[:, k + 1]) + np.where(v == 1, 0, (1 - v) * rows[:, k])
 
 
-def _of_proj(name, longitude, latitude):
+def _undulations_by_proj(
+    name: str | Path, longitude: Float[np.ndarray, " columns"], latitude: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows columns"]:
+    """N of a grid of PROJ."""
     try:
         import pyproj.datadir
         import pyproj.exceptions

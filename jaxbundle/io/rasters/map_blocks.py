@@ -35,7 +35,7 @@ def write_map(
     floating = np.issubdtype(dtype, np.floating)
     steps = np.arange(0, BLOCK + STEP, STEP)
 
-    def one(corner):
+    def write_block(corner: tuple[int, int]) -> None:
         row, column = corner
         values = block(system.nodes(surface, *grid.centres(row + steps, column + steps)))
         if values is None or not np.isfinite(values).any():
@@ -60,7 +60,8 @@ def write_map(
     ) as map_:
         if names:
             map_.describe(names)
+        # Two workers: while one computes, the other reads or writes.
         with ThreadPoolExecutor(2) as workers:
-            for done, _ in enumerate(workers.map(one, corners), 1):
+            for done, _ in enumerate(workers.map(write_block, corners), 1):
                 if progress:
                     progress("blocks", done, len(corners))

@@ -4,7 +4,8 @@ Longitudes of a map are continuous: they continue beyond ±180° if required, su
 180.4, which GDAL and its users read. A projected system with an edge there is refused.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,10 +16,9 @@ from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.system.programs import compile_once
 
-JUMP = 0.25
-"""Neighbouring points farther apart than this part of the extent are on both sides of an edge."""
-LARGEST_SIDE = 2**31 - 1
-"""Maximum rows and columns of a GeoTIFF."""
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
 
 _geodetic = compile_once(geodetic, ())
 
@@ -51,9 +51,10 @@ class MapSystem:
         if not self.transformer:
             return degrees
         x, y = (np.asarray(v) for v in self.transformer.transform(*degrees))
+        # pyproj gives infinity
         return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
 
-    def around(self, x: np.ndarray, middle: float) -> np.ndarray:
+    def unwrap(self, x: np.ndarray, middle: float) -> np.ndarray:
         """The longitudes shifted by full turns to within half a turn of the middle."""
         return x if self.turn is None else x - self.turn * np.round((x - middle) / self.turn)
 
@@ -87,7 +88,9 @@ class MapGrid(NamedTuple):
     columns: int
     rows: int
 
-    def centres(self, row: Float[np.ndarray, " r"], column: Float[np.ndarray, " c"]):
+    def centres(
+        self, row: Float[np.ndarray, " r"], column: Float[np.ndarray, " c"]
+    ) -> Sequence[Float[np.ndarray, "r c"]]:
         """x and y of the centres of rows × columns."""
         return np.meshgrid(self.x + (column + 0.5) * self.size, self.y - (row + 0.5) * self.size)
 
@@ -104,12 +107,15 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     seen = np.flatnonzero(np.isfinite(x))
     if not len(seen):
         return x
+    # the one nearest to the middle of the lattice that has a place
     middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
-    x = system.around(x, float(middle))
+    x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:
         steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
         longest = np.nanmax(np.concatenate([np.zeros(1), *steps]))
-        if longest > JUMP * (np.nanmax(x) - np.nanmin(x)):
+        # Neighbours of a lattice of some 30 points are a thirtieth of the extent apart; those on
+        # both sides of an edge are nearly all of it. A quarter lies between.
+        if longest > 0.25 * (np.nanmax(x) - np.nanmin(x)):
             raise InputError(
                 f"coordinate system {system.crs}: the image lies on both sides of its edge (x "
                 f"jumps by {longest:.6g}); give a system with its middle there, such as EPSG:3832 "
@@ -126,7 +132,8 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)
     columns, rows = right - left, top - bottom
-    if not (max(rows, columns) < LARGEST_SIDE and rows * columns <= most):
+    # GDAL counts rows and columns by 32 bits with a sign
+    if not (max(rows, columns) < np.iinfo(np.int32).max and rows * columns <= most):
         raise InputError(
             f"--spacing {size:g}: the map would have {rows:.3g} × {columns:.3g} pixels; give a "
             "larger one, in the unit of the map, or another --crs"
@@ -134,7 +141,7 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
     return MapGrid(left * size, top * size, size, int(columns), int(rows))
 
 
-def _transformer(crs):
+def _transformer(crs: str) -> tuple["Transformer", float | None]:
     """The transformation from degrees to a system, and the change of x in a turn."""
     try:
         import pyproj.exceptions
@@ -152,4 +159,4 @@ def _transformer(crs):
         raise InputError(f"coordinate system {crs!r}: {' '.join(str(error).split())}") from None
     if not system.is_geographic:
         return transformer, None
-    return transformer, 2 * np.pi / system.axis_info[0].unit_conversion_factor
+    return transformer, 2 * np.pi / system.axis_info[0].unit_conversion_factor  # in its unit

@@ -2,8 +2,11 @@
 
 import warnings
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
@@ -11,10 +14,13 @@ from jaxbundle.io.rasters.extent import Extent
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
 from jaxbundle.system.file_content import check_plain
 
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
 GEOGRAPHIC = "EPSG:4326"
 
 
-def rasterio():
+def rasterio() -> ModuleType:
     """The package, or an error naming the extra."""
     try:
         import rasterio
@@ -31,7 +37,7 @@ def unreadable(path: str | Path, error: Exception) -> InputError:
     return InputError(f"{path}: {' '.join(str(error).split())}")
 
 
-def open_plain(path: str | Path, *arguments, **options):
+def open_plain(path: str | Path, *arguments: str, **options: Any) -> Any:
     """As `rasterio.open`, without a warning about missing georeference."""
     package = rasterio()
     check_plain(path)
@@ -84,7 +90,7 @@ def read_terrain(
         raise unreadable(path, error) from None
 
 
-def _degrees_around(source):
+def _degrees_around(source: "DatasetReader") -> str:
     """Longitude and latitude with the jump of longitudes opposite to a raster."""
     import pyproj
 
@@ -98,7 +104,10 @@ def _degrees_around(source):
     )
 
 
-def _terrain(source, earth, path, extent):
+def _terrain(
+    source: "DatasetReader", earth: Ellipsoid | None, path: str | Path, extent: Extent | None
+) -> Terrain:
+    """The terrain model of a raster, whole or the `extent` of it."""
     transform = source.transform
     if transform.b or transform.d:
         raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
@@ -116,11 +125,14 @@ def _terrain(source, earth, path, extent):
     return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
 
 
-def _cut(source, path, extent):
+def _cut(
+    source: "DatasetReader", path: str | Path, extent: Extent
+) -> tuple[Float[np.ndarray, "rows columns"], tuple[int, int]]:
     """The heights of the extent and a cell around it, and the row and column of the first."""
     (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
     rows, columns = source.shape
     bounds = source.bounds
+    # rows count from the north, or from the south
     y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
     top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
     turn = 360 / abs(dx)
@@ -129,6 +141,7 @@ def _cut(source, path, extent):
     shift = turn * np.round((columns / 2 - middle) / turn)
     x = np.sort([(v - x0) / dx + shift for v in (extent.west, extent.east)])
     left, right = int(np.floor(x[0])) - 2, int(np.ceil(x[1])) + 2
+    # 1e-3 columns: the spacing in the file has some ten digits
     seam = abs(turn - columns) < 1e-3 and (left < 0 or right > columns)
     if not (seam and right - left < columns):
         seam, left, right = False, max(left, 0), min(right, columns)
@@ -144,5 +157,7 @@ def _cut(source, path, extent):
     return np.concatenate(heights, axis=1), (top, left)
 
 
-def _heights(source, window):
+def _heights(
+    source: "DatasetReader", window: tuple[tuple[int, int], tuple[int, int]] | None
+) -> Float[np.ndarray, "rows columns"]:
     return source.read(1, window=window, masked=True).astype(float).filled(np.nan)

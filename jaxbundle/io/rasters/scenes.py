@@ -18,11 +18,8 @@ from jaxbundle.pushbroom.simulate import take_image
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 
-PORTION = 64
-"""Lines simulated together."""
 
-
-class Scene(NamedTuple):
+class SceneRaster(NamedTuple):
     """Bands, their type, and `place(X)`, the row and column of points of the ground."""
 
     bands: Float[np.ndarray, "bands rows columns"]
@@ -30,7 +27,7 @@ class Scene(NamedTuple):
     place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
+def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     """A raster in any coordinate system; for a local frame its coordinates are X and Y."""
     package = rasterio()
     try:
@@ -45,14 +42,16 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
     back = ~transform
     middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
 
-    def place(X):
+    def place(
+        X: Float[np.ndarray, "3 *shape"],
+    ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
         x, y = system.from_ground(X)
-        x = system.around(x, middle)
+        x = system.unwrap(x, middle)
         column = back.a * x + back.b * y + back.c
         row = back.d * x + back.e * y + back.f
         return row - 0.5, column - 0.5
 
-    return Scene(bands, dtype, place)
+    return SceneRaster(bands, dtype, place)
 
 
 def write_taken(
@@ -60,19 +59,24 @@ def write_taken(
     image: PushbroomImage,
     surface: Surface,
     bands: Float[Array, "bands rows columns"],
-    place: Callable,
-    dtype: np.dtype,
+    place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    dtype: np.dtype | str,
     resampling: Resampling,
     progress: Progress | None = None,
+    portion: int = 64,
 ) -> None:
-    """Write the image of a scene, some lines at a time; 0 or NaN outside the scene.
+    """Write the image of a scene, `portion` lines at a time; 0 or NaN outside the scene.
+
+    More lines at a time take more memory, fewer more calls; 64 lines of 10 000 pixels are 5 MB of
+    doubles a band.
 
     **Raises:** `InputError` if the scene is not in the image.
     """
     seen = False
     with write_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
-        for first in range(0, image.lines, PORTION):
-            lines = np.arange(first, first + PORTION, dtype=float)
+        for first in range(0, image.lines, portion):
+            lines = np.arange(first, first + portion, dtype=float)
+            # the last portion is as long as the others, so that it needs no program of its own
             inside = np.minimum(lines, image.lines - 1)
             values = take_image(image, surface, bands, place, inside, resampling)
             values = values[:, : image.lines - first]

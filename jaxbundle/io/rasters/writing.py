@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +20,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.reading import open_plain, rasterio
 from jaxbundle.io.writing.replacing import disk_of, replace_file
 
+if TYPE_CHECKING:
+    from rasterio.io import DatasetWriter
+
 
 class RasterWriter:
     """A raster being written, block by block, from any thread."""
 
-    def __init__(self, raster):
+    def __init__(self, raster: "DatasetWriter"):
         self._raster = raster
         self._lock = threading.Lock()
         self.sums: dict[tuple, int] = {}
@@ -43,7 +47,12 @@ class RasterWriter:
 
 @contextmanager
 def write_raster(
-    target: str | Path, width: int, height: int, count: int, dtype: np.dtype | str, **profile
+    target: str | Path,
+    width: int,
+    height: int,
+    count: int,
+    dtype: np.dtype | str,
+    **profile: Any,
 ) -> Iterator[RasterWriter]:
     """A GeoTIFF to write, which gets its name when it is completely on the disk.
 
@@ -67,7 +76,7 @@ def write_raster(
                     height=height,
                     count=count,
                     dtype=dtype,
-                    BIGTIFF="IF_SAFER",
+                    BIGTIFF="IF_SAFER",  # where the file might exceed 4 GB
                     **profile,
                 )
             writer = RasterWriter(raster)
@@ -112,10 +121,11 @@ class _Silence:
             self._blocks += 1
             if self._blocks == 1:
                 with suppress(OSError), open(os.devnull, "wb") as nowhere:
+                    # libtiff writes to the descriptor itself, past Python's sys.stderr
                     self._kept = os.dup(2)
                     os.dup2(nowhere.fileno(), 2)
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._lock:
             self._blocks -= 1
             if self._blocks == 0 and self._kept is not None:

@@ -1,26 +1,27 @@
 """An error budget as JSON (the fields are listed in docs/result.md)."""
 
+from typing import TYPE_CHECKING, Any
 
-def budget_dict(budget) -> dict:
+if TYPE_CHECKING:
+    from jaxbundle.bundle.sensitivity import Budget
+
+
+def budget_dict(budget: "Budget") -> dict[str, Any]:
     """σ, total, and effect and share of every cause for each result; angles in the unit of the
     network."""
-    columns, results = budget.table(), {}
+    columns = budget.table()
+    results: dict[str, dict[str, Any]] = {}
     for name, cause, _, effect, share in zip(*(c.tolist() for c in columns.values())):
-        of = results.setdefault(name, {"held": {}})
+        result = results.setdefault(name, {"held": {}})
         if cause == "measurements":
-            of |= {"sigma": effect, "share": share}
+            result |= {"sigma": effect, "share": share}
         elif cause == "total":
-            of["total"] = effect
+            result["total"] = effect
         else:
-            of["held"][cause] = {"effect": effect, "share": share}
-    held = {
-        cause.name: {"sigma": _sigma(budget, cause), "errors": len(cause.errors)}
-        for cause in budget.causes
-    }
+            result["held"][cause] = {"effect": effect, "share": share}
+    held = {}
+    for cause in budget.causes:
+        unit = budget.angle_scale if cause.angle else 1.0
+        sigma = None if cause.sigma is None else cause.sigma * unit
+        held[cause.name] = {"sigma": sigma, "errors": len(cause.errors)}
     return {"held": held, "results": results}
-
-
-def _sigma(budget, cause) -> float | None:
-    if cause.sigma is None:
-        return None
-    return cause.sigma * (budget.angle_scale if cause.angle else 1.0)

@@ -5,6 +5,7 @@ unit; the columns are those of a project's tables, without σ if there are none,
 mean reprojection error, `error_px` or `error_mm`, which is not read again.
 """
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -53,5 +54,6 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     return ("interior orientations", "image points")
 
 
-def _cells(numbers):
+def _cells(numbers: Iterable[float]) -> Iterator[str]:
+    # x != x: NaN
     return ("" if x != x else "free" if x == np.inf else repr(x) for x in numbers)

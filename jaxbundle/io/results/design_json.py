@@ -1,6 +1,7 @@
 """The result of a design as JSON (the fields are listed in docs/design.md)."""
 
 import json
+from typing import Any
 
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import EXTERIOR
@@ -9,9 +10,10 @@ from jaxbundle.network_design.proof import Proof
 from jaxbundle.network_design.result import Design, State
 
 
-def design_dict(designed: Design, proof: Proof | None = None) -> dict:
+def design_dict(designed: Design, proof: Proof | None = None) -> dict[str, Any]:
     """A design as plain dicts and numbers."""
     network = designed.network
+    images, unit = network.images, ANGLE_UNITS[network.angle_unit]
     return {
         "order": designed.order,
         "aim": str(designed.aim),
@@ -21,7 +23,10 @@ def design_dict(designed: Design, proof: Proof | None = None) -> dict:
         "gain": designed.gain,
         "converged": designed.converged,
         "path": [{"softness": s.softness, "aim": s.aim} for s in designed.path],
-        "stations": _stations(designed),
+        "stations": {
+            id: dict(zip(EXTERIOR, [*X0.tolist(), *(angles / unit).tolist()]))
+            for id, X0, angles in zip(images.id, images.position, images.angles)
+        },
         "bound": designed.bound,
         "weights": designed.weights,
         "dropped": list(designed.dropped),
@@ -41,22 +46,14 @@ def design_dict(designed: Design, proof: Proof | None = None) -> dict:
 
 
 def design_text(designed: Design, proof: Proof | None = None) -> str:
-    """The same as text."""
+    """A design as JSON text of one line; numbers that are not finite are null."""
     return json.dumps(without_nan(design_dict(designed, proof)), ensure_ascii=False) + "\n"
 
 
-def _state(state: State) -> dict:
+def _state(state: State) -> dict[str, Any]:
     return {
         "aim": state.aim,
         "photographs": state.photographs,
         "image_points": state.rays,
         "lost": list(state.lost),
-    }
-
-
-def _stations(designed: Design) -> dict:
-    images, unit = designed.network.images, ANGLE_UNITS[designed.network.angle_unit]
-    return {
-        id: dict(zip(EXTERIOR, [*X0.tolist(), *(angles / unit).tolist()]))
-        for id, X0, angles in zip(images.id, images.position, images.angles)
     }

@@ -6,6 +6,7 @@ with their names; CAMERAS with the pyramids as lines and CAMERA_NAMES.
 
 import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from jaxbundle.io.results.pyramids import pyramids
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.tables import ROLES, Network
 
-TEXT_SHARE = 0.01
-"""Height of names relative to the extent of the drawing."""
+if TYPE_CHECKING:
+    from ezdxf.layouts.layout import Modelspace
+
 COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
 """Numbers of AutoCAD's colour index."""
 
@@ -44,16 +46,16 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     known = np.isfinite(points.position).all(1)
     corners, _ = pyramids(network)
     everything = np.concatenate([points.position[known], corners.reshape(-1, 3)])
-    height = TEXT_SHARE * float(np.ptp(everything, axis=0).max())
+    height = 0.01 * float(np.ptp(everything, axis=0).max())  # of names, legible on a full page
     for row in np.flatnonzero(known):
         place = tuple(points.position[row].tolist())
         space.add_point(place, dxfattribs={"layer": f"POINTS_{points.role[row].upper()}"})
-        _name(space, points.id[row], place, height, "POINT_NAMES")
+        _write_name(space, points.id[row], place, height, "POINT_NAMES")
     for id, pyramid in zip(network.images.id, corners.tolist()):
         centre, *base = map(tuple, pyramid)
         for a, b in [*((centre, c) for c in base), *zip(base, [*base[1:], base[0]])]:
             space.add_line(a, b, dxfattribs={"layer": "CAMERAS"})
-        _name(space, id, centre, height, "CAMERA_NAMES")
+        _write_name(space, id, centre, height, "CAMERA_NAMES")
     text = io.StringIO()
     drawing.write(text)
     write_text(Path(path), text.getvalue())
@@ -61,7 +63,9 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")
 
 
-def _name(space, name: str, place, height: float, layer: str) -> None:
+def _write_name(
+    space: "Modelspace", name: str, place: tuple[float, ...], height: float, layer: str
+) -> None:
     # control characters would break the lines of the file
     safe = "".join(c if c.isprintable() else "_" for c in name)
     space.add_text(safe, height=height, dxfattribs={"layer": layer, "insert": place})

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
@@ -32,12 +33,13 @@ class JsonLines:
         self._regular = regular = self.path.is_file() or not self.path.exists()
         # A link stays a link; a pipe of a process has no other name.
         self._file = Path(os.path.realpath(path)) if regular else self.path
-        self.heads: dict[str, dict] = {}
+        self.heads: dict[str, dict[str, Any]] = {}
         self._shared: dict[str, object] = {}
         end, twice, whole = 0, False, True
         for number, line in enumerate(self._lines() if regular else (), 1):
             row, whole = _row(line), line.endswith(b"\n")
             if row is None:
+                # zero bytes: what a crash of the system may leave at the end of a file
                 if not whole and _is_torn(line.rstrip(b"\0")):
                     break
                 raise InputError(
@@ -47,7 +49,7 @@ class JsonLines:
             end += len(line)
             twice |= row["key"] in self.heads
             self.heads.setdefault(row["key"], self._head(row))
-        self._write(lambda file: None)
+        self._write(lambda _: None)  # refuses a file that cannot be written before any work
         if regular and not whole:
             self._mend(end)
         if twice:
@@ -56,15 +58,15 @@ class JsonLines:
     def __contains__(self, key: str) -> bool:
         return key in self.heads
 
-    def append(self, rows: Iterable[dict]) -> None:
+    def append(self, rows: Iterable[dict[str, Any]]) -> None:
         """Add rows; they are on the disk when this returns."""
         rows = list(rows)
         # Names that are not UTF-8 are escaped as in JSON.
-        text = "".join(_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
+        text = "".join(_json_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
         self._write(lambda file: file.write(text))
         self.heads.update((row["key"], self._head(row)) for row in rows)
 
-    def rows(self, keys: Iterable[str]) -> Iterator[dict]:
+    def rows(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
         """The rows of some keys, in the order of the file."""
         wanted = set(keys)
         return (row for row in map(_row, self._lines()) if row is not None and row["key"] in wanted)
@@ -94,7 +96,7 @@ class JsonLines:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
 
-    def _write(self, write: Callable) -> None:
+    def _write(self, write: Callable[[BinaryIO], object]) -> None:
         try:
             # A pipe may be slow: nothing waits for it.
             whole = defer_interrupts() if self._regular else nullcontext()
@@ -106,13 +108,13 @@ class JsonLines:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
-    def _head(self, row: dict) -> dict:
+    def _head(self, row: dict[str, Any]) -> dict[str, Any]:
         """The fields kept in memory; equal settings share one object, since all lines have some."""
-        found = {name: row[name] for name in HEAD if name in row}
-        if "settings" in found:
-            key = json.dumps(found["settings"], sort_keys=True, default=str)
-            found["settings"] = self._shared.setdefault(key, found["settings"])
-        return found
+        head = {name: row[name] for name in HEAD if name in row}
+        if "settings" in head:
+            key = json.dumps(head["settings"], sort_keys=True, default=str)
+            head["settings"] = self._shared.setdefault(key, head["settings"])
+        return head
 
     def _mend(self, end: int) -> None:
         """Remove a partial line that begins at `end`, or add the line feed of the last line."""
@@ -122,7 +124,8 @@ class JsonLines:
             self._write(lambda file: file.write(b"\n"))
 
 
-def _text(row: dict) -> str:
+def _json_text(row: dict[str, Any]) -> str:
+    # first as it is: few rows have a NaN, and the others need no copy without it
     try:
         return json.dumps(row, ensure_ascii=False, allow_nan=False)
     except ValueError:
@@ -135,12 +138,12 @@ def _is_torn(line: bytes) -> bool:
     return begin.startswith(line[: len(begin)]) and _parse(line) is None
 
 
-def _row(line: bytes) -> dict | None:
+def _row(line: bytes) -> dict[str, Any] | None:
     row = _parse(line)
     return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
 
 
-def _parse(line: bytes):
+def _parse(line: bytes) -> Any:
     try:
         return json.loads(line)
     except (ValueError, RecursionError):

@@ -23,7 +23,6 @@ COLOURS = {
     "fixed": (0, 60, 160),
     "check": (0, 180, 80),
 }
-CAMERA = (220, 40, 40)
 VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f4")])
 
 
@@ -52,7 +51,7 @@ def write_ply(
         if there
     ]
     vertices["colour"][:first] = np.array(roles).reshape(-1, 3)
-    vertices["colour"][first:] = CAMERA
+    vertices["colour"][first:] = (220, 40, 40)  # red: cameras, against the blues of points
     edges = (edges.reshape(-1, 2) + first).astype("<i4")
     head = [
         "ply",

@@ -8,19 +8,18 @@ from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.network.tables import Camera, Network
 
-SHARE = 0.1
-"""Length of a pyramid relative to the distance from the cameras to the points."""
-UNKNOWN = (0.4, 0.3)
-"""Half width and height of an image of unknown size relative to the principal distance."""
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 def pyramids(
-    network: Network,
+    network: Network, length: float = 0.1
 ) -> tuple[Float[np.ndarray, "images 5 3"], Int[np.ndarray, "images 8 2"]]:
     """Corners of the pyramids, the projection centre first, and their edges.
 
     Edges are numbered through all corners of all images. Distortion is not drawn.
+
+    **Arguments:** `length` of a pyramid relative to the distance from the cameras to the points
+    (median): a tenth shows where a camera looks, and leaves the object visible.
     """
     images, points = network.images, network.points
     centre = images.position
@@ -33,7 +32,7 @@ def pyramids(
         [CORNERS[None] * half[:, None], np.full((len(images), 4, 1), -1.0)], axis=2
     )
     M = matrices_of(images.angles)
-    corners = centre[:, None] + SHARE * distance * rays @ M
+    corners = centre[:, None] + length * distance * rays @ M
     vertices = np.concatenate([centre[:, None], corners], axis=1)
     edges = np.array([[0, k] for k in range(1, 5)] + [[1, 2], [2, 3], [3, 4], [4, 1]])
     return vertices, edges[None] + 5 * np.arange(len(images))[:, None, None]
@@ -46,6 +45,6 @@ def _half(camera: Camera) -> tuple[float, float]:
     if model.unit == "mm" and size is not None:
         size = None if camera.pixel_size is None else size * camera.pixel_size
     if size is None:
-        return UNKNOWN
+        return 0.4, 0.3  # an image of unknown size: 4 : 3, 44° wide, as of a common lens
     focal = [p[name] for name in model.principal_distance]
     return tuple((size / 2 / focal).tolist())

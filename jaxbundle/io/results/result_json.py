@@ -9,14 +9,22 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.text.csv_tables import table_rows, take_portions
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.report.verdict import Verdict
 
 
-def result_dict(adjustment, brief: bool = False) -> dict:
+def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     """The result as plain dicts and numbers; `brief` leaves points and residuals out."""
     counts = adjustment.counts
     head = {
@@ -84,16 +92,18 @@ def unsolved_text(error: NotSolvedError) -> str:
 
 
 def result_text(
-    adjustment, brief: bool = False, also: Mapping = MappingProxyType({})
+    adjustment: "Adjustment", brief: bool = False, also: Mapping = MappingProxyType({})
 ) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
     image points take 1 GB. `also`: further entries."""
+    # without the long tables, which would need their memory at once
     head = result_dict(adjustment, brief=True) | dict(also)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return
     more = {"verdict": verdict_dict(adjustment.verdict)}
     more |= {"variance_components": _components(adjustment)}
+    # The two long tables are written in portions between the braces of the rest.
     yield _text({**more, **head})[:-1]
     yield ', "points": {'
     yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
@@ -102,7 +112,7 @@ def result_text(
     yield "]}\n"
 
 
-def _text(value) -> str:
+def _text(value: Any) -> str:
     return json.dumps(without_nan(value), ensure_ascii=False)
 
 
@@ -111,7 +121,7 @@ def _join(pieces: Iterator[str]) -> Iterator[str]:
         yield ", " + piece if number else piece
 
 
-def without_nan(value):
+def without_nan(value: Any) -> Any:
     """NaN and infinity do not exist in JSON: null."""
     if isinstance(value, dict):
         return {key: without_nan(v) for key, v in value.items()}
@@ -122,7 +132,7 @@ def without_nan(value):
     return value
 
 
-def verdict_dict(verdict) -> dict:
+def verdict_dict(verdict: "Verdict") -> dict:
     """A verdict (`report.verdict`) as plain dicts."""
     state, words, findings = verdict
     return {
@@ -144,11 +154,11 @@ def _camera(table: dict) -> dict:
     }
 
 
-def _estimate(value, sigma) -> dict:
+def _estimate(value: float, sigma: float) -> dict:
     return {"value": value, "sigma": sigma}
 
 
-def _images(adjustment) -> dict:
+def _images(adjustment: "Adjustment") -> dict:
     columns = {name: column.tolist() for name, column in adjustment.images.items()}
     return {
         image: {name: _estimate(columns[name][i], columns[f"s{name}"][i]) for name in EXTERIOR}
@@ -157,7 +167,7 @@ def _images(adjustment) -> dict:
     }
 
 
-def _components(adjustment) -> dict:
+def _components(adjustment: "Adjustment") -> dict:
     return {
         name: {
             "observations": c.observations,
@@ -171,7 +181,7 @@ def _components(adjustment) -> dict:
     }
 
 
-def _points(table) -> Iterator[tuple[str, dict]]:
+def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
     for row in table_rows(table):
         point = dict(zip(table, row))
         estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
@@ -181,14 +191,14 @@ def _points(table) -> Iterator[tuple[str, dict]]:
         )
 
 
-def _far_points(adjustment) -> dict:
-    found = adjustment.far_points
-    if found is None:
+def _far_points(adjustment: "Adjustment") -> dict:
+    far = adjustment.far_points
+    if far is None:
         return {}
     columns = {name: column.tolist() for name, column in adjustment.table("far_points").items()}
-    inverse = zip(found.inverse_distance.tolist(), found.sigma_inverse_distance.tolist())
+    inverse = zip(far.inverse_distance.tolist(), far.sigma_inverse_distance.tolist())
     return {
-        "origin": dict(zip("XYZ", found.origin.tolist())),
+        "origin": dict(zip("XYZ", far.origin.tolist())),
         "points": {
             point: {
                 "direction": {axis: columns[f"u{axis}"][i] for axis in "XYZ"},
@@ -201,16 +211,16 @@ def _far_points(adjustment) -> dict:
     }
 
 
-def _residuals(table) -> Iterator[dict]:
+def _residuals(table: Mapping[str, np.ndarray]) -> Iterator[dict]:
     for row in table_rows(table):
         yield dict(zip(table, row))
 
 
-def _checks(adjustment) -> dict:
+def _checks(adjustment: "Adjustment") -> dict:
     table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
     if not table:
         return {}
-    rms = adjustment.check_points.rms.tolist()
+    rms = present(adjustment.check_points).rms.tolist()
     return {
         "rms": dict(zip("XYZ", rms)),
         "points": {

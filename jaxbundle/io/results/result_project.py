@@ -1,8 +1,10 @@
 """The adjusted network as a project: for other programs, and to be adjusted again."""
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.further import CameraParameters, ExteriorPriors, Further, RollingShutter
@@ -10,8 +12,11 @@ from jaxbundle.network.further.base import among
 from jaxbundle.network.sightings import keep_points, without_distances
 from jaxbundle.network.tables import ESTIMATED, Images, Network, Points
 
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
-def adjusted_network(adjustment) -> Network:
+
+def adjusted_network(adjustment: "Adjustment") -> Network:
     """The network of a solved `Adjustment` at its solution, for other programs.
 
     Cameras, orientations and points have their adjusted values; observations removed by data
@@ -62,10 +67,10 @@ def adjusted_network(adjustment) -> Network:
         warnings=(),
         notes=("the adjusted network",),
     )
-    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+    return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 
-def readjustable_network(adjustment) -> Network:
+def readjustable_network(adjustment: "Adjustment") -> Network:
     """The network of a solved `Adjustment` with adjusted start values and all observations that
     took part: adjusted again it gives the same values, σ and σ0.
 
@@ -110,20 +115,20 @@ def readjustable_network(adjustment) -> Network:
         distances=dataclasses.replace(
             network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
         ),
-        further=_joined(*_further(adjustment), *_priors(adjustment)),
+        further=_join_tables(*_further(adjustment), *_priors(adjustment)),
         warnings=(),
         notes=("the adjusted network",),
     )
     adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
-    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))
+    return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
 
 
-def _sigma(weight, otherwise: float):
-    """σ of weights."""
+def _sigma(weight: Float[np.ndarray, "..."], otherwise: float) -> Float[np.ndarray, "..."]:
+    """σ of the engine's weights, which are 1/σ; `otherwise` where nothing was used."""
     return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), otherwise)
 
 
-def _given_points(adjustment) -> Points:
+def _given_points(adjustment: "Adjustment") -> Points:
     """Points at their adjusted coordinates, controlled axes at the given ones; a control point of
     which no axis is used any more is a tie point."""
     problem = adjustment.problem
@@ -135,20 +140,21 @@ def _given_points(adjustment) -> Points:
     position[control] = np.where(weight > 0, given, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
+    # a tie point has no observed coordinates
     sigma[roles == "tie"] = np.nan
     return Points(points.id, tuple(roles.tolist()), position, sigma, points.source)
 
 
-def _priors(adjustment) -> list[Further]:
+def _priors(adjustment: "Adjustment") -> list[Further]:
     """What was observed of orientations and cameras."""
     problem = adjustment.problem
     network, data, given = problem.network, problem.data, problem.layout.given
-    found: list[Further] = []
+    tables: list[Further] = []
     if len(given["exterior"]):
         value = np.asarray(data.exterior) + np.concatenate([problem.origin, np.zeros(3)])
         image = tuple(network.images.id[k] for k in given["exterior"])
         sigma = _sigma(np.asarray(data.exterior_weight), np.inf)
-        found.append(ExteriorPriors(image=image, value=value, sigma=sigma))
+        tables.append(ExteriorPriors(image=image, value=value, sigma=sigma))
     gone = {(name.id, name.parameter) for name in adjustment.eliminated}
     rows = []
     for row, c in enumerate(given["interior"]):
@@ -159,50 +165,50 @@ def _priors(adjustment) -> list[Further]:
                 rows.append((camera.id, name, float(data.interior[row, j]), 1 / weight))
     if rows:
         camera, parameter, value, sigma = zip(*rows)
-        found.append(
+        tables.append(
             CameraParameters(
                 camera=camera, parameter=parameter, value=np.array(value), sigma=np.array(sigma)
             )
         )
-    return found
+    return tables
 
 
-def _joined(*given: Further) -> tuple[Further, ...]:
+def _join_tables(*further: Further) -> tuple[Further, ...]:
     """One table of each kind: priors follow the rows of the same kind that the network had."""
     tables: dict[str, Further] = {}
-    for one in given:
-        first = tables.get(one.TABLE)
+    for table in further:
+        first = tables.get(table.TABLE)
         if first is None:
-            tables[one.TABLE] = one
+            tables[table.TABLE] = table
             continue
-        names = [f.name for f in dataclasses.fields(one) if f.name not in ("settings", "source")]
+        names = [f.name for f in dataclasses.fields(table) if f.name not in ("settings", "source")]
         join = lambda a, b: np.concatenate([a, b]) if isinstance(a, np.ndarray) else (*a, *b)
-        both: dict = {name: join(getattr(first, name), getattr(one, name)) for name in names}
-        tables[one.TABLE] = type(one)(**both, settings=first.settings)
+        both: dict = {name: join(getattr(first, name), getattr(table, name)) for name in names}
+        tables[table.TABLE] = type(table)(**both, settings=first.settings)
     return tuple(tables.values())
 
 
-def _further(adjustment) -> list[Further]:
+def _further(adjustment: "Adjustment") -> list[Further]:
     """The observations of further kinds without those removed by data snooping, with their final σ:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
     network, system = problem.network, problem.system
     # the engine's sets in the order of declaration, the user's own before those of the network
-    kinds = sorted(among(network), key=lambda one: not isinstance(one, RollingShutter))
-    numbers = [len(one.declare(network, problem.origin).observations) for one in kinds]
-    names, found = iter(problem.layout.others[len(problem.layout.others) - sum(numbers) :]), []
-    for one, number in zip(kinds, numbers):
+    kinds = sorted(among(network), key=lambda table: not isinstance(table, RollingShutter))
+    numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
+    names, tables = iter(problem.layout.others[len(problem.layout.others) - sum(numbers) :]), []
+    for table, number in zip(kinds, numbers):
         if not number:
-            found.append(one)
+            tables.append(table)
             continue
         first, *_ = [system.observations_of(next(names)) for _ in range(number)]
         factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
         for name, power in (("sigma", 1), ("covariance", 2)):
-            if factor != 1 and hasattr(one, name):
-                changed: dict = {name: getattr(one, name) * factor**power}
-                one = dataclasses.replace(one, **changed)
-        if first.number == len(one):
-            whole = np.abs(np.asarray(system.weights(first.name))).reshape(len(one), -1).max(1)
-            one = one.take(whole > 0)
-        found += [one] if len(one) else []
-    return found
+            if factor != 1 and hasattr(table, name):
+                changed: dict = {name: getattr(table, name) * factor**power}
+                table = dataclasses.replace(table, **changed)
+        if first.number == len(table):
+            whole = np.abs(np.asarray(system.weights(first.name))).reshape(len(table), -1).max(1)
+            table = table.take(whole > 0)
+        tables += [table] if len(table) else []
+    return tables

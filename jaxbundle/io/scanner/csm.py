@@ -21,8 +21,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.csm_optics import optics_of
 from jaxbundle.io.scanner.csm_state import MODEL, is_state, support_data_of
-from jaxbundle.io.scanner.csm_trajectory import ORDER, slerp, states_of, trajectory_of, unit_of
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.csm_trajectory import (
+    LAGRANGE_ORDER,
+    states_of,
+    trajectory_of,
+    unit_of,
+    view_directions,
+)
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object
 from jaxbundle.network.columns import show
@@ -32,7 +38,7 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 
-def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
+def read_csm(path: str | Path, interpolation: str = "usgscsm") -> ScannerInput:
     """The pushbroom image of an ISD or a model state.
 
     **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
@@ -41,7 +47,7 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
     **Raises:** `InputError` naming file and field: missing, of another kind, not a number,
     an unknown distortion; tables that end too long before the image.
     """
-    isd, order = _support_data(Path(path))
+    isd, order = _read_support_data(Path(path))
     lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
     check_size(lines, pixels, f"{path}: image_lines, image_samples")
     lines, pixels = int(lines), int(pixels)
@@ -49,7 +55,8 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
     ends = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
     when = np.linspace(ends[0], ends[1], lines) if times.table is None else np.asarray(times.table)
     states = states_of(isd, when, interpolation)
-    optics, turn = optics_of(isd, pixels, *_middle(states, ends.mean()))
+    middle = view_directions(states.t, states.P, states.rows, states.R, ends.mean())
+    optics, turn = optics_of(isd, pixels, *middle)
     image = make_image(
         trajectory_of(states, turn, interpolation, order),
         times,
@@ -59,19 +66,23 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
         sources=states.sources,
     )
     name = str(isd.get("name_sensor") or Path(path).stem)
-    return Scanner(name, image, _earth(isd), states.warnings)
+    return ScannerInput(name, image, _earth(isd), states.warnings)
 
 
-def _support_data(path):
+def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     """The fields of an ISD, also of a state, and the degree of its interpolation."""
     text = read_text(path)
     name, brace, _ = text.partition("{")
     name = name.strip()
+    # a state has the name of its model before the braces
     if name and brace and name.replace("_", "").isalnum():
         if name != MODEL:
             raise InputError(f"{path}: a model state of {show(name)}; {MODEL} is expected")
         text = text[text.index("{") : text.rindex("}") + 1] if "}" in text else brace
-    isd, order = JsonFields(path, read_object(path, text, "an ISD or a model state")), ORDER
+    isd, order = (
+        JsonFields(path, read_object(path, text, "an ISD or a model state")),
+        LAGRANGE_ORDER,
+    )
     if name or is_state(isd.document):
         document, order = support_data_of(isd)
         return JsonFields(path, document), order
@@ -81,7 +92,7 @@ def _support_data(path):
     return isd, order
 
 
-def _earth(isd):
+def _earth(isd: JsonFields) -> Ellipsoid:
     unit = unit_of(isd, "radii", "km")
     a, c = (unit * isd.number(f"radii.{key}") for key in ("semimajor", "semiminor"))
     if not min(a, c) > 0:
@@ -89,24 +100,17 @@ def _earth(isd):
     return Ellipsoid(a, a, c)
 
 
-def _line_times(isd, lines):
+def _line_times(isd: JsonFields, lines: int) -> LineTimes:
     rates = isd.array("line_scan_rate", (None, 3))
     if not len(rates) or (rates[:, 2] <= 0).any():
         raise InputError(f"{isd.path}: line_scan_rate needs rows of a positive period")
     first, start, period = rates.T
+    # the centre of line l is l + ½ in the coordinates of the ISD
     l = np.arange(lines)
     row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
     t = start[row] + period[row] * (l + 1 - first[row])
+    # one rate: times follow from it, and need no table
     if (row == row[0]).all():
         return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]]))
     check_times(t, Source(f"{isd.path}, line_scan_rate", None, "line"))
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
-
-
-def _middle(states, middle):
-    """The directions down and of flight at the middle line, in the camera frame."""
-    here, after = (
-        np.array([np.interp(middle + dt, states.t, p) for p in states.P.T]) for dt in (0, 1e-3)
-    )
-    camera = slerp(states.rows, states.R, np.array([middle]))[0].inv()
-    return camera.apply(-here), camera.apply(after - here)

@@ -17,8 +17,7 @@ from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import list_some, show
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
-ALIGNED = 1e-9
-KNOWN = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")
+DISTORTIONS = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")
 
 
 def optics_of(
@@ -39,7 +38,8 @@ def optics_of(
     frame = sight_frame(sights, down, forward)
     X, Y = f * frame.slopes(*sights)
     pitch = (X[-1] - X[0]) / (pixels - 1)
-    straight = np.abs(Y - Y[0]).max() < ALIGNED * max(np.abs(X).max(), abs(f))
+    # 1e-9 of the focal plane are below a thousandth of a pixel, and far above the rounding of Y
+    straight = np.abs(Y - Y[0]).max() < 1e-9 * max(np.abs(X).max(), abs(f))
     if kind == "radial" and f > 0 and straight:
         K = -isd.array("optical_distortion.radial.coefficients", (None,))
         model = get_model("usgs")
@@ -51,13 +51,14 @@ def optics_of(
     return AngleTable(*map(jnp.asarray, psi)), frame.turn
 
 
-def _focal_plane(isd, u):
+def _focal_plane(isd: JsonFields, u: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "2 pixels"]:
     """Positions of the pixels in the focal plane, mm, x and y of the ISD."""
     to_line, to_sample = (isd.array(f"focal2pixel_{k}", (3,)) for k in ("lines", "samples"))
     summing = isd.number("detector_sample_summing", 1)
     sample = (u + 0.5) * summing + isd.number("starting_detector_sample", 0)
     line = isd.number("starting_detector_line", 0)
     A = np.stack([to_line[1:], to_sample[1:]])
+    # parallel but for the rounding of numbers of 12 digits
     if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
         raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
     offset = np.stack(
@@ -69,13 +70,15 @@ def _focal_plane(isd, u):
     return np.linalg.solve(A, offset)
 
 
-def _distortion(isd, x, y):
+def _distortion(
+    isd: JsonFields, x: Float[np.ndarray, " pixels"], y: Float[np.ndarray, " pixels"]
+) -> tuple[str, tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]]:
     """The kind of distortion, and the undistorted coordinates, mm."""
-    given = isd.document.setdefault("optical_distortion", {"radial": {"coefficients": [0.0]}})
-    kind = next(iter(given), None) if isinstance(given, dict) else None
-    if isinstance(given, dict) and len(given) > 1:
+    kinds = isd.document.setdefault("optical_distortion", {"radial": {"coefficients": [0.0]}})
+    kind = next(iter(kinds), None) if isinstance(kinds, dict) else None
+    if isinstance(kinds, dict) and len(kinds) > 1:
         raise InputError(
-            f"{isd.path}: optical_distortion has {len(given)} kinds ({list_some(given)}); "
+            f"{isd.path}: optical_distortion has {len(kinds)} kinds ({list_some(kinds)}); "
             "one is expected"
         )
     where = f"optical_distortion.{kind}"
@@ -101,32 +104,29 @@ def _distortion(isd, x, y):
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
             return kind, _transverse(isd, a, b, x, y)
+    known = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; {', '.join(KNOWN[:-1])} "
-        f"or {KNOWN[-1]} is expected"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; {known} is expected"
     )
 
 
-def _transverse(isd, a, b, x, y):
+def _transverse(
+    isd: JsonFields,
+    a: Float[np.ndarray, "10"],
+    b: Float[np.ndarray, "10"],
+    x: Float[np.ndarray, " pixels"],
+    y: Float[np.ndarray, " pixels"],
+) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]:
     """The point that the cubic polynomials a and b distort to (x, y)."""
     u, v = x, y
+    # Fixed-point iteration u ← u + (x − a(u, v)): the polynomials are near the identity, so that a
+    # step gains some digits; a distortion that needs 100 has no inverse in practice.
     for _ in range(100):
-        terms = np.stack(
-            [
-                u**0,
-                u,
-                v,
-                u * u,
-                u * v,
-                v * v,
-                u**3,
-                u * u * v,
-                u * v * v,
-                v**3,
-            ]
-        )
+        uu, uv, vv = u * u, u * v, v * v
+        terms = np.stack([u**0, u, v, uu, uv, vv, u**3, uu * v, uv * v, v**3])
         du, dv = x - a @ terms, y - b @ terms
         u, v = u + du, v + dv
+        # some 500 eps of the largest coordinate
         if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):
             return u, v
     raise InputError(f"{isd.path}: optical_distortion.transverse cannot be inverted; check it")

@@ -45,7 +45,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
 
     **Raises:** `InputError` naming file and field.
     """
-    _check(state)
+    _check_unadjusted(state)
     number, array = state.number, state.array
     names = "m_intTimeLines", "m_intTimeStartTimes", "m_intTimes"
     rates = [array(name, (None,)) for name in names]
@@ -92,7 +92,7 @@ def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
     return isd, PLATFORM_ORDERS[int(flag)]
 
 
-def _check(state):
+def _check_unadjusted(state: JsonFields) -> None:
     name = state.get("m_modelName", MODEL)
     if name != MODEL:
         raise InputError(f"{state.path}: m_modelName is {show(name)}; {MODEL} is expected")
@@ -104,14 +104,14 @@ def _check(state):
         )
 
 
-def _rows(state, key, n):
+def _rows(state: JsonFields, key: str, n: int) -> list[list[float]]:
     values = state.array(key, (None,))
     if not len(values) or len(values) % n:
         raise InputError(f"{state.path}: {key} has {len(values)} numbers; {n} a row are expected")
     return values.reshape(-1, n).tolist()
 
 
-def _distortion(state):
+def _distortion(state: JsonFields) -> dict[str, dict[str, Any]]:
     kind = state.number("m_distortionType")
     if kind not in range(len(DISTORTIONS)):
         raise InputError(

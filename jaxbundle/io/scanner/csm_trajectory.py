@@ -16,7 +16,7 @@ interpolated by Lagrange's polynomial of fewer rows near the ends (`pushbroom.in
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.networks.poses import are_rotations
 from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
@@ -41,10 +42,12 @@ from jaxbundle.pushbroom.trajectory import Trajectory
 
 INTERPOLATIONS = ("usgscsm", "lagrange")
 UNITS = {"m": 1.0, "km": 1000.0}
-FEWEST, ORDER = 25, 7
-"""Minimum rows of resampled positions."""
-ORTHOGONAL = 1e-4
-"""Tolerance of R·Rᵀ relative to the identity, as of quaternions."""
+LAGRANGE_ORDER = 7
+"""Degree of the polynomial through eight rows with which usgscsm (`m_platformFlag` 1) and the SPOT
+123-4-5 Geometry Handbook interpolate positions; taken for the other products too."""
+Times = Float[np.ndarray, " n"]
+Turns = Callable[[Times], Rotation]
+"""Rotations at times."""
 
 
 class States(NamedTuple):
@@ -88,7 +91,7 @@ def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int
     """The tables, the camera turned by `turn`."""
     q = np.roll((states.R * turn).as_quat(), 1, axis=1)
 
-    def options(k, n):
+    def options(k: int, n: int) -> dict[str, Any]:
         least = order if interpolation == "usgscsm" else min(order, n - 1)
         return {
             "method": interpolation,
@@ -104,14 +107,30 @@ def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int
     )
 
 
-def slerp(t: Float[np.ndarray, " n"], R: Rotation, at: Float[np.ndarray, " m"]) -> Rotation:
-    """Rotations between rows, and beyond them at the rate of the first and last step."""
-    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    part = (at - t[i]) / (t[i + 1] - t[i])
+def slerp(t: Float[np.ndarray, " n"], R: Rotation, times: Float[np.ndarray, " m"]) -> Rotation:
+    """Rotations between rows, and beyond them at the rate of the first and last step (Shoemake,
+    1985): R(t) = Rᵢ·exp(u·log(Rᵢᵀ·Rᵢ₊₁)), u the part of the interval. SciPy's `Slerp` refuses
+    times outside the rows."""
+    i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+    part = (times - t[i]) / (t[i + 1] - t[i])
     return R[i] * Rotation.from_rotvec(part[:, None] * (R[i].inv() * R[i + 1]).as_rotvec())
 
 
-def _read_even_table(isd, lines):
+def view_directions(
+    t: Float[np.ndarray, " n"],
+    P: Float[np.ndarray, "n 3"],
+    rows: Float[np.ndarray, " m"],
+    R: Rotation,
+    time: float,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Approximate directions down and of flight in the camera frame: they only decide which axis
+    is which, so that linear interpolation and a difference over a millisecond suffice."""
+    here, after = (np.array([np.interp(time + dt, t, p) for p in P.T]) for dt in (0, 1e-3))
+    camera = slerp(rows, R, np.array([time]))[0].inv()
+    return camera.apply(-here), camera.apply(after - here)
+
+
+def _read_even_table(isd: JsonFields, lines: Float[np.ndarray, " lines"]) -> States:
     """Even tables as they are."""
     P = isd.array("sensor_position.positions", (None, 3)) * unit_of(isd, "sensor_position", "m")
     q = isd.array("sensor_orientation.quaternions", (None, 4))
@@ -127,13 +146,13 @@ def _read_even_table(isd, lines):
     return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
-def _resample(isd, lines, interpolation):
-    given = _times(isd, "instrument_position")
-    _check_rows(isd, "instrument_position", given)
+def _resample(isd: JsonFields, lines: Float[np.ndarray, " lines"], interpolation: str) -> States:
+    position_times = _times(isd, "instrument_position")
+    _check_rows(isd, "instrument_position", position_times)
     body_times, body, body_lengths = _turns(isd, "body_rotation")
     pointing_times, pointing, pointing_lengths = _turns(isd, "instrument_pointing")
     tables = {
-        "instrument_position": given,
+        "instrument_position": position_times,
         "instrument_pointing": pointing_times,
         "body_rotation": body_times,
     }
@@ -143,8 +162,11 @@ def _resample(isd, lines, interpolation):
         if len(t) > 1
         for warning in warn_of_extrapolation(t, lines, isd.source(key))
     ]
-    t = np.linspace(given[0], given[-1], max(FEWEST, len(given)))
-    P = body(t).apply(_positions(isd, given)(t))
+    # At least 25 rows, so that the eight rows of the polynomial lie close about every line of a
+    # short image, of which the file may have two states. Hermite's cubic between states h seconds
+    # apart errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
+    t = np.linspace(position_times[0], position_times[-1], max(25, len(position_times)))
+    P = body(t).apply(_positions(isd, position_times)(t))
     if interpolation == "usgscsm":
         merged = np.union1d(body_times, pointing_times)
         if len(merged) == 1:
@@ -155,42 +177,44 @@ def _resample(isd, lines, interpolation):
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
-    limits = extrapolation_limit(given), extrapolation_limit(pointing_times)
+    limits = extrapolation_limit(position_times), extrapolation_limit(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
     return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
 
 
-def _check_rows(isd, key, t):
+def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
     if len(t) < 2:
         raise InputError(f"{isd.path}: {key} has {len(t)} row; 2 at least")
     check_times(t, isd.source(key))
 
 
-def _positions(isd, given) -> Callable:
+def _positions(
+    isd: JsonFields, t: Float[np.ndarray, " n"]
+) -> Callable[[Times], Float[np.ndarray, "n 3"]]:
     """Positions in the inertial frame, metres, at times."""
     scale = unit_of(isd, "instrument_position", "km")
-    P = scale * isd.array("instrument_position.positions", (len(given), 3))
+    P = scale * isd.array("instrument_position.positions", (len(t), 3))
     if isd.get("instrument_position.velocities") is None:
-        table = position_table(given, P, method="usgscsm", order=3, gap=np.inf)
-        return lambda t: np.array(jax.vmap(lambda at: interpolate(table, at))(t))
-    V = scale * isd.array("instrument_position.velocities", (len(given), 3))
-    return CubicHermiteSpline(given, P, V)
+        table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
+        return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times))
+    V = scale * isd.array("instrument_position.velocities", (len(t), 3))
+    return CubicHermiteSpline(t, P, V)
 
 
-def _times(isd, key):
+def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:
     """Seconds since the centre time."""
     t = isd.array(f"{key}.ephemeris_times", (None,)) - isd.number("center_ephemeris_time")
     check_times(t, isd.source(key))
     return t
 
 
-def _turns(isd, key):
+def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, tuple[str, ...]]:
     """Times, the rotation from J2000 into a frame as a function of times, and warnings."""
     t = _times(isd, key)
     R, lengths = _rotations(isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]])
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
-    if not np.abs(fixed @ fixed.T - np.eye(3)).max() < ORTHOGONAL or np.linalg.det(fixed) < 0:
+    if not are_rotations(fixed):
         raise InputError(
             f"{isd.path}: {key}.constant_rotation is not a rotation; nine numbers of an orthogonal "
             "matrix are expected, row by row"
@@ -198,12 +222,14 @@ def _turns(isd, key):
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
         rate = isd.array(f"{key}.angular_velocities", (1, 3), np.zeros((1, 3)))[0]
-        turned = lambda at: constant * Rotation.from_rotvec(np.outer(at - t[0], rate)) * R[0]
+        turned = lambda times: constant * Rotation.from_rotvec(np.outer(times - t[0], rate)) * R[0]
         return t, turned, lengths
-    return t, lambda at: constant * slerp(t, R, at), lengths
+    return t, lambda times: constant * slerp(t, R, times), lengths
 
 
-def _rotations(isd, key, scalar_last):
+def _rotations(
+    isd: JsonFields, key: str, scalar_last: Float[np.ndarray, "n 4"]
+) -> tuple[Rotation, tuple[str, ...]]:
     if not len(scalar_last):
         raise InputError(f"{isd.path}: {key}.quaternions is empty; a row for each time is expected")
     values, lengths = normalise_quaternions(scalar_last, isd.source(f"{key}.quaternions"))

@@ -16,11 +16,13 @@ before the image (`ancillary.extrapolation_limit`), the angles are extrapolated 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.csm_trajectory import LAGRANGE_ORDER
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.xml_fields import XmlFields
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
@@ -35,10 +37,8 @@ from jaxbundle.pushbroom.interpolation import interpolate
 from jaxbundle.pushbroom.scanner import AngleTable, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
 
-ORDER = 7
 
-
-def read_dimap(file: XmlFields) -> Scanner:
+def read_dimap(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
 
     **Raises:** `InputError` naming file, element and its number: a missing one, an invalid number
@@ -60,7 +60,7 @@ def read_dimap(file: XmlFields) -> Scanner:
     t = file.times(key, epoch)
     orbit = file.columns(key, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
     source = points = Source(f"{path}, Ephemeris", None, "point")
-    options = {"method": "lagrange", "order": min(ORDER, len(t) - 1), "gap": np.inf}
+    options = {"method": "lagrange", "order": min(LAGRANGE_ORDER, len(t) - 1), "gap": np.inf}
     both = position_table(t, orbit, **options, source=source)
     position = position_table(t, orbit[:, :3], **options, source=source)
 
@@ -71,10 +71,11 @@ def read_dimap(file: XmlFields) -> Scanner:
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
     warnings = warn_of_extrapolation(rows, when, source)
     rows, angles = _extrapolate(rows, angles, when[0], when[-1])
+    # the frame of an attitude is that of the orbit at its time
     check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
-    turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])
+    turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])  # (11)
     attitude = attitude_table(rows, np.roll(turn.as_quat(), 1, axis=1), source=source)
 
     psi = file.columns(
@@ -83,16 +84,19 @@ def read_dimap(file: XmlFields) -> Scanner:
     )
     if len(psi) != pixels:
         raise InputError(f"{path}: {len(psi)} Look_Angles for {pixels} columns; one a column")
-    optics = AngleTable(jnp.asarray(-psi[:, 1]), jnp.asarray(psi[:, 0]))
+    optics = AngleTable(jnp.asarray(-psi[:, 1]), jnp.asarray(psi[:, 0]))  # across, along: (5a)
     image = make_image(
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
     name = file.text("Dataset_Id/DATASET_NAME", path.stem)
-    return Scanner(name, image, WGS84, warnings)
+    return ScannerInput(name, image, WGS84, warnings)
 
 
-def _extrapolate(t, angles, first, last):
-    """The rows, extrapolated linearly before and after if required."""
+def _extrapolate(
+    t: Float[np.ndarray, " n"], angles: Float[np.ndarray, "n 3"], first: float, last: float
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
+    """The rows, extrapolated linearly before `first` and after `last` if required, in steps of the
+    table."""
     if len(t) < 2:
         return t, angles
     end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], last)

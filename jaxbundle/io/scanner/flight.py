@@ -44,9 +44,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
-from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.noise import Noise, Sigma
 from jaxbundle.pushbroom.signals import KEYS
 from jaxbundle.pushbroom.simulate import Flight
 
@@ -95,25 +95,26 @@ def read_flight(path: str | Path) -> FlightFile:
         if rate <= 0:
             raise InputError(f"{instruments.where}{name} is {rate}; a positive number, in Hz")
     options |= {k: instruments.text(k) for k in METHODS if k in instruments}
+    noise = file.section("noise")
     flight = Flight(
         scanner.integer("lines"),
         pixels,
         period,
         optics_of(file, pixels),
-        _track(file, earth),
+        _read_track(file, earth),
         {
             k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
             for k, v in file.section("angles").values.items()
         },
         mounting_of(file),
-        noise=_noise(file),
+        noise=Noise(*(_sigma(noise, name, file.radians) for name in Noise._fields)),
         seed=int(file.section("simulation").number("seed", 0)),
         **options,
     )
     return FlightFile(file, flight, earth)
 
 
-def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
+def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     track = file.section("track")
     if earth is None:
         track.check_keys(LINE)
@@ -127,12 +128,8 @@ def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     return {"height": track.number("height"), **angles}
 
 
-def _noise(file: TomlFile) -> Noise:
-    section = file.section("noise")
-    return Noise(*(_sigma(section, name, file.radians) for name in Noise._fields))
-
-
-def _sigma(section: Section, name: str, radians: float):
+def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
+    # attitudes are given in the unit of angles, positions in metres
     unit = radians if name.startswith("attitude") else 1.0
     if isinstance(section.values.get(name), list):
         sigma = section.numbers(name, 3)
@@ -143,7 +140,7 @@ def _sigma(section: Section, name: str, radians: float):
     return unit * sigma
 
 
-def _signal(value: Any, unit: float, where: str):
+def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | list[Any]:
     """A signal with its angles in radians."""
     if isinstance(value, list):
         return [_signal(part, unit, where) for part in value]
@@ -154,12 +151,13 @@ def _signal(value: Any, unit: float, where: str):
     kind = value.get("kind", "constant")
     if kind not in KEYS:
         raise InputError(f"{where}unknown signal {kind!r}{did_you_mean(str(kind), KEYS)}")
-    section = Section(None, where, dict(value))
+    section = TomlSection(None, where, dict(value))
     section.check_keys(("kind", *KEYS[kind]))
     scaled: dict[str, Any] = {"kind": kind}
     for key in value:
         if key in ("times", "values"):
             scaled[key] = (unit if key == "values" else 1.0) * section.numbers(key)
         elif key != "kind":
+            # times are no angles
             scaled[key] = (1.0 if key in ("period", "step") else unit) * section.number(key)
     return scaled

@@ -13,6 +13,7 @@ else those that do. The difference is reported whenever none agree, or others th
 """
 
 import dataclasses
+import glob
 import re
 from pathlib import Path
 
@@ -20,9 +21,11 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.rpc import read_rpc
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.rpc_agreement import (
     CORRECTION_SETS,
     SUBPIXEL,
@@ -33,14 +36,17 @@ from jaxbundle.pushbroom.rpc_agreement import (
 RANDOM_ERROR = re.compile(r"(?i)<ERRRAND>\s*([-+.\de]+)|\berrRand\s*=\s*([-+.\de]+)")
 
 
-def check_against_rpc(scanner: Scanner, path: Path, choose: bool = True) -> Scanner:
+def check_against_rpc(scanner: ScannerInput, path: Path, choose: bool = True) -> ScannerInput:
     """The image of a product, compared with its RPC if there are any: with corrections that agree
     and a warning if they are not the usual ones (`choose`), and a warning if none agree."""
-    file = _rpc_file(path)
+    file = _find_rpc_file(path)
     if file is None:
         return scanner
     try:
-        rpc, random_error = read_rpc(file), _random_error(file)
+        rpc = read_rpc(file)
+        # σ of the positions per axis, metres; 0 if the file has none (DigitalGlobe writes −1)
+        match = RANDOM_ERROR.search(read_text(file, fallback="latin-1"))
+        random_error = max(float(match[1] or match[2]), 0.0) if match else 0.0
     except InputError as error:
         return _warn(scanner, f"not compared with its RPC: {error}")
     image = scanner.image
@@ -70,13 +76,14 @@ def check_against_rpc(scanner: Scanner, path: Path, choose: bool = True) -> Scan
     )
 
 
-def _rpc_file(path: Path) -> Path | None:
+def _find_rpc_file(path: Path) -> Path | None:
+    """The file of the RPC of a product; None if there is none."""
     suffix, stem = path.suffix.lower(), path.stem
     if suffix == ".imd":
         return next(
             (
                 p
-                for p in path.parent.glob(f"{_plain(stem)}.*")
+                for p in path.parent.glob(f"{glob.escape(stem)}.*")
                 if p.suffix.lower() == ".rpb" and p.stem == stem
             ),
             None,
@@ -89,24 +96,13 @@ def _rpc_file(path: Path) -> Path | None:
     return None
 
 
-def _plain(name):
-    """A name without the signs that a pattern of file names has."""
-    return re.sub(r"([\[*?])", r"[\1]", name)
-
-
-def _random_error(file):
-    """σ of the positions per axis, metres; 0 if the file has none (DigitalGlobe writes −1)."""
-    match = RANDOM_ERROR.search(read_text(file, fallback="latin-1"))
-    return max(float(match[1] or match[2]), 0.0) if match else 0.0
-
-
-def _compare(image, rpc, sets) -> list[Agreement]:
+def _compare(image: PushbroomImage, rpc: Rpc, sets: tuple[Corrections, ...]) -> list[Agreement]:
     with np.errstate(invalid="ignore"):
         return compare_with_rpc(image, rpc, sets)
 
 
 def _agree(found: Agreement, random_error: float) -> bool:
-    # two axes
+    # the random error is per axis, the RMS of the length of both
     return found.rms_pixels <= SUBPIXEL or found.rms <= np.sqrt(2) * random_error
 
 
@@ -121,5 +117,5 @@ def _names(corrections: Corrections) -> str:
     return on[0] if len(on) == 1 else f"{', '.join(on[:-1])} and {on[-1]}"
 
 
-def _warn(scanner: Scanner, message: str) -> Scanner:
+def _warn(scanner: ScannerInput, message: str) -> ScannerInput:
     return dataclasses.replace(scanner, warnings=(*scanner.warnings, message))

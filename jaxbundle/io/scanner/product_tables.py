@@ -1,12 +1,12 @@
 """Positions and attitudes of products as tables that cover the whole image."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxbundle.io.scanner.csm_trajectory import slerp
+from jaxbundle.io.scanner.csm_trajectory import LAGRANGE_ORDER, view_directions
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
@@ -15,8 +15,6 @@ from jaxbundle.pushbroom.ancillary import (
     warn_of_extrapolation,
 )
 from jaxbundle.pushbroom.trajectory import Trajectory
-
-ORDER = 7
 
 
 class Tables(NamedTuple):
@@ -29,13 +27,9 @@ class Tables(NamedTuple):
     positions: Source
     attitude: Source
 
-    def directions(self, at: float) -> tuple[np.ndarray, np.ndarray]:
+    def directions(self, time: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Approximate directions down and of flight in the camera frame."""
-        here, after = (
-            np.array([np.interp(at + dt, self.t, p) for p in self.P.T]) for dt in (0, 1e-3)
-        )
-        camera = slerp(self.rows, self.R, np.array([at]))[0].inv()
-        return camera.apply(-here), camera.apply(after - here)
+        return view_directions(self.t, self.P, self.rows, self.R, time)
 
 
 def trajectory_of(
@@ -50,12 +44,12 @@ def trajectory_of(
     """
     warnings: list[str] = []
 
-    def options(rows, source):
+    def options(rows: Float[np.ndarray, " n"], source: Source) -> dict[str, Any]:
         told = warn_of_extrapolation(rows, lines, source)
         warnings.extend(told)
         return {
             "method": "usgscsm" if told else "lagrange",
-            "order": min(ORDER, len(rows) - 1),
+            "order": min(LAGRANGE_ORDER, len(rows) - 1),
             "gap": np.inf,
             "extrapolate": extrapolation_limit(rows),
             "source": source,

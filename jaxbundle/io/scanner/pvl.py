@@ -38,18 +38,20 @@ def read_support_data(path: Path) -> ET.Element:
     return root
 
 
-def _read(path, root):
-    text, at, groups = read_text(path, fallback="latin-1"), 0, [root]
-    wrong = lambda what: InputError(f"{path}, line {text[:at].count(chr(10)) + 1}: {what}")
-    while (rest := text[at:].strip()) and not rest.upper().startswith("END;"):
-        at = len(text) - len(text[at:].lstrip())
-        match = STATEMENT.match(text, at)
+def _read(path: Path, root: ET.Element) -> None:
+    """Add the groups and values of a file to an element."""
+    text, begin, groups = read_text(path, fallback="latin-1"), 0, [root]
+    wrong = lambda what: InputError(f"{path}, line {text[:begin].count(chr(10)) + 1}: {what}")
+    while (rest := text[begin:].strip()) and not rest.upper().startswith("END;"):
+        begin = len(text) - len(text[begin:].lstrip())
+        match = STATEMENT.match(text, begin)
         if match is None:
             raise wrong("NAME = value; is expected")
         name = match[1].upper()
         if name in ("BEGIN_GROUP", "END_GROUP"):
             line = text.find("\n", match.end())
             line = len(text) if line < 0 else line
+            # IMAGE_1 → IMAGE: the XML has the name without the number
             tag = re.sub(r"_\d+$", "", text[match.end() : line].strip(" \t\r;").upper())
             if name == "BEGIN_GROUP":
                 if not re.fullmatch(r"\w+", tag):
@@ -57,18 +59,18 @@ def _read(path, root):
                 groups.append(ET.SubElement(groups[-1], tag))
             elif len(groups) == 1 or groups.pop().tag != tag:
                 raise wrong(f"the group {tag} ends without a beginning")
-            at = line
+            begin = line
             continue
         end = text.find(";", match.end())
         if end < 0 or not re.fullmatch(r"\w+", name):
             raise wrong("NAME = value; is expected")
         _put(groups[-1], name, text[match.end() : end].strip())
-        at = end + 1
+        begin = end + 1
     if len(groups) > 1:
         raise InputError(f"{path}: the group {groups[-1].tag} does not end")
 
 
-def _put(group, name, value):
+def _put(group: ET.Element, name: str, value: str) -> None:
     """A value; a list as NAMEList with NAME for each row."""
     if not value.startswith("("):
         ET.SubElement(group, name).text = value.strip('"')

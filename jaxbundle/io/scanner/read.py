@@ -9,10 +9,10 @@ from jaxbundle.io.scanner.dimap import read_dimap
 from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
 from jaxbundle.io.scanner.own_rpc import check_against_rpc
 from jaxbundle.io.scanner.pvl import read_support_data
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
 from jaxbundle.io.scanner.worldview import read_worldview
-from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 
 PRODUCTS = (".json", ".dim", ".xml", ".imd")
@@ -20,7 +20,7 @@ PRODUCTS = (".json", ".dim", ".xml", ".imd")
 WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 
-def read_scanner(path: str | Path) -> Scanner:
+def read_scanner(path: str | Path) -> ScannerInput:
     """The pushbroom image of a scanner file, `.toml`, or of a product; one that has RPC too is
     compared with them (`own_rpc`).
 
@@ -30,12 +30,13 @@ def read_scanner(path: str | Path) -> Scanner:
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
         return check_against_rpc(_read_product(path), path)
+    # a file with a source needs no other section
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
-    return _of_product(file, scanner) if "source" in scanner else scanner_of(file)
+    return _read_source(file, scanner) if "source" in scanner else scanner_of(file)
 
 
-def _of_product(file: TomlFile, scanner: Section) -> Scanner:
+def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
     """The image of the source, with the name, interpolation and corrections of the file."""
     scanner.check_keys(("source", "name", "interpolation"))
     for name in file.document:
@@ -46,16 +47,17 @@ def _of_product(file: TomlFile, scanner: Section) -> Scanner:
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
     source = file.path.parent / scanner.text("source")
-    found = _read_product(source, choice)
+    product = _read_product(source, choice)
     switches = file.section("corrections")
-    corrections = {name: switches.switch(name) for name in switches.values}
-    given = found.image.corrections._replace(**corrections)
-    image = dataclasses.replace(found.image, corrections=given)
-    found = dataclasses.replace(found, image=image, name=scanner.text("name", found.name))
-    return check_against_rpc(found, source, choose=not corrections)
+    switched = {name: switches.switch(name) for name in switches.values}
+    corrections = product.image.corrections._replace(**switched)
+    image = dataclasses.replace(product.image, corrections=corrections)
+    product = dataclasses.replace(product, image=image, name=scanner.text("name", product.name))
+    # what the user switched is compared, but not replaced
+    return check_against_rpc(product, source, choose=not switched)
 
 
-def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
+def _read_product(path: Path, interpolation: str | None = None) -> ScannerInput:
     """The image of a product; `interpolation` applies to CSM files only."""
     suffix = path.suffix.lower()
     if suffix not in PRODUCTS:
@@ -69,7 +71,8 @@ def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
     return _read_xml(path)
 
 
-def _read_xml(path):
+def _read_xml(path: Path) -> ScannerInput:
+    """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
     has = lambda key: root.find(f".//{key}") is not None
     if root.tag == "Dimap_Document":

@@ -38,6 +38,7 @@ attitude_rate = "held"
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +49,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.io.text.sections import Section, read_sections
+from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
@@ -72,8 +73,8 @@ SECTIONS = {
 }
 REQUIRED_FIELDS = ("refine", "images", "unknowns")
 WORDS = {"free": math.inf, "held": 0.0}
-TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
-LISTS = ("look_across", "look_along")
+ANGULAR_UNKNOWNS = ("attitude", "attitude_rate", "jitter", "mounting")
+LISTED_UNKNOWNS = ("look_across", "look_along")
 
 
 class RefineFile(NamedTuple):
@@ -100,7 +101,39 @@ def read_refinement(path: str | Path) -> RefineFile:
     if unit not in ANGLE_UNITS:
         raise InputError(f"{section.where}angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
     radians = ANGLE_UNITS[unit]
-    scanners = file.section("images")
+    images, warnings = _read_images(file, radians)
+    frames = None
+    if "frames" in section:
+        frames = read_network(path.parent / section.text("frames"))
+    points = _points(read_csv(path.parent / section.text("points")), images[0].earth, radians)
+    # checked first: the ids of observations are looked up in it
+    check_points_table(points)
+    ids = {id: k for k, id in enumerate(points.id)}
+    if frames is not None:
+        # points that only photographs show follow those of the table
+        more = (id for id in frames.points.id if id not in ids)
+        ids |= {id: k for k, id in enumerate(more, len(ids))}
+    observations = _observations(
+        read_csv(path.parent / section.text("observations")),
+        ids,
+        [image.id for image in images],
+        section,
+        str(path),
+    )
+    snooping = section.text("snooping", "none")
+    if snooping not in TESTS:
+        raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
+    significance = section.number("significance", 0.001)
+    if not 0 < significance < 1:
+        raise InputError(
+            f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
+        )
+    return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
+
+
+def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], list[str]]:
+    """The images with their unknowns, and warnings of their readers."""
+    path, scanners = file.path, file.section("images")
     if not scanners.values:
         raise InputError(f'{path}, [images]: no image; give id = "scanner.toml"')
     sensors, unknowns = file.section("sensors"), file.section("unknowns")
@@ -117,68 +150,42 @@ def read_refinement(path: str | Path) -> RefineFile:
         scanner = read_scanner(path.parent / scanners.text(id))
         warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
-        freedom = _freedom(Section(file, where, common | own.get(id, {})), radians)
+        freedom = _read_freedom(TomlSection(file, where, common | own.get(id, {})), radians)
+        # without an entry an image is a sensor of its own
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
-    earth = images[0].earth
-    for one in images:
-        if one.earth != earth:
+    for image in images:
+        if image.earth != images[0].earth:
             raise InputError(
-                f"{path}, [images]: {images[0].id!r} and {one.id!r} have different ellipsoids or "
+                f"{path}, [images]: {images[0].id!r} and {image.id!r} have different ellipsoids or "
                 "frames; points can be in one only"
             )
-    frames = None
-    if "frames" in section:
-        frames = read_network(path.parent / section.text("frames"))
-    points = _points(read_csv(path.parent / section.text("points")), earth, radians)
-    # checked first: the ids of observations are looked up in it
-    check_points_table(points)
-    ids = {id: k for k, id in enumerate(points.id)}
-    if frames is not None:
-        ids |= {
-            id: k for k, id in enumerate((id for id in frames.points.id if id not in ids), len(ids))
-        }
-    observations = _observations(
-        read_csv(path.parent / section.text("observations")),
-        ids,
-        [one.id for one in images],
-        section,
-        str(path),
-    )
-    snooping = section.text("snooping", "none")
-    if snooping not in TESTS:
-        raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
-    significance = section.number("significance", 0.001)
-    if not 0 < significance < 1:
-        raise InputError(
-            f"{section.where}significance is {significance}; a number between 0 and 1 is expected"
-        )
-    return RefineFile(images, points, observations, frames, snooping, significance, tuple(warnings))
+    return images, warnings
 
 
-def _freedom(section: Section, radians: float) -> Freedom:
+def _read_freedom(section: TomlSection, radians: float) -> Freedom:
     fields = {f.name for f in dataclasses.fields(Freedom)}
     section.check_keys(tuple(sorted(fields)))
-    found: dict[str, Any] = {}
+    values_read: dict[str, Any] = {}
     for key, value in section.values.items():
-        factor = radians if key in TURNING else 1.0
+        factor = radians if key in ANGULAR_UNKNOWNS else 1.0
         if key == "knot_spacing":
-            found[key] = section.number(key)
-            if found[key] <= 0:
+            values_read[key] = section.number(key)
+            if values_read[key] <= 0:
                 raise InputError(f"{section.where}{key} must be positive, in seconds")
         elif key == "focal_length":
-            found[key] = _sigma(section, key, value)
-        elif key in LISTS:
+            values_read[key] = _sigma(section, key, value)
+        elif key in LISTED_UNKNOWNS:
             values = value if isinstance(value, list) else [value]
-            found[key] = tuple(_sigma(section, key, v) for v in values)
+            values_read[key] = tuple(_sigma(section, key, v) for v in values)
         else:
             values = value if isinstance(value, list) else [value] * 3
             if len(values) != 3:
                 raise InputError(f"{section.where}{key} is {show(value)}; one value or three")
-            found[key] = tuple(factor * _sigma(section, key, v) for v in values)
-    return Freedom(**found)
+            values_read[key] = tuple(factor * _sigma(section, key, v) for v in values)
+    return Freedom(**values_read)
 
 
-def _sigma(section: Section, key: str, value: Any) -> float:
+def _sigma(section: TomlSection, key: str, value: Any) -> float:
     if isinstance(value, str) and value in WORDS:
         return WORDS[value]
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
@@ -203,7 +210,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
                 f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
                 "earth; give X, Y, Z"
             )
-        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12
+        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12  # some thousand eps, as of 100 gon
         if beyond.any():
             row = int(beyond.argmax())
             raise InputError(
@@ -218,6 +225,7 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
             1,
         )
         known = np.isfinite(X).all(1)
+        # an unknown place has no east and north: its σ are of the axes
         for k in np.flatnonzero(known):
             axes[k] = east_north_up(earth, X[k])
     return GroundPoints(
@@ -231,24 +239,26 @@ def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPo
     )
 
 
-def _observations(table, ids, images, section, where) -> Observations:
+def _observations(
+    table: Columns, ids: Mapping[str, int], images: Sequence[str], section: TomlSection, where: str
+) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
     sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
-    given = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
-    lacking = np.isnan(given)
+    stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
+    lacking = np.isnan(stated_sigma)
     if not stated and lacking.any() and not lacking.all():
         row = int(lacking.any(1).argmax())
         raise InputError(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
-            f"sigma in [{section.title}] for those without"
+            f"sigma in [refine] for those without"
         )
     return Observations(
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
         table.indices("point", "point", ids, section.text("points")),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, given),
+        np.where(lacking, sigma, stated_sigma),
         table.source,
         STATED if stated or not lacking.any() else UNIT,
     )

@@ -15,6 +15,7 @@ and none are written. Scales may be negative, as from some providers.
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +45,7 @@ UNITS = {
     "latitude": "degrees",
     "height": "meters",
 }
-ACCEPTED = {
+UNIT_WORDS = {
     "pixels": {"pixels", "pixel"},
     "degrees": {"degrees", "degree", "deg"},
     "meters": {"meters", "metres", "meter", "metre", "m"},
@@ -100,8 +101,8 @@ def write_rpc(path: str | Path, rpc: Rpc) -> None:
             write_text(path, _plain_text(rpc))
 
 
-def _from_text(path, text):
-    found = {}
+def _from_text(path: Path, text: str) -> dict[str, Any]:
+    entries = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
@@ -112,16 +113,16 @@ def _from_text(path, text):
                 "LINE_OFF: 3000.5"
             )
         name = name.strip().upper()
-        if name in found:
+        if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
-        found[name] = value.split(), number
+        entries[name] = value.split(), number
 
-    def number_of(name, unit=None):
-        if name not in found:
+    def number_of(name: str, unit: str | None = None) -> float:
+        if name not in entries:
             raise InputError(f"{path}: {name} is missing; an RPC00B text file is expected")
-        words, line = found[name]
+        words, line = entries[name]
         value = number_in(words[0] if words else "", f"{path}, line {line}: {name}")
-        if unit and len(words) > 1 and words[1].lower() not in ACCEPTED[unit]:
+        if unit and len(words) > 1 and words[1].lower() not in UNIT_WORDS[unit]:
             raise InputError(f"{path}, line {line}: {name} is in {words[1]}; {unit} are expected")
         return value
 
@@ -134,32 +135,32 @@ def _from_text(path, text):
     return values
 
 
-def _from_rpb(path, text):
-    found, name = {}, None
+def _from_rpb(path: Path, text: str) -> dict[str, Any]:
+    entries, name = {}, None
     for number, line in enumerate(text.splitlines(), 1):
         if name is None:
             match = RPB.match(line)
             if match is None:
                 continue
             key, value = match.groups()
-            if key in found:
+            if key in entries:
                 raise InputError(f"{path}, line {number}: {key} occurs twice")
-            found[key] = [value, number]
+            entries[key] = [value, number]
             name = key if "(" in value and ")" not in value else None
-        else:
-            found[name][0] += " " + line.strip().rstrip(";")
+        else:  # a list goes on to its closing bracket
+            entries[name][0] += " " + line.strip().rstrip(";")
             name = None if ")" in line else name
-    kind = found.get("SpecId", ['"RPC00B"', 0])
+    kind = entries.get("SpecId", ['"RPC00B"', 0])
     if kind[0].strip('"') != "RPC00B":
         raise InputError(
             f"{path}, line {kind[1]}: SpecId is {kind[0]}; only RPC00B is read, whose terms are "
             "in another order"
         )
 
-    def value_of(key):
-        if key not in found:
+    def value_of(key: str) -> tuple[str, str]:
+        if key not in entries:
             raise InputError(f"{path}: {key} is missing; an RPB file of RPC00B is expected")
-        return found[key][0], f"{path}, line {found[key][1]}: {key}"
+        return entries[key][0], f"{path}, line {entries[key][1]}: {key}"
 
     values = {}
     for axis, (_, key) in OFFSETS.items():
@@ -168,13 +169,14 @@ def _from_rpb(path, text):
     for field, (_, key) in FIELDS.items():
         value, where = value_of(key)
         numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
+        # a bracket that was cut off gives fewer
         if len(numbers) != TERMS:
             raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
         values[field] = [number_in(part, where) for part in numbers]
     return values
 
 
-def _from_raster(path):
+def _from_raster(path: Path) -> dict[str, Any]:
     package = rasterio()
     check_plain(path)
     try:
@@ -197,7 +199,7 @@ def _from_raster(path):
     return values
 
 
-def _to_raster(path, rpc):
+def _to_raster(path: Path, rpc: Rpc) -> None:
     package = rasterio()
     from rasterio.rpc import RPC
 
@@ -211,6 +213,7 @@ def _to_raster(path, rpc):
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
         with replace_file(path) as temporary:
+            # the tags of the copy change: after a failure the raster is as it was
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)
@@ -221,7 +224,7 @@ def _to_raster(path, rpc):
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
 
 
-def _plain_text(rpc):
+def _plain_text(rpc: Rpc) -> str:
     lines = []
     for part in ("OFF", "SCALE"):
         for axis, (name, _) in OFFSETS.items():
@@ -233,7 +236,7 @@ def _plain_text(rpc):
     return "\n".join(lines) + "\n"
 
 
-def _rpb_text(rpc):
+def _rpb_text(rpc: Rpc) -> str:
     lines = ['satId = "";', 'bandId = "";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
     lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
     for part in ("Offset", "Scale"):

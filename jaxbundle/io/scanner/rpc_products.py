@@ -38,7 +38,8 @@ from 0 (SPOT 6 & SPOT 7 User Guide, appendix C.2.1; with it Ames Stereo Pipeline
 model and the RPC of a SPOT product equal to 0.002 pixel, GDAL subtracts 1), Pléiades Neo from 0
 (support of the vendor, GDAL issue 5716)."""
 DIMAP_OTHER = {"Inverse_Model": 1.0, "GroundtoImage_Values": 0.0}
-"""The same for other profiles, by the name that DIMAP 2 and DIMAP 3 give the coefficients."""
+"""Row and column of the centre of the first pixel for other profiles, by the name that DIMAP 2 and
+DIMAP 3 give the coefficients."""
 DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 
 
@@ -111,7 +112,7 @@ def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float
     return number_in(value, f"{path}, line {line}: {name}")
 
 
-def _from_dimap(file):
+def _from_dimap(file: XmlFields) -> dict[str, Any]:
     inverse = next((n for n in DIMAP_OTHER if file.find(n) is not None), None)
     if inverse is None:
         raise file.missing("Inverse_Model")
@@ -121,6 +122,7 @@ def _from_dimap(file):
             values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     for axis in ("line", "sample"):
+        # the first pixel is (1, 1) or (0, 0) by the profile of the product
         values[f"{axis}_offset"] -= DIMAP_ORIGIN.get(profile, DIMAP_OTHER[inverse])
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k}".upper() for k in range(1, TERMS + 1)]
@@ -128,7 +130,7 @@ def _from_dimap(file):
     return values
 
 
-def _from_digitalglobe(file):
+def _from_digitalglobe(file: XmlFields) -> dict[str, Any]:
     kind = file.text("RPB/SPECID", "RPC00B")
     if kind != "RPC00B":
         raise InputError(

@@ -7,7 +7,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 
 
 @dataclasses.dataclass(frozen=True)
-class Scanner:
+class ScannerInput:
     """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader."""
 
     name: str

@@ -62,8 +62,8 @@ import numpy as np
 from jaxbundle.cameras import check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
-from jaxbundle.io.scanner.scanner import Scanner
-from jaxbundle.io.text.sections import Section, TomlFile
+from jaxbundle.io.scanner.scanner import ScannerInput
+from jaxbundle.io.text.sections import TomlFile, TomlSection
 from jaxbundle.network.columns import did_you_mean, show
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import earth_frames as frames
@@ -82,7 +82,6 @@ from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
 
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
-MOST_ROWS = 1_000_000
 INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
 KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
@@ -107,7 +106,7 @@ SECTIONS = {
 REQUIRED_FIELDS = ("scanner", "times", "position", "attitude", "optics")
 
 
-def scanner_of(file: TomlFile) -> Scanner:
+def scanner_of(file: TomlFile) -> ScannerInput:
     """The pushbroom image that the sections of a scanner file describe.
 
     **Raises:** `InputError` naming file, section and key, or table and line.
@@ -134,7 +133,7 @@ def scanner_of(file: TomlFile) -> Scanner:
         corrections,
         (positions, attitudes),
     )
-    return Scanner(scanner.text("name", file.path.stem), image, earth, lengths)
+    return ScannerInput(scanner.text("name", file.path.stem), image, earth, lengths)
 
 
 def _orientation(file: TomlFile) -> frames.EarthOrientation:
@@ -153,7 +152,7 @@ def _epoch(file: TomlFile) -> str:
     return str(epoch)
 
 
-def _options(section: Section, method: str) -> dict[str, Any]:
+def _options(section: TomlSection, method: str) -> dict[str, Any]:
     """Interpolation, order, gap, extrapolation."""
     options: dict[str, Any] = {"method": section.text("interpolation", method)}
     if "order" in section:
@@ -177,7 +176,7 @@ def mounting_of(file: TomlFile) -> tuple[float, float, float]:
     return pitch, roll, yaw
 
 
-def earth_of(scanner: Section) -> Ellipsoid | None:
+def earth_of(scanner: TomlSection) -> Ellipsoid | None:
     """The ellipsoid of [scanner] earth; None for a local frame."""
     value = scanner.values.get("earth", "WGS84")
     if isinstance(value, list):
@@ -212,10 +211,11 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
 
-def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> str:
+def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) -> str:
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
+    # attitudes against the orbit are given without an Earth, too
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
             f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
@@ -247,15 +247,16 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
 
 
 def _orbit(
-    file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
+    file: TomlFile, section: TomlSection, kind: str, earth: Ellipsoid | None
 ) -> tuple[Table, Source]:
     """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
-    if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
+    most = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
+    if not (step > 0 and 0 < (end - start) / step <= most):
         raise InputError(
             f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
-            f"{MOST_ROWS} steps forward are expected"
+            f"{most} steps forward are expected"
         )
     t = np.arange(start, end, step)
     if kind == "tle":
@@ -266,18 +267,18 @@ def _orbit(
         P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
     elif kind == "state":
         frame = _frame(section, earth, frames.FRAMES)
-        at = section.number("at", 0.0)
+        time = section.number("at", 0.0)
         state = section.numbers("state", 6)[None]
         P, V = state[:, :3], state[:, 3:]
         if frame != "ITRF":
-            R = frames.to_earth(frame, _epoch(file), np.array([at]), _orientation(file))
+            R = frames.to_earth(frame, _epoch(file), np.array([time]), _orientation(file))
             P, V = frames.turn_positions(R, P, V, _orientation(file))
         try:
-            P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)
+            P, V = state_orbit(t, P[0], V[0], time, section.switch("j2") or "j2" not in section)
         except InputError as error:
             raise InputError(f"{section.where}{error}") from None
     else:
-        circle = Section(file, f"{section.where}circle: ", section.values["circle"])
+        circle = TomlSection(file, f"{section.where}circle: ", section.values["circle"])
         angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
         angles = [file.radians * angle for angle in angles]
         P, V = frames.circular_orbit(t, circle.number("height"), *angles)
@@ -342,14 +343,15 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
     try:
         model = get_model(section.text("model", "brown"))
         section.check_keys(("model", "pitch", "middle", "row", *model.parameters))
-        given = {name: section.number(name) for name in model.parameters if name in section}
-        check_parameters(model, given)
+        parameters = {name: section.number(name) for name in model.parameters if name in section}
+        check_parameters(model, parameters)
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{section.where}{error}") from None
-    values = default_parameters(model) | given
+    values = default_parameters(model) | parameters
     pitch = section.number("pitch")
+    # a negative one counts the pixels the other way
     if pitch == 0:
         raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
     return FocalLine(

@@ -16,7 +16,7 @@ class SightFrame(NamedTuple):
     (ξ, η)."""
 
     turn: Rotation
-    slopes: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    slopes: Callable[[Float[np.ndarray, " n"], Float[np.ndarray, " n"]], Float[np.ndarray, "2 n"]]
 
 
 def sight_frame(
@@ -37,7 +37,7 @@ def sight_frame(
     along = signs * (sights[:, -1] - sights[:, 0])
     angle = np.arctan2(along[1], along[0])
     about = lambda angle: turn * Rotation.from_rotvec([0, 0, angle])
-    if about(angle).inv().apply(forward)[1] < 0:
+    if about(angle).inv().apply(forward)[1] < 0:  # y would point backwards
         angle += np.pi
     c, s = np.cos(angle), np.sin(angle)
     slopes = lambda x, y: np.array([[c, s], [-s, c]]) @ (signs[:, None] * [x, y])

@@ -18,15 +18,18 @@ unless the RPC of the file say otherwise (`own_rpc`). Optical distortion, decrea
 products resampled to a map are refused.
 """
 
+import xml.etree.ElementTree as ET
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm_trajectory import slerp
 from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
-from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
 from jaxbundle.network.columns import show
@@ -37,14 +40,12 @@ from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import LineTimes
 
 LEVELS = ("basic1b", "stereo1b")
-EPHEMERIS, ATTITUDE = 7, 5
-"""Numbers of a row that are used: index, position, velocity; index, quaternion."""
 CORRECTIONS = Corrections(light_time=True, aberration=True, refraction=True)
 """Of products whose RPC say nothing else: a file of WorldView-1 agrees with its RPC to 0.05 m with
 all three, to 0.7 m without refraction."""
 
 
-def read_worldview(file: XmlFields) -> Scanner:
+def read_worldview(file: XmlFields) -> ScannerInput:
     """The pushbroom image of a DigitalGlobe XML file.
 
     **Raises:** `InputError` naming file and element: missing, not a number, a product of
@@ -62,11 +63,13 @@ def read_worldview(file: XmlFields) -> Scanner:
     lines, pixels = int(lines), int(pixels)
     epoch = file.time("IMD/IMAGE/TLCTIME")
     times = _line_times(file, lines)
-    t, P, _ = _table(file, "EPH", "EPHEMLIST", EPHEMERIS, epoch)
-    rows, values, source = _table(file, "ATT", "ATTLIST", ATTITUDE, epoch)
+    # of a row are used: index, position, velocity; index, quaternion. Covariances follow.
+    t, P, _ = _table(file, "EPH", "EPHEMLIST", 7, epoch)
+    rows, values, source = _table(file, "ATT", "ATTLIST", 5, epoch)
     values, lengths = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
+    # ephemerides are those of the satellite, lines of sight begin in its camera
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
     lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
     (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
@@ -89,12 +92,13 @@ def read_worldview(file: XmlFields) -> Scanner:
         sources=(tables.positions, tables.attitude),
     )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return Scanner(name, image, WGS84, (*lengths, *odd, *warnings, *told))
+    return ScannerInput(name, image, WGS84, (*lengths, *odd, *warnings, *told))
 
 
-def _line_times(file, lines):
+def _line_times(file: XmlFields, lines: int) -> LineTimes:
     pairs = file.elements("IMD/IMAGE/TLCLISTList/TLCLIST")
     pairs = np.array([_numbers(file, e, "TLCLIST", 2) for e in pairs])
+    # one pair gives only where the lines begin
     if len(pairs) == 1:
         rate = file.number("IMD/IMAGE/AVGLINERATE")
         if file.text("IMD/IMAGE/SCANDIRECTION", "Forward").lower() != "forward":
@@ -110,6 +114,7 @@ def _line_times(file, lines):
             f"{file.path}: the times of TLCLIST, AVGLINERATE, SCANDIRECTION go backwards; the "
             "first line must be the first in time"
         )
+    # 1e-9 of the period, as the file rounds its times: one rate, which needs no table
     if np.ptp(slope) <= 1e-9 * slope[0]:
         start = np.ravel(t)[0] - slope[0] * np.ravel(first)[0]
         return LineTimes(jnp.asarray(start), jnp.asarray(slope[0]))
@@ -118,7 +123,9 @@ def _line_times(file, lines):
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t[k] + slope[k] * (l - first[k])))
 
 
-def _table(file, group, name, used, epoch):
+def _table(
+    file: XmlFields, group: str, name: str, used: int, epoch: np.datetime64
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows n"], Source]:
     """Seconds since the epoch, the values of the rows, and the source of the table."""
     rows = file.elements(f"{group}/{name}List/{name}")
     values = np.array([_numbers(file, e, f"{name} {k}", used) for k, e in enumerate(rows, 1)])
@@ -131,7 +138,7 @@ def _table(file, group, name, used, epoch):
     return t, values[:, 1:], source
 
 
-def _numbers(file, element, name, used):
+def _numbers(file: XmlFields, element: ET.Element, name: str, used: int) -> list[float]:
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
     if len(words) < used:
@@ -139,7 +146,9 @@ def _numbers(file, element, name, used):
     return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
 
 
-def _detectors(file):
+def _detectors(
+    file: XmlFields,
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], tuple[str, ...]]:
     """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
     for name in ("ALIST", "BLIST"):
         found = file.find(f"GEO/OPTICAL_DISTORTION/{name}List")

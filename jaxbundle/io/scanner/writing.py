@@ -1,9 +1,11 @@
 """Writing of a scanner image: `NAME.toml` and its tables, for `read_scanner`."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
@@ -13,7 +15,9 @@ from jaxbundle.io.text.sections import toml_text
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.interpolation import Table
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
+from jaxbundle.types import AnyArray
 
 TABLES = ("positions", "attitude", "times", "angles")
 
@@ -82,8 +86,8 @@ def write_scanner_image(
     return path
 
 
-def _options(table, method=None):
-    options = {"interpolation": method or table.method}
+def _options(table: Table, method: str | None = None) -> dict[str, Any]:
+    options: dict[str, Any] = {"interpolation": method or table.method}
     if options["interpolation"] in ("lagrange", "usgscsm"):
         options["order"] = table.order
     if np.isfinite(table.gap):
@@ -93,7 +97,9 @@ def _options(table, method=None):
     return options
 
 
-def _optics(optics: Optics, folder: Path, file, radians: float) -> dict[str, Any]:
+def _optics(
+    optics: Optics, folder: Path, file: Callable[[str], str], radians: float
+) -> dict[str, Any]:
     if isinstance(optics, FocalLine):
         parameters = dict(zip(get_model(optics.model).parameters, optics.parameters.tolist()))
         more = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
@@ -115,5 +121,5 @@ def _optics(optics: Optics, folder: Path, file, radians: float) -> dict[str, Any
     return {"table": file("angles")}
 
 
-def _write(path, header, *columns):
+def _write(path: Path, header: Sequence[str], *columns: Float[AnyArray, "rows ..."]) -> None:
     write_csv(path, header, np.column_stack([np.asarray(c) for c in columns]).tolist())

@@ -16,9 +16,7 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import DESCRIPTORS, parse_toml, read_content
 from jaxbundle.system.terminals import in_utf8
-
-PORTION = 10_000
-"""Rows converted to text at a time."""
+from jaxbundle.types import T
 
 
 def read_text(path: Path, fallback: str = "") -> str:
@@ -96,18 +94,20 @@ def _csv_text(rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def table_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple]:
-    """The rows of a table of columns as plain values, some at a time."""
+def table_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, ...]]:
+    """The rows of a table of columns as plain values, some at a time: `tolist` is faster than cell
+    by cell, but of two million rows takes gigabytes."""
     columns = list(table.values())
-    for first in range(0, max(map(len, columns), default=0), PORTION):
-        yield from zip(*(column[first : first + PORTION].tolist() for column in columns))
+    for rows in take_portions(range(max(map(len, columns), default=0))):
+        yield from zip(*(column[rows[0] : rows[-1] + 1].tolist() for column in columns))
 
 
-def take_portions(rows: Iterable[Any]) -> Iterator[list]:
-    """Some rows at a time."""
+def take_portions(rows: Iterable[T], portion: int = 10_000) -> Iterator[list[T]]:
+    """Rows some at a time, for conversion to text: `portion` of them are some megabytes; not
+    critical."""
     rows = iter(rows)
-    while portion := list(itertools.islice(rows, PORTION)):
-        yield portion
+    while taken := list(itertools.islice(rows, portion)):
+        yield taken
 
 
 def write_text(path: Path, text: str | Iterable[str]) -> None:

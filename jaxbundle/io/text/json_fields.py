@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
@@ -35,7 +36,9 @@ class JsonFields:
         """A finite number."""
         return float(self.array(key, (), default))
 
-    def array(self, key: str, shape: tuple[int | None, ...], default: Any = None) -> np.ndarray:
+    def array(
+        self, key: str, shape: tuple[int | None, ...], default: Any = None
+    ) -> Float[np.ndarray, "..."]:
         """Numbers of a shape; None means any length."""
         value = self.get(key, default)
         if value is None:
@@ -54,6 +57,7 @@ class JsonFields:
     def integer(self, key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number that is not less than `least`."""
         value = self.number(key, default)
+        # beyond 2⁵³ floats are all whole: a number there has lost digits
         if not (value.is_integer() and least <= value < 2**53):
             raise InputError(
                 f"{self.path}: {key} is {value:g}; a whole number from {least} is expected"
@@ -68,7 +72,7 @@ class JsonFields:
             raise InputError(f"{self.path}: {key} is {said}")
         return str(value)
 
-    def of(self, key: str) -> "JsonFields":
+    def child(self, key: str) -> "JsonFields":
         """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
@@ -78,7 +82,7 @@ class JsonFields:
 
     def objects(self, key: str) -> dict[str, "JsonFields"]:
         """The objects in a field with an object of objects; none if it is missing."""
-        fields = self.of(key) if self.get(key) is not None else JsonFields(self.path, {})
+        fields = self.child(key) if self.get(key) is not None else JsonFields(self.path, {})
         return {
             id: _object(f"{self.path}, {key} {show(id)}", value)
             for id, value in fields.document.items()
@@ -104,7 +108,7 @@ def _object(where: str, value: Any) -> JsonFields:
 
 def stack_rows(
     values: Sequence[Any], size: int, place: Callable[[int], tuple[str, str]]
-) -> np.ndarray:
+) -> Float[np.ndarray, "n size"]:
     """Many lists of numbers as one array [len(values), size]; of the k-th, `place(k)` names file
     and field.
 
@@ -116,6 +120,7 @@ def stack_rows(
         array = np.full((1, 1), np.nan)
     if np.isfinite(array).all():
         return array
+    # Only for a file with a fault: list by list, up to the faulty one.
     rows = ((*place(k), value) for k, value in enumerate(values))
     return np.array([JsonFields(path, {key: v}).array(key, (size,)) for path, key, v in rows])
 

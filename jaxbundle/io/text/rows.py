@@ -1,7 +1,7 @@
 """The lines of a text file as rows of words; errors name the file and the line."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,12 @@ from jaxbundle.network.columns import show
 BLANKS = "; blanks separate columns, so that no name may have one"
 
 
-class Row:
+def join_numbers(values: Iterable[float], separator: str = " ") -> str:
+    """Numbers as text that reads back to the last bit (`repr` is the shortest such text)."""
+    return separator.join(repr(float(value)) for value in values)
+
+
+class TextRow:
     """A line of a file: its place, text, and words."""
 
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
@@ -52,6 +57,7 @@ class Row:
             numbers = np.array(self.words, float) if self.words else np.zeros(0)
         except ValueError:
             numbers = np.array([np.nan])
+        # Python and NumPy read "1_0" as ten; in a file it is a name, or a mistake.
         if not np.isfinite(numbers).all() or "_" in self.text:
             return np.array([self._number(word, what) for word in self.words])
         return numbers
@@ -59,8 +65,9 @@ class Row:
     def integer(self, k: int, what: str, least: int = 0) -> int:
         """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
-        sign = word.removeprefix("-")
-        if not (sign.isascii() and sign.isdigit() and len(sign) < 19) or int(word) < least:
+        digits = word.removeprefix("-")
+        # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
+        if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
             raise self.error(f"{what} is {show(word)}; a whole number from {least} is expected")
         return int(word)
 
@@ -74,7 +81,7 @@ class Row:
         return number
 
 
-class Rows:
+class TextRows:
     """The lines of a file in sequence.
 
     **Arguments:** `comment` begins lines to skip; `blank` whether empty lines count;
@@ -98,7 +105,7 @@ class Rows:
         self.separator = separator
         self.position = 0
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[TextRow]:
         while self.more():
             yield self.take("a line")
 
@@ -106,7 +113,7 @@ class Rows:
         """Whether there is another line."""
         return self.position < len(self.lines)
 
-    def take(self, what: str) -> Row:
+    def take(self, what: str) -> TextRow:
         """The next line; `what` names the expected content in messages.
 
         **Raises:** `InputError` if the file has ended.
@@ -116,7 +123,7 @@ class Rows:
             raise InputError(f"{self.path}: the file ends after line {last}; {what} is expected")
         number, text = self.lines[self.position]
         self.position += 1
-        return Row(self.path, number, text, self.separator)
+        return TextRow(self.path, number, text, self.separator)
 
     def next_words(self) -> list[str]:
         """The words of the next line without taking it; none at the end of the file."""

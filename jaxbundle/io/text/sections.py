@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,18 @@ from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.units import ANGLE_UNITS
 
 
+def refuse_unknown(name: str, known: Iterable[str], where: str, noun: str = "key") -> None:
+    """Refuse a name other than the `known` ones, as a probable typing error: a setting that is
+    silently ignored would give another result than the user expects.
+
+    **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
+    """
+    known = tuple(known)
+    if name not in known:
+        shown = f"[{name}]" if noun == "section" else repr(name)
+        raise InputError(f"{where}unknown {noun} {shown}{did_you_mean(name, known)}")
+
+
 @dataclasses.dataclass(frozen=True)
 class TomlFile:
     """A TOML file as sections of keys."""
@@ -22,9 +34,9 @@ class TomlFile:
     path: Path
     document: dict[str, Any]
 
-    def section(self, name: str) -> "Section":
+    def section(self, name: str) -> "TomlSection":
         """A section, empty if it is missing."""
-        return Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
+        return TomlSection(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
 
     def require(self, names: Sequence[str]) -> None:
         """Refuse a file that lacks one of these sections."""
@@ -50,19 +62,18 @@ def read_sections(
     """
     document = read_toml(path)
     for key, value in document.items():
-        if key not in sections:
-            raise InputError(f"{path}: unknown section [{key}]{did_you_mean(key, sections)}")
+        refuse_unknown(key, sections, f"{path}: ", "section")
         if not isinstance(value, dict):
             raise InputError(f"{path}: {key} must be a section, [{key}]")
         if sections[key]:
-            Section(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
+            TomlSection(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
     file = TomlFile(path, document)
     file.require(needed)
     return file
 
 
 @dataclasses.dataclass(frozen=True)
-class Section:
+class TomlSection:
     """One section; every getter refuses missing entries and other types."""
 
     file: TomlFile | None
@@ -72,10 +83,11 @@ class Section:
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
-    def _get(self, key, default, expected, kinds) -> Any:
+    def _get(self, key: str, default: Any, expected: str, kinds: tuple[type, ...]) -> Any:
         value = self.values.get(key, default)
         if value is None:
             raise InputError(f"{self.where}{key} is missing; {expected} is expected")
+        # True and False are whole numbers in Python, but not where a file needs a number
         if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
             raise InputError(f"{self.where}{key} is {show(value)}; {expected} is expected")
         return value
@@ -83,8 +95,7 @@ class Section:
     def check_keys(self, known: Sequence[str]) -> None:
         """Refuse other keys."""
         for key in self.values:
-            if key not in known:
-                raise InputError(f"{self.where}unknown key {key!r}{did_you_mean(key, known)}")
+            refuse_unknown(key, known, self.where)
 
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""

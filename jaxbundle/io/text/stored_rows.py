@@ -11,23 +11,22 @@ import struct
 import tempfile
 import weakref
 import zipfile
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxbundle.errors import InputError
 
-SMALLEST_STORED = 2**20
-"""Smaller arrays are read at once, bytes."""
 LOCAL_HEADER = struct.Struct("<4s22xHH")
 """Signature, length of the name, of the field after it."""
 READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-AT_ONCE = 2**20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,11 +47,13 @@ class StoredRows:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, rows) -> np.ndarray:
+    def __getitem__(self, rows: int | Sequence[int] | Int[np.ndarray, "..."]) -> np.ndarray:
         """A row, or the rows of a list of numbers."""
         wanted = np.atleast_1d(np.asarray(rows, int))
+        # one array: a list of rows would be copied once more
         found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
+        # consecutive rows are read together
         ends = [0, *(np.flatnonzero(np.diff(wanted) != 1) + 1), len(wanted)]
         there = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
         with there as stream:
@@ -65,9 +66,11 @@ class StoredRows:
         return found[0] if np.ndim(rows) == 0 else found
 
 
-def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
+def find_stored_rows(path: str | Path, name: str, smallest: int = 2**20) -> StoredRows | None:
     """The rows of an array of an `.npz`, if they can be read singly and the array is large enough;
     its checksum is tested once.
+
+    **Arguments:** `smallest`: bytes of an array that is worth it; a smaller one fits in memory.
 
     **Raises:** as `zipfile` and NumPy for a damaged archive."""
     with zipfile.ZipFile(path) as archive:
@@ -75,7 +78,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             member = archive.getinfo(f"{name}.npy")
         except KeyError:
             return None
-        if member.file_size < SMALLEST_STORED:
+        if member.file_size < smallest:
             return None
         with archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)
@@ -84,6 +87,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             shape, by_columns, dtype = READERS[version](stream)
             head = stream.tell()
             whole = head + int(np.prod(shape)) * dtype.itemsize
+            # rows that do not lie in one piece, objects, or trailing bytes
             if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
                 return None
             if member.compress_type != zipfile.ZIP_STORED:
@@ -91,7 +95,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
                 rows = StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
                 weakref.finalize(rows, unpacked.close)
                 return rows
-            while stream.read(AT_ONCE):
+            while stream.read(2**20):  # to its end, where zipfile compares the checksum
                 pass
     with open(path, "rb") as stream:
         stream.seek(member.header_offset)
@@ -102,11 +106,12 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
     return StoredRows(Path(path), offset, tuple(shape), dtype)
 
 
-def _unpack(stream) -> BinaryIO:
+def _unpack(stream: IO[bytes]) -> BinaryIO:
     """The rest of a stream in a temporary file."""
     unpacked = tempfile.TemporaryFile()
     try:
-        shutil.copyfileobj(stream, unpacked, AT_ONCE)
+        shutil.copyfileobj(stream, unpacked, 2**20)  # a megabyte at a time
+        # fromfile reads by the descriptor, past the buffer of Python
         unpacked.flush()
     except BaseException:
         unpacked.close()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text
@@ -43,7 +44,7 @@ class XmlFields:
         text = self.text(key, None if default is None else repr(default))
         return number_in(text, f"{self.path}: {key}")
 
-    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
+    def numbers(self, key: str, count: int | None = None) -> Float[np.ndarray, " n"]:
         """The numbers in the text of an element, separated by blanks or commas."""
         words = self.text(key).replace(",", " ").split()
         if count is not None and len(words) != count:
@@ -63,7 +64,7 @@ class XmlFields:
             raise self.missing(key)
         return elements
 
-    def columns(self, key: str, names: Sequence[str]) -> np.ndarray:
+    def columns(self, key: str, names: Sequence[str]) -> Float[np.ndarray, "elements names"]:
         """Numbers [elements, names] of repeated elements."""
         last = key.rpartition("/")[2]
         return np.array(
@@ -76,7 +77,9 @@ class XmlFields:
             ]
         )
 
-    def times(self, key: str, epoch: np.datetime64, name: str = "TIME") -> np.ndarray:
+    def times(
+        self, key: str, epoch: np.datetime64, name: str = "TIME"
+    ) -> Float[np.ndarray, " elements"]:
         """Seconds since the epoch of repeated elements."""
         last = key.rpartition("/")[2]
         times = [
@@ -96,6 +99,7 @@ def read_xml(path: str | Path) -> ET.Element:
     **Raises:** `InputError` if it cannot be read, is not XML, or defines entities.
     """
     text = read_text(Path(path), fallback="latin-1")
+    # nested entities unpack to gigabytes ("billion laughs")
     if "<!ENTITY" in text:
         raise InputError(f"{path}: entities are not expected in this file")
     try:
@@ -136,4 +140,5 @@ def time_in(text: str, where: str) -> np.datetime64:
 
 def seconds(time: np.datetime64, epoch: np.datetime64) -> float:
     """The seconds from an epoch to a time."""
+    # through whole nanoseconds: a float of seconds since 1970 has some tenths of a microsecond
     return float((time - epoch) / np.timedelta64(1, "ns") * 1e-9)

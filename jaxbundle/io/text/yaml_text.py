@@ -15,14 +15,16 @@ from typing import Any
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import show
 
-DEEPEST_NESTING = 32
+MAX_NESTING = 32
+"""Levels of blocks and of brackets: calibration files have four; Python's own limit, a thousand
+calls, would be reached at some 300 levels and end in a RecursionError."""
 KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s*:(?:\s+(.*))?""")
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
 TAG = re.compile(r"!\S*\s*")
-OPEN, CLOSE = re.compile(r"[\[{]"), re.compile(r"[\]}]")
+OPEN_BRACKET, CLOSE_BRACKET = re.compile(r"[\[{]"), re.compile(r"[\]}]")
 WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
-NOT_READ = {
+UNREAD_KINDS = {
     "{": "a dictionary in braces",
     "&": "an anchor",
     "*": "an alias",
@@ -31,7 +33,7 @@ NOT_READ = {
 }
 
 
-class Line:
+class YamlLine:
     """A line with content: its number, its indentation, and the rest."""
 
     def __init__(self, path: str | Path, number: int, text: str, lenient: bool = False):
@@ -60,9 +62,9 @@ def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[st
     return value
 
 
-def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
+def _lines(path: str | Path, text: str, lenient: bool) -> list[YamlLine]:
     """The lines without comments; content in brackets or braces becomes one line."""
-    lines: list[Line] = []
+    lines: list[YamlLine] = []
     open_brackets, ended = 0, 0
     for number, raw in enumerate(text.splitlines(), 1):
         found = COMMENT.match(raw)
@@ -76,33 +78,38 @@ def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
         if "\t" in bare[: len(bare) - len(bare.lstrip())] and not open_brackets:
             raise InputError(f"{path}, line {number}: indentation by tabs; YAML has blanks")
         if open_brackets:
+            # a list over several lines is read as one line
             lines[-1].text += " " + bare.strip()
         else:
-            lines.append(Line(path, number, bare, lenient))
+            lines.append(YamlLine(path, number, bare, lenient))
+        # brackets in texts open nothing
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
-        open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
+        open_brackets = max(
+            0, open_brackets + len(OPEN_BRACKET.findall(plain)) - len(CLOSE_BRACKET.findall(plain))
+        )
     if open_brackets:
         raise lines[-1].error(f"the list {show(lines[-1].text)} has no end")
     return lines
 
 
-def _block(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _block(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
     """The value of the lines of one indentation, and the lines after it."""
-    if depth > DEEPEST_NESTING:
-        raise lines[0].error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
+    if depth > MAX_NESTING:
+        raise lines[0].error(f"nested too deeply: more than {MAX_NESTING} levels")
     read = _items if _is_item(lines[0]) else _keys
     return read(lines, indent, depth)
 
 
-def _is_item(line: Line) -> bool:
+def _is_item(line: YamlLine) -> bool:
     return line.text == "-" or line.text.startswith("- ")
 
 
-def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]]:
+def _items(lines: list[YamlLine], indent: int, depth: int) -> tuple[list[Any], list[YamlLine]]:
     values = []
     while lines and lines[0].indent == indent and _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
-        inner = Line(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
+        # "- key: value" is a block whose indentation is that of the key
+        inner = YamlLine(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
         if inner.text and not _is_item(inner) and not KEY.fullmatch(inner.text):
             values.append(_value(inner, inner.text))
         elif inner.text:
@@ -114,7 +121,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]
     return values, lines
 
 
-def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]:
+def _keys(lines: list[YamlLine], indent: int, depth: int) -> tuple[dict[str, Any], list[YamlLine]]:
     values: dict[str, Any] = {}
     while lines and lines[0].indent == indent and not _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
@@ -131,7 +138,7 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]
     return values, lines
 
 
-def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
+def _parse_nested(lines: list[YamlLine], indent: int, depth: int) -> tuple[Any, list[YamlLine]]:
     """The value below a key or the dash of a list; a list may have the indentation of its key."""
     if not lines or lines[0].indent < indent:
         return None, lines
@@ -140,16 +147,16 @@ def _parse_nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list
     return _block(lines, lines[0].indent, depth + 1)
 
 
-def _value(line: Line, text: str) -> Any:
+def _value(line: YamlLine, text: str) -> Any:
     """A scalar, or a list in brackets."""
     text = text.strip()
-    if text[:1] in NOT_READ and line.lenient:
+    if text[:1] in UNREAD_KINDS and line.lenient:
         return None
-    if text[:1] in NOT_READ:
-        raise line.error(f"{show(text)}: {NOT_READ[text[0]]} is not read here")
+    if text[:1] in UNREAD_KINDS:
+        raise line.error(f"{show(text)}: {UNREAD_KINDS[text[0]]} is not read here")
     if not text.startswith("["):
         return _scalar(text)
-    stack: list[list] = [[]]
+    stack: list[list[Any]] = [[]]  # the lists that are open, the outermost a holder of one list
     for part in re.findall(r"\[|\]|\"[^\"]*\"|'[^']*'|[^][,\"']+", text):
         if part == "[":
             stack.append([])
@@ -158,7 +165,7 @@ def _value(line: Line, text: str) -> Any:
             stack.pop()
         elif part.strip():
             stack[-1].append(_scalar(part.strip()))
-        if not stack or len(stack) > DEEPEST_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
+        if not stack or len(stack) > MAX_NESTING or (len(stack) == 1 and len(stack[0]) > 1):
             raise line.error(f"{show(text)}: brackets that do not match")
     return stack[0][0]
 

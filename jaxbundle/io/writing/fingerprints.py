@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from jaxbundle.io.networks.project import project_file
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.system.file_content import is_plain
 
-OF_A_MODEL = {".bin", ".csv", ".dat", ".toml", ".txt"}
+NETWORK_SUFFIXES = {".bin", ".csv", ".dat", ".toml", ".txt"}
 """Files of a folder that hold a network (COLMAP, BINGO); photographs do not count."""
 
 _hash = partial(hashlib.blake2b, digest_size=8)
@@ -74,7 +75,9 @@ def files_read(path: str | Path) -> list[Path]:
 def _files(path: Path) -> Iterator[Path]:
     """A file and those it names, or the files of a folder."""
     if path.is_dir():
-        yield from sorted(file for file in path.iterdir() if file.suffix.lower() in OF_A_MODEL)
+        yield from sorted(
+            file for file in path.iterdir() if file.suffix.lower() in NETWORK_SUFFIXES
+        )
         return
     yield path
     if path.suffix.lower() == ".toml":
@@ -87,7 +90,7 @@ def _files(path: Path) -> Iterator[Path]:
                 yield path.parent / text
 
 
-def _texts(value) -> Iterator[str]:
+def _texts(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):

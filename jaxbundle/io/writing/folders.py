@@ -35,8 +35,6 @@ from jaxbundle.system.temporaries import defer_interrupts, temporary
 
 MARKER, INSIDE = ".jaxbundle", ".jaxbundle.work"
 NEW, READY, OLD = "new", "ready", "old"
-MOST_NAMED = 40
-"""Maximum number of files named by a refusal."""
 
 
 class Marker(NamedTuple):
@@ -101,7 +99,8 @@ def replace_folder(
             with defer_interrupts():
                 work = until.enter_context(temporary(_make_work(real), content=False))
             new = work / NEW
-            until.enter_context(_held(folder, work))
+            # from here on a second command on this folder is refused
+            until.enter_context(_hold_work(folder, work))
             until.enter_context(temporary(new)).mkdir()
             yield new
             _replace(folder, real, work, by, tuple(names), force)
@@ -119,7 +118,7 @@ def recover(folder: str | Path) -> None:
     for work in _works(real):
         if work.is_dir() and not work.is_symlink():
             try:
-                with _held(folder, work):
+                with _hold_work(folder, work):
                     _settle(work, real)
             except OSError as error:
                 raise unwritable(folder, error) from None
@@ -150,6 +149,7 @@ def _is_inside(folder: Path, name: str) -> bool:
 def _check_place(folder: Path, said: str) -> None:
     """Refuse paths that are not folders, or cannot be created or written."""
     there = next((p for p in (folder, *folder.absolute().parents) if os.path.lexists(p)), folder)
+    # a link to nothing is not followed: the folder is made where it points
     dangling = there == folder and os.path.islink(there) and not os.path.exists(there)
     if not os.path.isdir(there) and not dangling:
         raise InputError(f"{said}: cannot be made: {there} is not a folder")
@@ -164,7 +164,10 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         return
     own = marker.files if marker else {}
     taken = [str(folder / name) for name in _list_taken(real, names, own)]
-    listed = list_some(taken, MOST_NAMED, str)
+    most = (
+        40  # names in a message: those of a project or a result in full, not of a thousand figures
+    )
+    listed = list_some(taken, most, str)
     way = "give a new folder, or --force (force=True in Python) to"
     if marker is None and taken:
         raise InputError(
@@ -180,12 +183,12 @@ def _refuse_others(folder: Path, real: Path, by: str, names: Sequence[str], said
         there = [str(folder / name) for name in own if os.path.lexists(real / name)]
         raise InputError(
             f"{said}: a folder of jaxbundle {marker.by}, not {by}; {way} replace "
-            f"{list_some([*there, *taken], MOST_NAMED, str)}"
+            f"{list_some([*there, *taken], most, str)}"
         )
     changed = [str(folder / n) for n, d in own.items() if _digest(real / n) not in (None, d)]
     if changed or taken:
         raise InputError(
-            f"{said}: {list_some([*changed, *taken], MOST_NAMED, str)}: already there, and not as "
+            f"{said}: {list_some([*changed, *taken], most, str)}: already there, and not as "
             f"jaxbundle {by} wrote it; {way} replace it"
         )
 
@@ -210,6 +213,7 @@ def _digest(path: Path) -> str | None:
     """Digest of the content of a file; None if it is missing, empty for anything else."""
     if not os.path.lexists(path):
         return None
+    # equal to no digest of a marker: whoever put it there did not mean to lose it
     if path.is_symlink() or not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -225,6 +229,7 @@ def _make_work(real: Path) -> Path:
     to the folder, which may be on another disk; else inside."""
     beside, inside = _works(real)
     if not real.is_dir():
+        # there is nothing yet that could be inside it
         beside.mkdir(exist_ok=True)
         return beside
     inside.mkdir(exist_ok=True)
@@ -235,7 +240,8 @@ def _make_work(real: Path) -> Path:
     return beside
 
 
-def _held(folder: str | Path, work: Path) -> AbstractContextManager[None]:
+def _hold_work(folder: str | Path, work: Path) -> AbstractContextManager[None]:
+    # without locks (some network disks) two commands on one folder are the user's risk
     return hold_lock(work / "run", folder, needed=False)
 
 
@@ -273,7 +279,7 @@ def _replace(
 def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]) -> None:
     """Replace old files by the new ones, all or none."""
     new, old = work / READY, work / OLD
-    os.rename(work / NEW, new)
+    os.rename(work / NEW, new)  # from here on `recover` knows that the new files are complete
     if not real.exists():
         os.rename(new, real)
         return
@@ -287,6 +293,7 @@ def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]
         _move_back(work, real)
         raise
     for name in going:
+        # folders that the old result needed, if nothing else is in them
         for parent in [*PurePosixPath(name).parents][:-1]:
             with suppress(OSError):
                 (real / parent).rmdir()
@@ -328,6 +335,7 @@ def _files(folder: Path) -> list[str]:
         for root, _, names in os.walk(folder)
         for name in names
     ]
+    # the marker declares the others to be there, so that it must not come before them
     return sorted(found, key=lambda name: (name == MARKER, name))
 
 

@@ -10,9 +10,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import defer_interrupts, temporary
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
-LONGEST_STEM = 60
-"""Characters of a name in its temporary name, which could otherwise be too long."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -37,9 +35,9 @@ def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
     for path, target in zip(paths, real):
         if target.exists() and not target.is_file():
             raise InputError(f"{path}: cannot be written: it is not a file; give another name")
+    # Names have 255 bytes at most: 60 characters of up to 4 leave room for the rest.
     names = tuple(
-        target.with_name(f".{target.stem[:LONGEST_STEM]}.{os.getpid()}{target.suffix}")
-        for target in real
+        target.with_name(f".{target.stem[:60]}.{os.getpid()}{target.suffix}") for target in real
     )
     with ExitStack() as until:
         for name in names:
@@ -63,7 +61,7 @@ def unwritable(path: str | Path, error: OSError) -> InputError:
     """Why a file or folder cannot be written, in one line; a full disk is named."""
     why = error.strerror or " ".join(str(error).split())
     return InputError(
-        f"{path}: cannot be written: {why}{disk_of(path) if error.errno in FULL else ''}"
+        f"{path}: cannot be written: {why}{disk_of(path) if error.errno in DISK_FULL else ''}"
     )
 
 

@@ -1,7 +1,7 @@
 """The page of an adjustment, and of a command based on one."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.report import head
@@ -16,7 +16,10 @@ from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
 from jaxbundle.report.verdict import Finding, Verdict, conclude
 
-A_POSTERIORI = (
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+
+SIGMA_NOTE = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
     "said to be a priori."
 )
@@ -40,18 +43,22 @@ class Addition(NamedTuple):
     tables: Mapping[str, Listing] = NOTHING
     name: str = ""
 
-    def conclude(self, adjustment) -> Verdict:
+    def conclude(self, adjustment: "Adjustment") -> Verdict:
         """The verdict of the command on its adjustment."""
         return conclude(adjustment, self.findings, self.without, len(self.warnings))
 
 
-ALONE = Addition()
+NO_ADDITION = Addition()
 REPEATED_LINES = ("Note", "Verdict", "Redundancy", "σ0", "Image precision", "χ² test")
 """Lines of the summary that are repeated below it."""
 
 
 def compose(
-    adjustment, origin: Origin = UNKNOWN, *, date: str | None = None, also: Addition = ALONE
+    adjustment: "Adjustment",
+    origin: Origin = UNKNOWN,
+    *,
+    date: str | None = None,
+    also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of an adjustment as HTML, in pieces; for an unsolved one, the reason.
 
@@ -66,7 +73,7 @@ def compose(
 
 
 def compose_failure(
-    error: NotSolvedError, origin: Origin = UNKNOWN, kind: str = ALONE.kind
+    error: NotSolvedError, origin: Origin = UNKNOWN, kind: str = NO_ADDITION.kind
 ) -> Iterator[str]:
     """The page of an adjustment that ended before there was a result."""
     rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
@@ -74,7 +81,9 @@ def compose_failure(
     yield from write(Page(f"no result: {kind}", [first], origin))
 
 
-def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
+def describe(
+    adjustment: "Adjustment", origin: Origin = UNKNOWN, also: Addition = NO_ADDITION
+) -> Page:
     """The page of an adjustment, as a `Page`."""
     name = clean(also.name or adjustment.network.name) or "network"
     title = f"{name}: {also.kind}" if also.kind else name
@@ -95,7 +104,7 @@ def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Pa
     return Page(title, shown, origin, settings, tables, drawings)
 
 
-def _whole(adjustment) -> list[str]:
+def _whole(adjustment: "Adjustment") -> list[str]:
     """Summary numbers."""
     return [
         "<h3>Result</h3>\n",
@@ -104,5 +113,5 @@ def _whole(adjustment) -> list[str]:
         facts(head.variance_facts(adjustment)),
         "<h3>Counts</h3>\n",
         grid(("", "", ""), head.count_rows(adjustment), "words"),
-        paragraph(A_POSTERIORI),
+        paragraph(SIGMA_NOTE),
     ]

@@ -1,14 +1,19 @@
 """An error budget as a section of a page."""
 
-from jaxbundle.report.budget import HEADER, LEGEND, MOST_ROWS, TITLE
-from jaxbundle.report.page.adjustment import ALONE, Addition
+from typing import TYPE_CHECKING
+
+from jaxbundle.report.budget import HEADER, LEGEND, TITLE, select_rows
+from jaxbundle.report.page.adjustment import NO_ADDITION, Addition
 from jaxbundle.report.page.document import Section
 from jaxbundle.report.page.markup import grid, paragraph
 
+if TYPE_CHECKING:
+    from jaxbundle.bundle.sensitivity import Budget
 
-def describe_budget(budget) -> Addition:
+
+def describe_budget(budget: "Budget | None") -> Addition:
     """The error budget on the page of an adjustment, if there is one."""
     if budget is None:
-        return ALONE
-    content = grid(HEADER, budget.rows()[:MOST_ROWS], "words") + paragraph(LEGEND)
+        return NO_ADDITION
+    content = grid(HEADER, select_rows(budget)[0], "words") + paragraph(LEGEND)
     return Addition(sections=(Section("budget", TITLE, content, "Budget"),))

@@ -5,22 +5,49 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.plotting.ticks import label_ticks, offset_in_words
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.markup import text
 
-WIDE, HIGH = 640, 300
-LEFT, RIGHT, TOP, BOTTOM = 70, 15, 15, 45
+
+class ChartLayout(NamedTuple):
+    """Size of a drawing and of its margins, in the units of its SVG; the page scales it to its
+    width, at which a unit is about a CSS pixel.
+
+    `left` holds ticks of seven characters and the turned label of y, `bottom` the ticks and the
+    label of x; `right` and `top` half a tick that stands at the end of an axis.
+    """
+
+    width: int = 640
+    height: int = 300
+    left: int = 70
+    right: int = 15
+    top: int = 15
+    bottom: int = 45
+
+    @property
+    def plot_right(self) -> int:
+        """The right end of the axis of x."""
+        return self.width - self.right
+
+    @property
+    def plot_bottom(self) -> int:
+        """The lower end of the axis of y."""
+        return self.height - self.bottom
+
+
+LAYOUT = ChartLayout()
 
 
 class Curve(NamedTuple):
     """A line through x, y, with a band of y ± sigma around it; `kind` is its class of style."""
 
     label: str
-    x: np.ndarray
-    y: np.ndarray
-    sigma: np.ndarray | None = None
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"] | None = None
     kind: str = "first"
 
 
@@ -32,7 +59,7 @@ class Scale(NamedTuple):
     start: float
     end: float
 
-    def __call__(self, value):
+    def __call__(self, value: float | Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         return self.start + (np.asarray(value, float) - self.low) / (self.high - self.low) * (
             self.end - self.start
         )
@@ -44,6 +71,7 @@ def draw_curves(
     y_label: str,
     logarithmic: str = "",
     mark: tuple[float, str] | None = None,
+    layout: ChartLayout = LAYOUT,
 ) -> str:
     """Curves over a common x; `logarithmic`: the axes, of x and y, whose values are log10 of what
     they say; `mark`: an x with a vertical line, and its name."""
@@ -53,12 +81,14 @@ def draw_curves(
         for band in [np.nan_to_num(0 if c.sigma is None else c.sigma)]
     ]
     xs, ys = np.concatenate([c.x for c in curves]), np.concatenate(reach)
-    x, y = _scale(xs, LEFT, WIDE - RIGHT), _scale(ys, HIGH - BOTTOM, TOP, 0.05)
-    parts = [_axes(x, y, x_label, y_label, logarithmic)]
+    x = _scale(xs, layout.left, layout.plot_right)
+    y = _scale(ys, layout.plot_bottom, layout.top, 0.05)
+    parts = [_axes(x, y, x_label, y_label, layout, logarithmic)]
     if mark is not None:
-        at = float(x(mark[0]))
+        where = float(x(mark[0]))
         parts.append(
-            f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HIGH - BOTTOM}"/>\n'
+            f'<line class="mark" x1="{where:.1f}" x2="{where:.1f}" y1="{layout.top}" '
+            f'y2="{layout.plot_bottom}"/>\n'
         )
     for curve in curves:
         if curve.sigma is not None:
@@ -67,37 +97,46 @@ def draw_curves(
             parts.append(f'<polygon class="band {curve.kind}" points="{outline}"/>\n')
         line = _places(x, y, curve.x, curve.y)
         parts.append(f'<polyline class="{curve.kind}" points="{line}"/>\n')
-    return _svg(parts) + _legend(
+    return _svg(parts, layout) + _legend(
         [(c.kind, c.label) for c in curves], None if mark is None else mark[1]
     )
 
 
-def draw_plan(lines: Sequence[Curve], x_label: str, y_label: str, down: bool = False) -> str:
+def draw_plan(
+    lines: Sequence[Curve],
+    x_label: str,
+    y_label: str,
+    down: bool = False,
+    layout: ChartLayout = LAYOUT,
+) -> str:
     """Lines in a plane, both axes at one scale; `down`: y grows downwards. Lines of the same label
     have one sample."""
     xs, ys = (np.concatenate([getattr(line, name) for line in lines]) for name in ("x", "y"))
     ends = [_scale(v, 0, 1, 0.03) for v in (xs, ys)]
-    room = WIDE - RIGHT - LEFT, HIGH - BOTTOM - TOP
+    room = layout.plot_right - layout.left, layout.plot_bottom - layout.top
     unit = max((end.high - end.low) / size for end, size in zip(ends, room))
     # The remaining space is shared by both sides.
     low = [(end.low + end.high - unit * size) / 2 for end, size in zip(ends, room)]
-    top, bottom = (HIGH - BOTTOM, TOP) if not down else (TOP, HIGH - BOTTOM)
-    x = Scale(low[0], low[0] + unit * room[0], LEFT, WIDE - RIGHT)
-    y = Scale(low[1], low[1] + unit * room[1], top, bottom)
-    parts = [_axes(x, y, x_label, y_label)]
+    ends_of_y = (layout.plot_bottom, layout.top)  # SVG counts y from above
+    start, end = ends_of_y[::-1] if down else ends_of_y
+    x = Scale(low[0], low[0] + unit * room[0], layout.left, layout.plot_right)
+    y = Scale(low[1], low[1] + unit * room[1], start, end)
+    parts = [_axes(x, y, x_label, y_label, layout)]
     parts += [
         f'<polyline class="{line.kind}" points="{_places(x, y, line.x, line.y)}"/>\n'
         for line in lines
     ]
-    return _svg(parts) + _legend([*dict.fromkeys((line.kind, line.label) for line in lines)])
+    names = [*dict.fromkeys((line.kind, line.label) for line in lines)]
+    return _svg(parts, layout) + _legend(names)
 
 
 def draw_histogram(
-    edges: np.ndarray,
-    counted: np.ndarray,
+    edges: Float[np.ndarray, " edges"],
+    counted: Int[np.ndarray, " classes"],
     x_label: str,
     things: str,
-    expected: np.ndarray | None = None,
+    expected: Float[np.ndarray, " classes"] | None = None,
+    layout: ChartLayout = LAYOUT,
 ) -> str:
     """Counts by class as bars, with the expectation of a normal distribution as steps; an
     outer class whose edge is infinite is open, and drawn as wide as its neighbour."""
@@ -106,11 +145,11 @@ def draw_histogram(
         ends[0] = 2 * ends[1] - ends[2]
     if np.isinf(ends[-1]):
         ends[-1] = 2 * ends[-2] - ends[-3]
-    x = Scale(ends[0], ends[-1], LEFT, WIDE - RIGHT)
+    x = Scale(ends[0], ends[-1], layout.left, layout.plot_right)
     tallest = max(counted.max(initial=1), 0 if expected is None else expected.max(initial=1))
-    y = _scale(np.array([0.0, tallest]), HIGH - BOTTOM, TOP)
+    y = _scale(np.array([0.0, tallest]), layout.plot_bottom, layout.top)
     base = float(y(0))
-    parts = [_axes(x, y, x_label, things, whole=True)]
+    parts = [_axes(x, y, x_label, things, layout, whole=True)]
     parts += [
         f'<rect class="bar" x="{x(a):.1f}" y="{y(n):.1f}" width="{x(b) - x(a):.1f}" '
         f'height="{base - y(n):.1f}"/>\n'
@@ -121,17 +160,20 @@ def draw_histogram(
         steps = _places(x, y, np.repeat(ends, 2)[1:-1], np.repeat(expected, 2))
         parts.append(f'<polyline class="second" points="{steps}"/>\n')
         names.append(("second", "normal distribution"))
-    return _svg(parts) + _legend(names)
+    return _svg(parts, layout) + _legend(names)
 
 
-def draw_field(values: np.ndarray, digits: int = 2) -> str:
+def draw_field(
+    values: Float[np.ndarray, "rows columns"], digits: int = 2, layout: ChartLayout = LAYOUT
+) -> str:
     """Numbers in the cells of an image, row by row from its top, the larger the darker; a cell
     without a number is empty. `digits`: significant ones; 0: whole numbers."""
     rows, columns = values.shape
-    wide, high = WIDE / columns, HIGH / rows
+    wide, high = layout.width / columns, layout.height / rows
     there = np.isfinite(values)
     low, top = (values[there].min(), values[there].max()) if there.any() else (0.0, 1.0)
-    shade = 0.6 * (values - low) / (top - low or 1.0)
+    shade = 0.6 * (values - low) / (top - low or 1.0)  # the numbers stay legible on the darkest
+    format_cell = lambda value: f"{value:.0f}" if digits == 0 else significant(value, digits)
     parts = []
     for i, j in np.argwhere(there):
         x, y = j * wide, i * high
@@ -139,13 +181,10 @@ def draw_field(values: np.ndarray, digits: int = 2) -> str:
             f'<rect class="cell" x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" '
             f'fill-opacity="{shade[i, j]:.2f}"/>\n<text x="{x + wide / 2:.1f}" '
             f'class="number" y="{y + high / 2 + 4:.1f}" text-anchor="middle">'
-            f"{_cell(float(values[i, j]), digits)}</text>\n"
+            f"{format_cell(float(values[i, j]))}</text>\n"
         )
-    return _svg([*parts, f'<rect class="frame" width="{WIDE}" height="{HIGH}"/>\n'])
-
-
-def _cell(value: float, digits: int) -> str:
-    return f"{value:.0f}" if digits == 0 else significant(value, digits)
+    frame = f'<rect class="frame" width="{layout.width}" height="{layout.height}"/>\n'
+    return _svg([*parts, frame], layout)
 
 
 def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) -> Scale:
@@ -197,29 +236,37 @@ def _round_values(low: float, high: float, whole: bool = False) -> np.ndarray:
 
 
 def _axes(
-    x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "", whole: bool = False
+    x: Scale,
+    y: Scale,
+    x_label: str,
+    y_label: str,
+    layout: ChartLayout,
+    logarithmic: str = "",
+    whole: bool = False,
 ) -> str:
     """Axes with their ticks; `whole`: y counts."""
     parts = []
+    left, right = layout.left, layout.plot_right
+    top, bottom = layout.top, layout.plot_bottom
     across = _ticks(x, "x" in logarithmic)
-    for at, name in zip(x(across.places), across.names):
+    for tick, name in zip(x(across.places), across.names):
         parts.append(
-            f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
-            f'y2="{HIGH - BOTTOM}"/>\n'
-            f'<text class="tick" x="{at:.1f}" y="{HIGH - BOTTOM + 16}" '
+            f'<line class="grid" x1="{tick:.1f}" x2="{tick:.1f}" y1="{top}" '
+            f'y2="{bottom}"/>\n'
+            f'<text class="tick" x="{tick:.1f}" y="{bottom + 16}" '
             f'text-anchor="middle">{name}</text>\n'
         )
     up = _ticks(y, "y" in logarithmic, whole)
-    for at, name in zip(y(up.places), up.names):
+    for tick, name in zip(y(up.places), up.names):
         parts.append(
-            f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
-            f'y2="{at:.1f}"/>\n'
-            f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" '
+            f'<line class="grid" x1="{left}" x2="{right}" y1="{tick:.1f}" '
+            f'y2="{tick:.1f}"/>\n'
+            f'<text class="tick" x="{left - 6}" y="{tick + 4:.1f}" '
             f'text-anchor="end">{name}</text>\n'
         )
-    middle = (TOP + HIGH - BOTTOM) / 2
+    middle = (top + bottom) / 2
     parts.append(
-        f'<text x="{(LEFT + WIDE - RIGHT) / 2}" y="{HIGH - 8}" text-anchor="middle">'
+        f'<text x="{(left + right) / 2}" y="{layout.height - 8}" text-anchor="middle">'
         f"{text(x_label + across.offset)}</text>\n"
         f'<text x="14" y="{middle}" text-anchor="middle" '
         f'transform="rotate(-90 14 {middle})">{text(y_label + up.offset)}</text>\n'
@@ -227,13 +274,14 @@ def _axes(
     return "".join(parts)
 
 
-def _places(x: Scale, y: Scale, xs, ys) -> str:
+def _places(x: Scale, y: Scale, xs: Float[np.ndarray, " n"], ys: Float[np.ndarray, " n"]) -> str:
     there = np.isfinite(xs) & np.isfinite(ys)
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(xs[there]), y(ys[there])))
 
 
-def _svg(parts: Sequence[str]) -> str:
-    return f'<svg viewBox="0 0 {WIDE} {HIGH}" role="img">\n{"".join(parts)}</svg>\n'
+def _svg(parts: Sequence[str], layout: ChartLayout) -> str:
+    size = f"{layout.width} {layout.height}"
+    return f'<svg viewBox="0 0 {size}" role="img">\n{"".join(parts)}</svg>\n'
 
 
 def _legend(names: Sequence[tuple[str, str]], mark: str | None = None) -> str:

@@ -60,6 +60,7 @@ def encode_values(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype == bool:
         values = np.where(values, "yes", "no").astype(object)
     if values.dtype.kind in "OU":
+        # ids repeat in every row of an image or a point
         codes: dict[str, int] = {}
         found = [codes.setdefault(str(value), len(codes)) for value in values]
         return {"names": list(codes)} | _pack(np.array(found, int))
@@ -72,6 +73,7 @@ def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
         kind = next((k for k in INTEGERS if _holds(k, low, high)), "<f8")
     else:
         kind = "<f8" if exact else "<f4"
+    # the page decodes little-endian bytes, whatever this machine has
     packed = np.ascontiguousarray(values, kind)
     if len(packed) > 1 and np.isfinite(packed[0]) and (packed == packed[0]).all():
         return {"type": kind[1:], "same": packed[0].item()}
@@ -82,7 +84,7 @@ def _holds(kind: str, low: int, high: int) -> bool:
     return np.iinfo(kind).min <= low and high <= np.iinfo(kind).max
 
 
-def script_text(value) -> str:
+def script_text(value: Any) -> str:
     """JSON that is safe in a script element: ASCII without `<`."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 

@@ -77,9 +77,11 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         for id, table in page.tables.items()
         if any(len(column.values) for column in table.columns.values())
     }
+    # the verdict stands before the contents, on the first screen
     first, *sections = page.sections
     listed = [_listing(id, table) for id, table in tables.items()]
     if listed:
+        # one link leads to all tables
         listed[0] = listed[0]._replace(link="Tables")
     last = _origin(page)
     yield _beginning(page, date or page.origin.computed or in_words(now()))
@@ -160,7 +162,7 @@ def _css_text(words: str) -> str:
     return "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in words)
 
 
-def _data(id: str, value) -> str:
+def _data(id: str, value: Any) -> str:
     return f'<script type="application/json" id="{id}">{script_text(value)}</script>\n'
 
 

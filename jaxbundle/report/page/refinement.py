@@ -1,12 +1,13 @@
 """The page of a refinement of scanner images (`jaxbundle.refinement`)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.columns import count
-from jaxbundle.refinement import point_rows
+from jaxbundle.refinement import Refinement, point_rows
 from jaxbundle.report.layout import estimate
 from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing, Page, Section, write
@@ -16,24 +17,25 @@ from jaxbundle.report.page.overview import give_verdict
 from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
 from jaxbundle.report.page.tables import Columns
 from jaxbundle.report.refinement import conclude_refinement
+from jaxbundle.types import present
 
 KIND = "refinement of scanner images"
-MOST_CORRELATED = 40
-"""With more unknowns the matrix is only in result.json."""
 SCANNER_AXES = ("line", "pixel")
+ImagePoint = dict[str, Any]
+"""A row of `Refinement.image_points`."""
 
 
-def compose_refinement(result, origin: Origin = UNKNOWN) -> Iterator[str]:
+def compose_refinement(result: Refinement, origin: Origin = UNKNOWN) -> Iterator[str]:
     """The page of a `Refinement`: HTML, in pieces."""
     return write(_describe(result, origin))
 
 
-def _describe(result, origin: Origin) -> Page:
+def _describe(result: Refinement, origin: Origin) -> Page:
     found = _image_points(result)
     used = [row for row in found if not row["removed"]]
     w = np.concatenate([row["w"] for row in used])
     findings = conclude_refinement(result).findings
-    first = give_verdict(findings, result.warnings, _whole(result, used))
+    first = give_verdict(findings, result.warnings, _list_numbers(result, used))
     sections = [first, photographs("w"), _unknowns(result), show_residuals(w, "w")]
     tables = {
         "images": Listing("Images", _images(result, used), "result.json"),
@@ -54,16 +56,17 @@ def _describe(result, origin: Origin) -> Page:
     return Page(title, sections, origin, tables=tables, drawings=frames)
 
 
-def _words(values) -> np.ndarray:
+def _words(values: Iterable[object]) -> np.ndarray:
     return np.array(list(values), dtype=object)
 
 
-def _image_points(result) -> list[dict]:
+def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
     declared, given = result.inspection.declared, result.inspection.declared.given
     xy = lambda of_scanner: np.asarray(
-        given.observations.xy if of_scanner else given.frames.observations.xy
+        given.observations.xy if of_scanner else present(given.frames).observations.xy
     )
+    # the parts of the equations are in another order than the images
     measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
     scanners = {one.id for one in result.images}
     return [
@@ -72,7 +75,7 @@ def _image_points(result) -> list[dict]:
     ]
 
 
-def _whole(result, used) -> str:
+def _list_numbers(result: Refinement, used: Sequence[ImagePoint]) -> str:
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     frames = 0 if result.frames is None else len(result.frames.images)
     rows = [
@@ -89,9 +92,10 @@ def _whole(result, used) -> str:
     return f"<h3>Result</h3>\n{facts(rows)}"
 
 
-def _unknowns(result) -> Section:
+def _unknowns(result: Refinement) -> Section:
     """The changes of the unknowns with σ and prior, and their correlations."""
-    rows, shows_matrix = [], 1 < len(result.names) <= MOST_CORRELATED
+    # The numbers of more than 40 columns cannot be read on a page: they are in result.json.
+    rows, shows_matrix = [], 1 < len(result.names) <= 40
     numbered = [
         f"{i}: {name}" if shows_matrix else str(name) for i, name in enumerate(result.names, 1)
     ]
@@ -109,7 +113,7 @@ def _unknowns(result) -> Section:
     return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns")
 
 
-def _images(result, used) -> Columns:
+def _images(result: Refinement, used: Sequence[ImagePoint]) -> Columns:
     camera, rms = [], []
     for id in result.inspection.declared.given.ids:
         v = np.array([row["v"] for row in used if row["image"] == id]).reshape(-1, 2)
@@ -124,7 +128,7 @@ def _images(result, used) -> Columns:
     }
 
 
-def _points(result) -> Columns:
+def _points(result: Refinement) -> Columns:
     rows = point_rows(result)
     found = {
         "id": Column(_words(row["id"] for row in rows), "point"),
@@ -136,7 +140,7 @@ def _points(result) -> Columns:
     }
 
 
-def _checks(result) -> Columns:
+def _checks(result: Refinement) -> Columns:
     check = result.check
     if check is None:
         return {}
@@ -148,7 +152,7 @@ def _checks(result) -> Columns:
     return found | {"rays": Column(np.asarray(check.rays), "rays")}
 
 
-def _observations(used) -> Columns:
+def _observations(used: Sequence[ImagePoint]) -> Columns:
     """One row per coordinate, as for an adjustment; `tau`, the drawn test, is w."""
     both = lambda name: np.concatenate([row[name] for row in used])
     twice = lambda name: _words(row[name] for row in used for _ in range(2))
@@ -164,7 +168,7 @@ def _observations(used) -> Columns:
     }
 
 
-def _frames(result) -> dict[str, dict]:
+def _frames(result: Refinement) -> dict[str, dict]:
     """By camera, and scanner image, what is drawn: pixels to the right, lines down."""
     frame = lambda low, high, known, down, unit: {
         "low": low,

@@ -1,5 +1,7 @@
 """Drawings of the page: the stations of the network, and the frames of images."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from jaxbundle.cameras import get_model
@@ -16,13 +18,11 @@ from jaxbundle.plotting.views import (
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page.columns import encode_values
 
-OF_STATIONS = 0.05
-"""The largest ellipsoid of a station, as a part of the network, where no point has one."""
-MOST_OF_SIZE = 0.15
-"""Wider ones hide the network: they are drawn on request."""
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 
-def describe_network(adjustment) -> dict:
+def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
     """Centre, size and unit of the network; its error ellipsoids: the factor, the rows of points
     and stations that have one, in words, and whether those of stations are too wide to be drawn;
     the pyramid of every image (projection centre and four corners, relative to the centre)."""
@@ -33,7 +33,8 @@ def describe_network(adjustment) -> dict:
     ellipsoids = choose_ellipses(adjustment, size)
     largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
     if not ellipsoids.total and largest.max(initial=0.0) > 0:
-        factor = round_number(OF_STATIONS * size / largest.max())
+        # no point has one: the largest of the stations is a twentieth of the network
+        factor = round_number(0.05 * size / largest.max())
         ellipsoids = ellipsoids._replace(factor=factor)
     return {
         "centre": centre.tolist(),
@@ -51,20 +52,21 @@ def describe_network(adjustment) -> dict:
                 ellipsoids.selection,
             ]
         ).rstrip(),
-        "wide": bool(ellipsoids.factor * largest.max(initial=0.0) > MOST_OF_SIZE * size),
+        # wider than this part of the network they hide it: drawn on request
+        "wide": bool(ellipsoids.factor * largest.max(initial=0.0) > 0.15 * size),
         "pyramids": encode_values(pyramids.ravel()),
     }
 
 
-def describe_frames(adjustment) -> dict[str, dict]:
+def describe_frames(adjustment: "Adjustment") -> dict[str, dict[str, Any]]:
     """By camera the frame of its images, its principal point, and the unit of residuals."""
-    found = {}
+    frames = {}
     for camera in adjustment.problem.network.cameras:
         model = get_model(camera.model)
         low, high, known = image_frame(adjustment, camera.id)
         scale, unit = micrometres(model.unit)
         centre = principal_point(adjustment, camera.id)
-        found[camera.id] = {
+        frames[camera.id] = {
             "low": low.tolist(),
             "high": high.tolist(),
             "known": bool(known),
@@ -73,4 +75,4 @@ def describe_frames(adjustment) -> dict[str, dict]:
             "unit": unit,
             "centre": centre.tolist() if np.isfinite(centre).all() else None,
         }
-    return found
+    return frames

@@ -1,6 +1,7 @@
 """The sections of an adjustment, in order; words and numbers are those of the report."""
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +18,11 @@ from jaxbundle.report.page.document import Section
 from jaxbundle.report.page.markup import figure, grid, items, paragraph
 from jaxbundle.report.unknowns import validity
 
-MOST_CAMERAS = 20
-"""Largest number of cameras with drawn distortion and correlations."""
-LEAST_FALL = 1e-5
-"""Smallest relative change of vᵀPv that is drawn: its table has six digits."""
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
 
 
-def collect(adjustment) -> Iterator[Section]:
+def collect(adjustment: "Adjustment") -> Iterator[Section]:
     """All sections of a solved adjustment between its verdict and its tables."""
     yield network()
     yield photographs()
@@ -64,9 +63,10 @@ def photographs(test: str = "τ") -> Section:
     return Section("photographs", title, "".join(parts), "Photographs")
 
 
-def cameras(adjustment) -> Iterator[Section]:
-    """Equations, distortion and correlations of the cameras."""
-    chosen = list(adjustment.cameras)[:MOST_CAMERAS]
+def cameras(adjustment: "Adjustment", max_cameras: int = 20) -> Iterator[Section]:
+    """Equations, distortion and correlations of the cameras; of more than `max_cameras` the first,
+    since each has a drawing: the table has all."""
+    chosen = list(adjustment.cameras)[:max_cameras]
     for number, camera in enumerate(chosen):
         entry = adjustment.cameras[camera]
         model = get_model(entry["model"])
@@ -84,7 +84,7 @@ def cameras(adjustment) -> Iterator[Section]:
         yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link)
 
 
-def _distortion(adjustment, camera: str) -> str:
+def _distortion(adjustment: "Adjustment", camera: str) -> str:
     measured, reach = curve_reach(adjustment, camera)
     if not reach > 0:
         return ""
@@ -138,7 +138,7 @@ def show_correlations(
     return grid(("", *short), rows, "matrix") + paragraph(note)
 
 
-def residuals(adjustment) -> Section:
+def residuals(adjustment: "Adjustment") -> Section:
     """The histogram of the normalised residuals, and the variance components."""
     components = [
         (
@@ -165,13 +165,14 @@ def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "")
     return Section("residuals", "Normalised residuals", drawing + more, "Residuals")
 
 
-def convergence(adjustment) -> Section:
+def convergence(adjustment: "Adjustment") -> Section:
     """vᵀPv of the steps."""
     vtpv, damping, accepted = head.evaluations(adjustment)
     there = np.isfinite(vtpv) & (vtpv > 0)
     step = np.arange(len(vtpv))
     drawing = ""
-    if there.sum() > 1 and vtpv[there].max() > (1 + LEAST_FALL) * vtpv[there].min():
+    # A smaller fall than 1e-5 cannot be seen in the six digits of the table either.
+    if there.sum() > 1 and vtpv[there].max() > (1 + 1e-5) * vtpv[there].min():
         curve = Curve("vᵀPv", step[there], np.log10(vtpv[there]))
         drawing = figure(
             draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),

@@ -1,47 +1,49 @@
 """The embedded tables of a result, for sorting, searching and drawing."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import clean, coordinate_decimals
 from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.document import Listing
 
-MOST_ROWS = 500_000
+if TYPE_CHECKING:
+    from jaxbundle.bundle.result import Adjustment
+
+MAX_OBSERVATIONS = 500_000
 """Largest number of embedded observations: a page with a million takes too long to open."""
 
 Columns = dict[str, Column]
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+UPPER = [(i, j) for i in range(3) for j in range(i, 3)]
 """The embedded elements of a symmetric matrix, in this order."""
 ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
-def collect_tables(adjustment) -> dict[str, Listing]:
+def collect_tables(adjustment: "Adjustment") -> dict[str, Listing]:
     """All tables by name."""
     total = len(adjustment.residuals["tau"])
-    most = (
-        ""
-        if total <= MOST_ROWS
-        else (
-            f"The {MOST_ROWS} with the largest |τ| of {total}, here and in the photographs; "
-            "all are in "
-            "residuals.csv."
+    note = ""
+    if total > MAX_OBSERVATIONS:
+        note = (
+            f"The {MAX_OBSERVATIONS} with the largest |τ| of {total}, here and in the photographs; "
+            "all are in residuals.csv."
         )
-    )
     return {
         "cameras": Listing("Cameras", cameras(adjustment), "cameras.csv"),
         "images": Listing("Images", images(adjustment), "images.csv"),
         "points": Listing("Points", points(adjustment), "points.csv"),
         "far_points": Listing("Points at any distance", far_points(adjustment), "far_points.csv"),
         "checks": Listing("Check points", checks(adjustment), "checks.csv"),
-        "observations": Listing("Observations", observations(adjustment), "residuals.csv", most),
+        "observations": Listing("Observations", observations(adjustment), "residuals.csv", note),
         "blunders": Listing("Blunders", blunders(adjustment), "result.json"),
     }
 
 
-def cameras(adjustment) -> Columns:
+def cameras(adjustment: "Adjustment") -> Columns:
     """One row per parameter."""
     found = adjustment.table("cameras")
     return {
@@ -56,7 +58,7 @@ def cameras(adjustment) -> Columns:
     }
 
 
-def images(adjustment) -> Columns:
+def images(adjustment: "Adjustment") -> Columns:
     """Exterior orientation; the covariance of the projection centre, to be drawn."""
     found, given = adjustment.images, adjustment.problem.network
     unit, angle = clean(given.object_unit), given.angle_unit
@@ -76,7 +78,7 @@ def images(adjustment) -> Columns:
     )
 
 
-def points(adjustment) -> Columns:
+def points(adjustment: "Adjustment") -> Columns:
     """Coordinates with σ; the covariance, and whether a point is near enough to be drawn."""
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
     places = {axis: coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"}
@@ -93,11 +95,11 @@ def points(adjustment) -> Columns:
     )
 
 
-def _covariance(matrices) -> Columns:
+def _covariance(matrices: Float[np.ndarray, "n 3 3"]) -> Columns:
     return {f"c{i}{j}": Column(matrices[:, i, j]) for i, j in UPPER}
 
 
-def far_points(adjustment) -> Columns:
+def far_points(adjustment: "Adjustment") -> Columns:
     """Directions of the points at any distance."""
     found = adjustment.table("far_points")
     network = adjustment.network
@@ -119,7 +121,7 @@ def far_points(adjustment) -> Columns:
     }
 
 
-def checks(adjustment) -> Columns:
+def checks(adjustment: "Adjustment") -> Columns:
     """Check points: intersected, minus given, σ."""
     found, unit = adjustment.table("checks"), clean(adjustment.network.object_unit)
     if not found:
@@ -134,7 +136,7 @@ def checks(adjustment) -> Columns:
     )
 
 
-def observations(adjustment) -> Columns:
+def observations(adjustment: "Adjustment") -> Columns:
     """All observations, of very many those with the largest |τ|; `measured` of image points."""
     return table_of_residuals(
         adjustment.residuals | {"measured": measured_coordinates(adjustment)}, adjustment.sigma0
@@ -143,7 +145,7 @@ def observations(adjustment) -> Columns:
 
 def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Columns:
     """The columns there are of a table of residuals."""
-    chosen = choose_largest(found["tau"], MOST_ROWS)
+    chosen = choose_largest(found["tau"], MAX_OBSERVATIONS)
     labels = {
         "kind": "kind",
         "image": "image",
@@ -168,9 +170,10 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
     }
 
 
-def measured_coordinates(adjustment) -> np.ndarray:
+def measured_coordinates(adjustment: "Adjustment") -> np.ndarray:
     """By row of the table of residuals, the measured image coordinate; NaN for other kinds."""
     data, kind = adjustment.problem.data, adjustment.residuals["kind"]
+    # the table has rows of other kinds, too
     measured = np.full(len(kind), np.nan)
     used = np.asarray(data.image_weight) > 0
     measured[kind == "image"] = np.asarray(data.image_xy)[used]
@@ -181,10 +184,11 @@ def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
     """The rows with the largest |τ|, limited in number, in their order."""
     if len(tau) <= most:
         return np.arange(len(tau))
+    # a partition needs no order among the largest
     return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), most)[:most])
 
 
-def blunders(adjustment) -> Columns:
+def blunders(adjustment: "Adjustment") -> Columns:
     """Observations removed by data snooping, in order, and suspects of a robust estimate."""
     rows = [("removed", r.kind, r.name, r.test, 0.0) for r in adjustment.removed]
     rows += [("suspect", s.kind, s.name, s.test, s.weight) for s in adjustment.suspects]
