@@ -9,10 +9,18 @@ value. Its derivatives, of every order, also where that value is zero, are those
 import jax.numpy as jnp
 from jax import Array
 from jax.lax import stop_gradient
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.types import AnyArray
+
+RANK_TOLERANCE = 1e-7
+"""Singular values below this part of the largest count as zero: points lie on a line or in a plane,
+or linear equations leave a parameter open. It lies between rounding and noise: rounding is 1e-16 of
+a coordinate, so 1e-10 of the extent of points a million extents from the origin (map coordinates);
+measurements of images are good to 1e-6 of the format at best, which spreads even the points of a
+line by more. So it finds degenerate configurations of exact data; of measured data the cofactors
+show them."""
 
 
 def null_vector(
@@ -21,10 +29,14 @@ def null_vector(
     """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
     _, s, Vt = _right_singular(stop_gradient(A))
     root = (Vt[-1], s[-1] ** 2)
+    # The derivatives of an SVD divide by singular values, of which the last is zero for exact data;
+    # those of the root need only that it is a single one.
     return implicit_root(_null_equations, solve_dense, root, None, A)[0], s
 
 
-def _null_equations(root, _, A):
+def _null_equations(
+    root: tuple[Float[Array, " n"], Float[Array, ""]], _: None, A: Float[AnyArray, "rows n"]
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     h, eigenvalue = root
     return A.T @ (A @ h) - eigenvalue * h, 0.5 * (h @ h - 1)
 
@@ -52,13 +64,22 @@ def extent(points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]) -> Fl
     return s / jnp.where(s[0] > 0, s[0], 1)
 
 
+def are_collinear(
+    points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
+) -> Bool[Array, ""]:
+    """Whether the points of weight > 0 lie on a line, or are one."""
+    return extent(points, weights)[1] < RANK_TOLERANCE
+
+
 def ones_unless(weights: Float[AnyArray, " n"] | None, points: AnyArray) -> Float[Array, " n"]:
     """The weights, one a point if there are none."""
     ones = jnp.ones(points.shape[0], points.dtype)
     return ones if weights is None else jnp.asarray(weights)
 
 
-def _right_singular(A):
+def _right_singular(
+    A: Float[AnyArray, "rows n"],
+) -> tuple[Float[Array, "_ n"], Float[Array, " n"], Float[Array, "n n"]]:
     """SVD with all right singular vectors: empty rows are added to a flat matrix."""
     missing = max(A.shape[1] - A.shape[0], 0)
     return jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)
