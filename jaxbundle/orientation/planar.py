@@ -60,8 +60,8 @@ def planar_orientations(
     square, V = jnp.linalg.eigh(G.T @ G)
     v3, v2, v1 = V.T
     long, short = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
-    # λ₁ − λ₃ is about 2·|b|/d, the base by the distance of the plane: a base of 1e-9 of the distance
-    # moves no image point by what can be measured, and is far above rounding (1e-15).
+    # λ₁ − λ₃ is about 2·|b|/d, the base by the distance of the plane: a base of 1e-9 of the
+    # distance moves no image point by what can be measured, and is far above rounding (1e-15).
     no_base = long + short < 1e-9
     apart = jnp.sqrt(jnp.where(no_base, 1.0, long + short))
 
