@@ -227,8 +227,8 @@ def take_back(
     lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
     seen = sights(given.replace(cameras=lens))
     model = _adjusted_model(problem, values, given, seen)
-    model.held = are_held(given.points)
-    new = model.held & ~model.known
+    model.control = are_held(given.points)
+    new = model.control & ~model.known
     model.X[new], model.known[new] = given.points.position[new], True
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
     straight = see_a_line(seen, model, factor) & ~model.placed

@@ -67,7 +67,8 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     truth, exact = problem.data.start, problem.data
     functions = functions_of(problem, aim)
     interest = np.flatnonzero(points_of_interest(problem))
-    of = _points_of(interest) if functions is None else lambda values: functions(values)[None]
+    points = lambda values: np.asarray(values.point)[interest]
+    of = points if functions is None else lambda values: functions(values)[None]
     random = np.random.default_rng(seed)
     found = []
     for _ in range(draws):
@@ -82,15 +83,17 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     return Proof(aim_of(problem, shape), measure(shape, blocks), draws, draws - len(d))
 
 
-def _points_of(interest):
-    return lambda values: np.asarray(values.point)[interest]
-
-
 def _measure(exact: Data, random: np.random.Generator) -> Data:
     """Simulated data."""
+
+    def sigma_of(name: str) -> np.ndarray:
+        """0 of what is not measured. The network's `weight` is 1/σ, the root of the weight."""
+        sqrt_p = np.asarray(exact.weight(name))
+        return np.where(sqrt_p > 0, 1 / np.where(sqrt_p > 0, sqrt_p, 1.0), 0.0)
+
     noisy = {
         name: np.asarray(exact.measured(name))
-        + random.standard_normal(exact.measured(name).shape) * _sigma(exact.weight(name))
+        + random.standard_normal(exact.measured(name).shape) * sigma_of(name)
         for name in FIELDS
     }
     xy = noisy.pop("image")
@@ -104,8 +107,3 @@ def _adjust(problem: Problem, data: Data) -> Values | None:
     if not bool(converged(minimum.termination)):
         return None
     return problem.layout.values(minimum.values)
-
-
-def _sigma(weight):
-    weight = np.asarray(weight)
-    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)

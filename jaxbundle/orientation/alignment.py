@@ -106,7 +106,7 @@ def join(sights: Sights, model: Model, part: Model) -> Model | None:
         model.placed | image,
         choose(point, part.X, model.X),
         model.known | point,
-        model.held,
+        model.control,
     )
 
 

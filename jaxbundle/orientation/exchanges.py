@@ -101,8 +101,8 @@ def contradiction(
     """How two lists of points contradict each other after a similarity; None where they do not, or
     where no explanation is found.
 
-    Start values fit to `extent_to_misfit` of the extent, and control to four times the largest of its
-    `sigma` (NaN: exact); the tolerance is the root of the sum of both squares."""
+    Start values fit to the extent by `extent_to_misfit`, and control to four times the largest of
+    its `sigma` (NaN: exact); the tolerance is the root of the sum of both squares."""
     n = len(source)
     if n < 3:
         return None

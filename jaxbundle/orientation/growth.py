@@ -41,14 +41,14 @@ than `gross_ratio`, so that one bad ray of two is excluded and named, not the po
 
 @dataclasses.dataclass
 class Model:
-    """Images and points of one frame; a point that is `held` (control) is never intersected."""
+    """Images and points of one frame; a point that is `control` is never intersected."""
 
     X0: Float[np.ndarray, "images 3"]
     M: Float[np.ndarray, "images 3 3"]
     placed: Bool[np.ndarray, " images"]
     X: Float[np.ndarray, "points 3"]
     known: Bool[np.ndarray, " points"]
-    held: Bool[np.ndarray, " points"]
+    control: Bool[np.ndarray, " points"]
 
     @classmethod
     def empty(cls, sights: Sights) -> "Model":
@@ -72,15 +72,15 @@ class Model:
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
     def without(self, images: Bool[np.ndarray, " images"]) -> "Model":
-        """A copy without these images, and with only the held points."""
-        X = np.where(self.held[:, None], self.X, np.nan)
+        """A copy without these images, and with only the control points."""
+        X = np.where(self.control[:, None], self.X, np.nan)
         return dataclasses.replace(
             self,
             X0=self.X0.copy(),
             M=self.M.copy(),
             placed=self.placed & ~images,
             X=X,
-            known=self.known & self.held,
+            known=self.known & self.control,
         )
 
     def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
@@ -100,8 +100,9 @@ def are_held(
     points: Points, settings: StartValueSettings = DEFAULTS
 ) -> Bool[np.ndarray, " points"]:
     """Controlled points whose coordinates serve as start values: σ below the misfit allowed of
-    control (`extent_to_misfit`). Less exact ones, such as those of handheld receivers, are intersected
-    like tie points; with them the model is moved to control, but no ray contradicts them."""
+    control (`extent_to_misfit`). Less exact ones, such as those of handheld receivers, are
+    intersected like tie points; with them the model is moved to control, but no ray contradicts
+    them."""
     known = are_controlled(points)
     if known.sum() < 3:  # they have no extent to compare with
         return known
@@ -117,23 +118,23 @@ Improve = Callable[[Sights, Model], None]
 def grow(
     sights: Sights,
     model: Model,
-    among: Bool[np.ndarray, " images"] | None = None,
+    candidates: Bool[np.ndarray, " images"] | None = None,
     improve: Improve | None = None,
     settings: StartValueSettings = DEFAULTS,
 ) -> None:
-    """Orient as many images as possible (`among` these), and intersect their points.
+    """Orient as many images as possible, all or the `candidates`, and intersect their points.
 
     A growing model drifts: every image inherits the errors of the points it is resected from.
     `improve` is called whenever the model has grown by a factor (2.5), so that all calls together
     cost less than twice the last one."""
-    among = np.ones(sights.images, bool) if among is None else among
+    candidates = np.ones(sights.images, bool) if candidates is None else candidates
     # Known points at the last try: an image is tried again only when it has more.
     tried = np.zeros(sights.images, int)
     due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
     intersect(sights, model, FOR_OTHERS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
-        waiting = among & ~model.placed & (known >= settings.min_points) & (known > tried)
+        waiting = candidates & ~model.placed & (known >= settings.min_points) & (known > tried)
         if not waiting.any():
             break
         # Several at a time, those with the most points first; on repeated structures the images
@@ -172,7 +173,7 @@ def place_far_points(sights: Sights, model: Model, settings: StartValueSettings 
     direction /= np.where(number > 0, np.linalg.norm(direction, axis=1), 1.0)[:, None]
     widest = np.zeros(sights.points)
     np.fmax.at(widest, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
-    far = (number >= 3) & (widest < settings.parallel_angle) & ~model.held
+    far = (number >= 3) & (widest < settings.parallel_angle) & ~model.control
     if not far.any() or 2 * far.sum() > model.known.sum():
         return
     centres = model.X0[model.placed]
@@ -265,7 +266,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     point = sights.point[rows]
     first = np.searchsorted(point, np.arange(sights.points))
     number = np.bincount(point, minlength=sights.points)
-    wanted = np.flatnonzero((number >= 2) & ~model.held & (again | ~model.known))
+    wanted = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
     if not len(wanted):
         return
     place = np.minimum(np.arange(many.RAYS), number[wanted, None] - 1)

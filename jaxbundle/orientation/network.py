@@ -228,7 +228,7 @@ def _place_doubtful_again(
 def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
     """The number of agreeing rays; and their share of those of every placed image that belong to
     known control or to points with two rays."""
-    checked = model.held | (_rays_of(seen, model) > 1)
+    checked = model.control | (_rays_of(seen, model) > 1)
     rays = model.placed[seen.image] & checked[seen.point]
     agree = rays & (misclosures(seen, model) < seen.tolerance[seen.image])
     number, good = (np.bincount(seen.image, r, seen.images) for r in (rays, agree))
@@ -253,7 +253,7 @@ def _start_from_given(network: Network, seen: Sights, settings: StartValueSettin
 def _with_control(network: Network, model: Model, settings: StartValueSettings) -> Model:
     held = are_held(network.points, settings)
     X = np.where(held[:, None], network.points.position, model.X)
-    return dataclasses.replace(model, X=X, known=model.known | held, held=held)
+    return dataclasses.replace(model, X=X, known=model.known | held, control=held)
 
 
 def _with_approximate_points(network: Network, model: Model, settings: StartValueSettings) -> Model:
@@ -292,7 +292,7 @@ def _grow_from_a_pair(
 
 def _good_pairs(
     seen: Sights,
-    among: Bool[np.ndarray, " images"],
+    candidates: Bool[np.ndarray, " images"],
     old: Bool[np.ndarray, " images"],
     linked: bool,
     settings: StartValueSettings,
@@ -307,7 +307,7 @@ def _good_pairs(
 ]:
     """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
     of an old image and another."""
-    pairs, common = _pairs_in_common(seen, among, old, linked, settings)
+    pairs, common = _pairs_in_common(seen, candidates, old, linked, settings)
     if not len(pairs):
         return
     turned = [_common_points(seen, *pair) for pair in pairs]
@@ -328,14 +328,14 @@ def _good_pairs(
 
 def _pairs_in_common(
     seen: Sights,
-    among: Bool[np.ndarray, " images"],
+    candidates: Bool[np.ndarray, " images"],
     old: Bool[np.ndarray, " images"],
     linked: bool,
     settings: StartValueSettings,
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
-    pairs, number = _all_pairs(seen, among)
+    pairs, number = _all_pairs(seen, candidates)
     use = (number >= settings.min_common_points) & (
         (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
     )
@@ -352,12 +352,12 @@ def _pairs_in_common(
 
 
 def _all_pairs(
-    seen: Sights, among: Bool[np.ndarray, " images"]
+    seen: Sights, candidates: Bool[np.ndarray, " images"]
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Pairs of these images that share points [pairs, 2], and how many."""
     from scipy.sparse import coo_array, triu
 
-    rows = among[seen.image]
+    rows = candidates[seen.image]
     shape = (seen.images, seen.points)
     sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
     sees = sees.tocsr()
@@ -460,7 +460,8 @@ def explain_missing(
         else:
             why = (
                 f"fewer than {settings.agreeing_share:.0%} of the {of_known[image]} known "
-                "points it sees agree on a pose: look for wrong point numbers, or a wrong principal distance"
+                "points it sees agree on a pose: look for wrong point numbers, or a wrong "
+                "principal distance"
             )
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]

@@ -325,7 +325,7 @@ def _repeat(
     adjust: Callable[[Any, Bool[Array, " n"]], tuple[Any, Bool[Array, " n"]]],
     good: Bool[Array, " n"],
     model: PyTree = None,
-    model_of: Callable[[Any], PyTree] = lambda found: None,
+    model_of: Callable[[Any], PyTree] = lambda _: None,
 ) -> tuple[Any, Bool[Array, " n"]]:
     """The solution by the good observations, after these were chosen anew three times, and which
     they are.
