@@ -168,7 +168,7 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
             r = redundancy(declared, plan, data)
             roots = [diagonal_of(w) for w in (data.weight[o] for o in task.image_sets)]
             inverse = [
-                _mask(1 / jnp.maximum(r[o], 1e-12), w > 1e-3 * jnp.max(w)).ravel()
+                jnp.where(w > 1e-3 * jnp.max(w), 1 / jnp.maximum(r[o], 1e-12), 0.0).ravel()
                 for o, w in zip(task.image_sets, roots)
             ]
             return jnp.log(_norm(jnp.concatenate(inverse))) / 2
@@ -181,6 +181,8 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
         _, C = covariances(declared, plan, data, jax.jacrev(of)(still))
         return _log_measure(task.measure, C[None], jnp.ones(1))
 
+    # By all numbers of the data, not by the variables of a design: so this program, the largest by
+    # far, does not depend on the design, and `search.make_program` carries the gradient back.
     return jax.value_and_grad(value)(data)
 
 
@@ -223,24 +225,20 @@ def _log_measure(
     single = len(blocks) == 1
 
     def mean() -> Float[Array, ""]:
-        return jnp.log(jnp.sum(_mask(variances, there[..., 0])) / size) / 2
+        return jnp.log(jnp.sum(jnp.where(there[..., 0], variances, 0.0)) / size) / 2
 
     def worst() -> Float[Array, ""]:
         of_blocks = variances if single else variances.mean(1, keepdims=True)
-        return jnp.log(_norm(_mask(of_blocks, there[..., 0]))) / 2
+        return jnp.log(_norm(jnp.where(there[..., 0], of_blocks, 0.0))) / 2
 
     def determinant() -> Float[Array, ""]:
         # Of the correlations, since units differ by many powers of ten (c in mm, K3 in mm⁻⁶).
         scale = jnp.sqrt(variances)
         correlation = blocks / (scale[:, :, None] * scale[:, None, :])
         log = jnp.linalg.slogdet(correlation)[1] / 2 + jnp.log(scale).sum(1)
-        return jnp.sum(_mask(log, mask > 0)) / size
+        return jnp.sum(jnp.where(mask > 0, log, 0.0)) / size
 
     return jax.lax.switch(index, [mean, worst, determinant])
-
-
-def _mask(x: Float[Array, "..."], there: Bool[Array, "..."]) -> Float[Array, "..."]:
-    return jnp.where(there, x, 0.0)
 
 
 def _norm(x: Float[Array, "..."]) -> Float[Array, ""]:
@@ -270,6 +268,8 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
                 "(design of order zero), or control points"
             )
         return
+    # The derivatives by the seven motions of a similarity; the columns of the gauge are the
+    # combinations of these that the datum leaves open.
     start = problem.data.start
     move = lambda t: functions(_move(start, t))
     slope = np.asarray(jax.jacfwd(move)(jnp.zeros(7)))

@@ -52,6 +52,7 @@ class Conditions:
     targets: Box | None = None
 
     def __post_init__(self) -> None:
+        # Frozen: what is given is normalised once here, so that all else reads tuples of floats.
         put = lambda name, value: object.__setattr__(self, name, value)
         for name in ("room", "targets"):
             if getattr(self, name) is not None:

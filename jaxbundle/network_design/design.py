@@ -86,6 +86,7 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
     if conditions is not None and not isinstance(conditions, Conditions):
         raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
+    # Check points have no part in an adjustment, and so none in its σ.
     network = use_prior_tables(split_check_points(require_network(network))[0])
     sigma = _sigma(network, sigma_image)
     integer("starts", starts)
@@ -175,6 +176,7 @@ def _design_weights(
     candidates = network.images.id
     pairs = make_pairs(network, aim, conditions, sigma)
     values = start_at(pairs).values
+    # Candidates with too few visible targets are undetermined at any weight: they go first.
     rays = np.bincount(pairs.problem.image[pairs.measured(values)], minlength=len(network.images))
     seeing = rays >= MIN_TARGETS
     if seeing.any() and not seeing.all():
@@ -219,6 +221,8 @@ def _add_photographs(
     settings: DesignSettings,
 ) -> Design:
     """Third order: further photographs, one after the other."""
+    # Greedily: each is a search in six variables. Together they would be one in 6·n, with as many
+    # more local minima as there are ways to distribute photographs over good places.
     states, path, added, tried, converged = [], [], [], [], True
     for k in range(more):
         measured = bool(len(network.observations))
@@ -273,6 +277,8 @@ def _best_place(
     aims = np.array([program(variables.vector(s), s, softness)[0] for s in begins])
     boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
+    # Only the best few: the aim has a local minimum in every region from which other targets are
+    # seen, which a search from one of them does not leave.
     best = None
     for k in np.argsort(aims)[: settings.refined]:
         end, steps, done = search(
@@ -322,6 +328,8 @@ def _state(
     measured: Bool[np.ndarray, " rays"] | None = None,
 ) -> DesignState:
     """The visibility of targets at these values."""
+    # Soft visibility is for the search: states count what satisfies the conditions, as a
+    # photogrammetrist will.
     measured = pairs.measured(values) if measured is None else measured
     exact = realise(pairs, values, measured, None, network.residuals)
     lost, aim = lost_targets(pairs, measured), float("nan")

@@ -55,6 +55,7 @@ def try_stations(
         position = position[~inside]
     if not len(position):
         raise InputError("conditions: no station is possible: the obstacles fill the whole room")
+    # Every target is looked at in turn: with a narrow camera a station sees only what it looks at.
     targets = np.resize(np.arange(len(values.point)), len(position))
     away = np.asarray(values.point)[targets] - position
     upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(position), 1))
@@ -83,6 +84,7 @@ def check_feasible(pairs: StationTargetPairs, tried: int = 1024) -> None:
     interest = np.flatnonzero(pairs.interest)
     if not everything.any():
         raise InputError(_why(found, len(position)))
+    # Targets measured already (third order) need no further visibility.
     known = pairs.problem.point[np.nan_to_num(pairs.given_visibility) > 0]
     measured = np.bincount(known, minlength=len(pairs.interest)) >= MIN_RAYS
     hidden = ~everything[:, interest].any(0) & ~measured[interest]

@@ -175,6 +175,8 @@ def make_pairs(
     **Raises:** `InputError` for a network that cannot be designed, or an aim that depends on the
     datum.
     """
+    # All pairs, so that visibility is a number that changes smoothly and the sizes of arrays, with
+    # them the compiled programs, do not depend on where stations are.
     _refuse(require_network(network))
     images, points, rays = network.images, network.points, network.observations
     shape = len(images), len(points)

@@ -33,6 +33,8 @@ def use_prior_tables(network: Network) -> Network:
 
 def _move_to_images(network: Network, given: ExteriorPriors) -> Network:
     """σ of orientations in the table of images; two of the same element are combined."""
+    # Independent observations of one element: their weights p = 1/σ² add. σ = 0 is fixed, and
+    # stays.
     sigma = network.images.sigma.copy()
     weight = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
     np.add.at(weight, rows_of(given.image, network.images), 1 / given.sigma**2)

@@ -65,6 +65,7 @@ def _distances(
     ends = points[given.points], network.points.position[given.points]
     length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
     moved = np.abs(length - before) > 1e-12 * before  # beyond rounding
+    # A stream of its own: the noise of image points does not depend on whether there are distances.
     noise = (
         np.zeros(len(given))
         if seed is None

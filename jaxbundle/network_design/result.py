@@ -104,6 +104,8 @@ class Design:
         y down."""
         from jaxbundle.geometry import matrix_from_omega_phi_kappa
 
+        # From y up and z backwards, as in photogrammetry, to y down and z forwards, as in computer
+        # vision.
         images, flip = self.network.images, np.diag([1.0, -1.0, -1.0])
         found = np.tile(np.eye(4), (len(images), 1, 1))
         for pose, X0, angles in zip(found, images.position, images.angles):
@@ -112,7 +114,8 @@ class Design:
         return found
 
     def __str__(self) -> str:
-        unit = self._unit
+        points = self.aim.of == "points" and self.aim.measure != "reliability"
+        unit = f" [{self.after.network.object_unit}]" if points else ""
         lines = [f"Design of {ORDERS[self.order]}", f"aim: {self.aim}", ""]
         lines.append(f"{'':22}{'before':>14}{'after':>14}")
         rows = [
@@ -128,11 +131,6 @@ class Design:
             lines.append(f"{name:22}{show(a)}{show(b)}")
         lines += ["", *self._remarks()]
         return "\n".join(lines)
-
-    @property
-    def _unit(self) -> str:
-        points = self.aim.of == "points" and self.aim.measure != "reliability"
-        return f" [{self.after.network.object_unit}]" if points else ""
 
     def _remarks(self) -> Iterator[str]:
         if np.isnan(self.before.aim):

@@ -132,7 +132,11 @@ def search(
     **Returns:** the configuration, the steps, and whether the last round converged."""
     origin = pairs.problem.origin
     margins = station_margins(pairs.conditions, variables, origin, settings.edge_sharpness)
-    conditions = () if margins is None else _compile(margins)
+    conditions: list[dict[str, Any]] = []
+    if margins is not None:
+        as_numbers = lambda f: lambda x, start: np.asarray(f(jnp.asarray(x), start))
+        value, slope = eqx.filter_jit(margins), eqx.filter_jit(jax.jacfwd(margins))
+        conditions = [{"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)}]
     options = {"maxiter": max_iterations, "ftol": settings.smallest_change}
     steps: list[Step] = []
     converged = False
@@ -189,13 +193,6 @@ def _minimise(
         options=options,
     )
     return np.clip(found.x, low, high), bool(found.success)
-
-
-def _compile(margins: Callable) -> tuple[dict[str, Any]]:
-    """The margins as constraints of scipy."""
-    value, slope = eqx.filter_jit(margins), eqx.filter_jit(jax.jacfwd(margins))
-    as_numbers = lambda f: lambda x, start: np.asarray(f(jnp.asarray(x), start))
-    return ({"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)},)
 
 
 def satisfies(

@@ -90,6 +90,7 @@ class Variables:
         parts, values = self.parts(x), start.values
         position, look = (jnp.asarray(rows) for rows in (values.position, start.look))
         rotation, point = jnp.asarray(values.rotation), jnp.asarray(values.point)
+        # The position first: the direction is that from the new position to the viewed point.
         if "position" in parts:
             position = position.at[self.images].set(parts["position"] * self.unit)
         if "direction" in parts:
@@ -98,7 +99,8 @@ class Variables:
             turned = jax.vmap(turn_axis)(rotation[self.images], away)
             rotation = rotation.at[self.images].set(turned)
         if "roll" in parts:
-            rolled = jax.vmap(_roll)(rotation[self.images], parts["roll"][:, 0])
+            roll = lambda q, angle: retract_quaternion(q, jnp.zeros(3).at[2].set(angle))
+            rolled = jax.vmap(roll)(rotation[self.images], parts["roll"][:, 0])
             rotation = rotation.at[self.images].set(rolled)
         if "targets" in parts:
             point = point.at[self.points].set(parts["targets"] * self.unit)
@@ -117,10 +119,6 @@ def turn_axis(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Arra
     sine = jnp.sqrt(jnp.where(small, 1.0, square))
     times = jnp.where(small, 1.0 + square / 6, jnp.arctan2(sine, cosine) / sine)
     return retract_quaternion(q, times * axis)
-
-
-def _roll(q: Float[Array, "4"], roll: Float[Array, ""]) -> Float[Array, "4"]:
-    return retract_quaternion(q, jnp.zeros(3).at[2].set(roll))
 
 
 def choose_variables(

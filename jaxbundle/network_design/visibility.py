@@ -61,14 +61,17 @@ def view_of(camera: Camera, edge: float) -> UsableFormat:
     model = get_model(camera.model)
     try:
         low, high = image_area(model, camera.image_size, camera.pixel_size)
-        size = present_size(camera)
+        if camera.image_size is None:
+            raise ValueError("image_size is not given")
         given = {**default_parameters(model), **camera.parameters}
-        field = field_of_view_of_rays(model, given, size, camera.pixel_size)
+        field = field_of_view_of_rays(model, given, camera.image_size, camera.pixel_size)
     except ValueError as error:
         raise InputError(
             f"camera {camera.id}: its field of view is not known: {error}; a design needs "
             "image_size, and pixel_size of a model in mm"
         ) from None
+    # Beyond the radius to which a distortion is one-to-one there are no rays, and the search, which
+    # moves targets over the edge of the image, would have no gradient.
     if not np.isfinite(field.diagonal):
         raise InputError(
             f"camera {camera.id}: there is no ray to the corners of its image; a "
@@ -77,15 +80,6 @@ def view_of(camera: Camera, edge: float) -> UsableFormat:
     inner = edge * (high - low)
     low, high = (tuple(map(float, corner)) for corner in (low + inner, high - inner))
     return UsableFormat(model, low, high, field.diagonal / 2)
-
-
-def present_size(camera: Camera) -> tuple[int, int]:
-    """The image size of a camera.
-
-    **Raises:** `ValueError`."""
-    if camera.image_size is None:
-        raise ValueError("image_size is not given")
-    return camera.image_size
 
 
 def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
@@ -165,6 +159,8 @@ def _in_view(
     depth: Float[Array, ""],
 ) -> Float[Array, "5"]:
     """Margins of the four edges of the format and of the angle off the axis."""
+    # The angle as well, since the image is that of the nearest ray inside: targets behind the
+    # camera would else lie within the format.
     xy, angle = _image(view, interior, x, y, depth)
     low, high = jnp.array(view.low), jnp.array(view.high)
     half = (high - low) / 2

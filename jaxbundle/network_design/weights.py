@@ -86,6 +86,7 @@ def select(
     chosen = np.zeros(images, bool)
     chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
     chosen = _exchange(program, chosen, settings.max_exchanges)
+    # The smallest ∇T·w' of n whole photographs is the sum of the n smallest slopes.
     value, slope = program(weight)
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight

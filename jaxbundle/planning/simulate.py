@@ -163,6 +163,7 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
     begin = cameras if start is None else make_cameras(start, "start: ")
     if len(begin) != len(cameras):
         raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
+    # Before any drawing, so that faults of arguments are reported without computing.
     role = _roles(len(targets), control, control_sigma, check)
     sigma_xy = _not_negative(noise, 2, "noise")
 
@@ -173,6 +174,7 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
         chosen = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
     if max_rays is not None:
         chosen[chosen] = _draw_rays(rays[1][chosen], max_rays, rng)
+    # A control point is known: one ray is information about its image. Others need two.
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
     (image, point, xy), used = _select_imaged(rays, chosen, need)
     row = np.cumsum(used) - 1

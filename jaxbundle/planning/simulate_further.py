@@ -48,6 +48,7 @@ def simulate_further(
     for rows in require_network(network).further:
         field = rows.MEASURED
         declared = declare(truth.replace(further=(rows,)), np.zeros(3))
+        # The network declares its tables for these rows alone: theirs are what `unknowns` may name.
         values = {t.name: t.value for t in declared.tables}
         known |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}

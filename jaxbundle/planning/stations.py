@@ -135,6 +135,7 @@ def ring_of_stations(
     offset = np.stack(
         [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
     )
+    # The n-th, 2n-th, … camera, so that the first one is upright.
     turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
     return stations_looking_at(middle + offset, middle, roll=np.pi / 2 * turned)
 
@@ -179,6 +180,7 @@ def aerial_block(
     below_one = lambda x: -np.inf < x < 1
     forward_overlap = number("forward_overlap", forward_overlap, "a fraction below 1", below_one)
     side_overlap = number("side_overlap", side_overlap, "a fraction below 1", below_one)
+    # Strips are flown to and fro: images of every other one are turned by 180° about the vertical.
     base, spacing = size[0] * (1 - forward_overlap), size[1] * (1 - side_overlap)
     strip, place = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
     back = strip % 2 == 1

@@ -102,7 +102,7 @@ def make_tile(side: int, seed: int) -> Float[np.ndarray, "side side"]:
     """A periodic tile of fractal noise and flat patches with edges, mean 0, deviation 1."""
     rng = np.random.default_rng(seed)
     f = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
-    f[0, 0] = np.inf
+    f[0, 0] = np.inf  # 1/f = 0: no constant part
 
     def noise(spectrum: Float[np.ndarray, "side half"]) -> Float[np.ndarray, "side side"]:
         """Periodic noise of this amplitude spectrum, standard deviation 1."""
@@ -128,6 +128,8 @@ def _interpolate(
     width: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
     """Linear between the two levels next to the width, bilinear in both."""
+    # Texels of level k are means of 2ᵏ × 2ᵏ: the level of a width is its logarithm. Centres of
+    # texels are at k + 1/2, hence the half below.
     level = np.clip(np.log2(np.maximum(width, 1e-30)), 0, len(pyramid) - 1)
     low = np.floor(level).astype(int)
     total = np.zeros(len(x))
