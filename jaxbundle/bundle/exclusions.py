@@ -30,7 +30,7 @@ from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.determined import have_one_line, see_a_line
 from jaxbundle.orientation.growth import (
-    FOR_ITSELF,
+    START_VALUE_DEMANDS,
     Demands,
     Model,
     are_held,
@@ -45,7 +45,7 @@ from jaxbundle.orientation.network import (
 )
 from jaxbundle.orientation.sights import Sights, sights
 
-COMES_BACK = Demands(FOR_ITSELF.angle, 1.0)
+COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
 """On points and image points that come back: adjusted images are better than start values, which
 may miss by three times as much; blunders should not come back with the others."""
 LARGEST_SIGMA = 0.01

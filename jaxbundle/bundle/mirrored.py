@@ -15,7 +15,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.sightings import count_controlled_axes
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.conventions import EXPECTED, image_frame
+from jaxbundle.orientation.conventions import EXPECTED_CONVENTION, image_frame
 
 MUCH_BETTER = 5.0
 """Least ratio of σ0 of the given images and of the mirrored ones; below, control is no witness."""
@@ -47,7 +47,7 @@ def name_mirrored(
         f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
         "exchange X and Y of the control (lists often give northing first), or reverse "
         f"one of its axes (a right-handed system is expected) or {axes} of the image coordinates "
-        f"(expected: {EXPECTED[unit]})"
+        f"(expected: {EXPECTED_CONVENTION[unit]})"
     )
 
 

@@ -40,7 +40,7 @@ class Proof:
 
     @property
     def limit(self) -> float:
-        """Limit of the random deviation of the ratio of one σ from 1: three times its σ, 1/√(2n)."""
+        """Limit of the random deviation of the ratio of one σ from 1: three times its σ."""
         return 3 / np.sqrt(2 * (self.draws - self.failed))
 
     @property

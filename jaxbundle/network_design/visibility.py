@@ -29,7 +29,8 @@ from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.types import AnyArray
 
 WIDE_ANGLE = np.radians(70.0)
-"""Rays of narrower cameras are compared by tangents of the angle off the axis, others by the
+"""Rays of cameras with a smaller largest angle are compared by tangents of the angle off the axis,
+as a perspective camera images them; of fisheyes, whose tangents grow without limit, by the
 angle."""
 LARGEST_ANGLE = np.radians(87.0)
 """Angles off the axis whose tangents are compared; beyond, the angle is added."""

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
 
-PAIRS_UP_TO = 20
+MAX_POINTS_FOR_PAIRS = 20
 """With at most this many points two are also tested together: two errors of one size, as of
 exchanged names, hide each other in the estimated σ of a few points. Of 20 points there are 190
 pairs, each with a σ estimated anew."""
@@ -104,7 +104,7 @@ def assess(found: Discrepancies, assumed: float, significance: float = 0.05) -> 
     sigma, redundancy, guessed = _resolve(found, used, assumed)
     error, spread = np.full((2, len(found), 3), np.nan)
     probability = np.full(len(found), np.nan)
-    common = _linearise(found, used, used, assumed) if used.sum() > PAIRS_UP_TO else None
+    common = _linearise(found, used, used, assumed) if used.sum() > MAX_POINTS_FOR_PAIRS else None
     for i in range(len(found)):
         test = _predict(found, used, [i], assumed, common if used[i] else None)
         if test is not None:
@@ -135,7 +135,7 @@ def _most_improbable(
     """The point, or else the two points, of at most this number, that are most improbable; none if
     chance explains all."""
     rows = np.flatnonzero(used).tolist()
-    few = len(rows) <= PAIRS_UP_TO
+    few = len(rows) <= MAX_POINTS_FOR_PAIRS
     # of many points one changes the estimated σ by too little to matter
     common = None if few else _linearise(found, used, used, assumed)
     for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):

@@ -21,7 +21,7 @@ from jaxbundle.orientation.growth import Model, misclosures
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import sights
 
-UNCHANGED = (1, 0, 0, 1)
+IDENTITY = (1, 0, 0, 1)
 """The symmetry of the expected convention: a 2 × 2 matrix, row by row."""
 SYMMETRIES = {
     (1, 0, 0, -1): "{y} is counted in the other direction",
@@ -32,7 +32,7 @@ SYMMETRIES = {
     (0, -1, 1, 0): "the image is turned by 90°",
     (0, 1, -1, 0): "the image is turned by −90°",
 }
-EXPECTED = {
+EXPECTED_CONVENTION = {
     "px": "pixels from the centre of the upper-left pixel, u right, v down",
     "mm": "mm from the image centre, x right, y up",
 }
@@ -54,11 +54,11 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]
     missed: dict[tuple[tuple[int, int, int, int], bool], float]
-    missed = {(UNCHANGED, False): _misclosure(some, placed, known)}
-    if missed[UNCHANGED, False] <= settings.gross_ratio:
+    missed = {(IDENTITY, False): _misclosure(some, placed, known)}
+    if missed[IDENTITY, False] <= settings.gross_ratio:
         return ""
     m, half = centres[camera], halves[camera]
-    for symmetry, shifted in itertools.product([UNCHANGED, *SYMMETRIES], [False, True]):
+    for symmetry, shifted in itertools.product([IDENTITY, *SYMMETRIES], [False, True]):
         if (symmetry, shifted) in missed or shifted and not np.isfinite(half).all():
             continue
         # Centred coordinates instead of those from a corner, or the other way round.
@@ -69,7 +69,7 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     best = min(missed, key=lambda k: missed[k])  # The expected one, and simple ones, come first.
     # A wrong convention misses by parts of the image, the right one by the errors of start values,
     # a few hundredths of it. Of sixteen conventions one is always somewhat better by chance.
-    if not 10 * missed[best] < missed[UNCHANGED, False]:
+    if not 10 * missed[best] < missed[IDENTITY, False]:
         return ""
     unit = get_model(network.cameras[0].model).unit
     x, y = ("u", "v") if unit == "px" else ("x", "y")
@@ -80,11 +80,11 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
             if unit == "px"
             else "they are counted from a corner of the image"
         )
-    if best[0] != UNCHANGED:
+    if best[0] != IDENTITY:
         words.append(SYMMETRIES[best[0]].format(x=x, y=y))
     return (
         f"the image coordinates fit the start values if {' and '.join(words)}: expected are "
-        f"{EXPECTED[unit]}; change them in the input"
+        f"{EXPECTED_CONVENTION[unit]}; change them in the input"
     )
 
 
@@ -132,12 +132,14 @@ def name_image_extent(network: Network) -> str:
         # In mm all points lie within 2 % of the image about its first pixel: a sensor of 36 mm has
         # 2000 columns and more.
         if unit == "px" and (np.abs([low, high]) < 0.02 * 2 * half).all():
-            return f"{said}: are they in mm? Expected are {EXPECTED[unit]}"
+            return f"{said}: are they in mm? Expected are {EXPECTED_CONVENTION[unit]}"
         # Of coordinates from the centre, taken for coordinates from a corner, three quarters lie
         # outside the image; blunders are fewer than a quarter.
         outside = (np.abs(xy - centre) > half).any(1).mean()
         shifted = np.where(centre == 0, half, 0.0)
         if outside > 0.25 and (np.abs(xy - shifted) <= half).all(1).mean() > 0.99:
             origin = "the image centre" if unit == "px" else "a corner of the image"
-            return f"{said}: are they counted from {origin}? Expected are {EXPECTED[unit]}"
+            return (
+                f"{said}: are they counted from {origin}? Expected are {EXPECTED_CONVENTION[unit]}"
+            )
     return ""

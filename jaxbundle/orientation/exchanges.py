@@ -16,12 +16,12 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.control_consistency import MIN_AGREEING
-from jaxbundle.orientation.growth import FOR_ITSELF, Model, are_controlled, intersect
+from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, are_controlled, intersect
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
-ALL_PAIRS_UP_TO = 12
+MAX_POINTS_FOR_TRIALS = 12
 """With at most this many points every swap of two (66) is tried, and every similarity of three
 (220) tested. More points have a majority, which needs no trial."""
 
@@ -47,7 +47,7 @@ def name_contradiction(
         there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
         if there.any():
             alone.place(there, images.position[there], many.matrices(images.angles[there]))
-    intersect(seen, alone, FOR_ITSELF)
+    intersect(seen, alone, START_VALUE_DEMANDS)
     control = np.flatnonzero(are_controlled(points) & alone.known)
     found = contradiction(
         alone.X[control], points.position[control], points.sigma[control], settings
@@ -153,7 +153,7 @@ def _by_trial(
 ) -> Contradiction | None:
     """Every swap of two, and every point left out: those after which all points fit."""
     n = len(source)
-    if n > ALL_PAIRS_UP_TO:
+    if n > MAX_POINTS_FOR_TRIALS:
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
     trials += [((), (k,)) for k in range(n) if n >= MIN_AGREEING]
@@ -180,7 +180,7 @@ def _agreeing(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], tolerance: float
 ) -> Bool[np.ndarray, " n"]:
     """The most points that fit one similarity from three of them, and after it once more."""
-    if len(source) <= ALL_PAIRS_UP_TO:
+    if len(source) <= MAX_POINTS_FOR_TRIALS:
         triples = list(itertools.combinations(range(len(source)), 3))
     else:
         # With half of the points wrong an eighth of the triples is good: fifteen of 120.

@@ -31,10 +31,10 @@ class Demands:
     miss: float
 
 
-FOR_OTHERS = Demands(0.02, 1.0)
+RESECTION_DEMANDS = Demands(0.02, 1.0)
 """A point known well enough for resection: an angle of 0.02 (1.1°) makes an error of a direction 50
 times as large along the ray, which an image from the side sees in full."""
-FOR_ITSELF = Demands(1e-3, 4.0)
+START_VALUE_DEMANDS = Demands(1e-3, 4.0)
 """A point that needs a start value: the adjustment decides about it. Its rays may miss it by more
 than `gross_ratio`, so that one bad ray of two is excluded and named, not the point lost."""
 
@@ -131,7 +131,7 @@ def grow(
     # Known points at the last try: an image is tried again only when it has more.
     tried = np.zeros(sights.images, int)
     due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
-    intersect(sights, model, FOR_OTHERS)
+    intersect(sights, model, RESECTION_DEMANDS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
         waiting = candidates & ~model.placed & (known >= settings.min_points) & (known > tried)
@@ -144,7 +144,7 @@ def grow(
         chosen = np.flatnonzero(waiting & (known >= enough))
         tried[chosen] = known[chosen]
         if _place_images(sights, model, chosen, settings):
-            intersect(sights, model, FOR_OTHERS)
+            intersect(sights, model, RESECTION_DEMANDS)
         if improve is not None and model.placed.sum() >= due:
             improve(sights, model)
             due = settings.improvement_growth * model.placed.sum()
@@ -154,9 +154,9 @@ def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS
     """Repeat everything, images from all their points and points from all their rays."""
     # FINISH_REASON
     for _ in range(2):
-        intersect(sights, model, FOR_ITSELF, again=True)
+        intersect(sights, model, START_VALUE_DEMANDS, again=True)
         _refine(sights, model, settings)
-    intersect(sights, model, FOR_ITSELF, again=True)
+    intersect(sights, model, START_VALUE_DEMANDS, again=True)
 
 
 def place_far_points(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:

@@ -34,7 +34,7 @@ from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given
 from jaxbundle.orientation.conventions import name_image_extent
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
-    FOR_OTHERS,
+    RESECTION_DEMANDS,
     Improve,
     Model,
     are_controlled,
@@ -321,7 +321,7 @@ def _good_pairs(
     # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
     # `good_angle` images differ so much that many points are seen in one only.
     worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
-    usable = (part >= settings.agreeing_share) & (angle > FOR_OTHERS.angle)
+    usable = (part >= settings.agreeing_share) & (angle > RESECTION_DEMANDS.angle)
     for k in [k for k in np.argsort(-worth) if usable[k]][: settings.max_seeds]:
         yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
 
