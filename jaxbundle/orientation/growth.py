@@ -71,7 +71,7 @@ class Model:
         """An image, or several, with their poses."""
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
-    def without(self, images: Bool[np.ndarray, " images"]) -> "Model":
+    def copy_without(self, images: Bool[np.ndarray, " images"]) -> "Model":
         """A copy without these images, and with only the control points."""
         X = np.where(self.control[:, None], self.X, np.nan)
         return dataclasses.replace(
@@ -84,7 +84,7 @@ class Model:
         )
 
     def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
-        """The same model in the frame X' = A·X + t, A a rotation times a scale."""
+        """The model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))
         return dataclasses.replace(self, X0=self.X0 @ A.T + t, M=self.M @ R.T, X=self.X @ A.T + t)
 

@@ -218,7 +218,7 @@ def _place_doubtful_again(
     doubtful = placed & ~_have_poses(network) & (share < limit)
     if not doubtful.any() or (placed & ~doubtful).sum() < 2:
         return model
-    other = model.without(doubtful)
+    other = model.copy_without(doubtful)
     grow(seen, other, improve=improve, settings=settings)
     finish(seen, other, settings)
     lost = placed & ~other.placed & ~doubtful

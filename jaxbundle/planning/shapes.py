@@ -49,7 +49,9 @@ class HeightField:
         if not (west < east and south < north):
             raise InputError(f"extent {self.extent} is empty; expected: Xmin, Ymin, Xmax, Ymax")
         if self.bounds is None or self.steepest is None:
-            # SAMPLES_REASON
+            # Half and double change no ray. Of hills of eleven waves across, 64 samples a side
+            # underestimate the steepest slope by 13 %, 256 by 1.5 %; 1.3 covers up to about fifty
+            # waves.
             samples, allowance = 256, 1.3
             x, y = np.linspace(west, east, samples), np.linspace(south, north, samples)
             Z = self.height(*np.meshgrid(x, y))
@@ -142,7 +144,8 @@ class HeightField:
         near, spread = np.broadcast_to(near, len(d)), np.broadcast_to(spread, len(d))
         leave = leave + relief
         ends = (reach + spread, near, spread, leave)
-        # NEAR_REASON
+        # Then by secants, which need a start near the surface. Half, double and a tenth of 1e-3 of
+        # the relief change 0.03 % of the rays, those that graze summits, and no time.
         t = self._march(o, d, t, np.flatnonzero(usable), ends, 1e-3 * relief)
         if not last:
             return t
@@ -191,7 +194,7 @@ class HeightField:
         f = self._above(o, d, here)
         with np.errstate(invalid="ignore", divide="ignore"):
             step = np.where(f == 0, 0.0, f / (np.abs(d[:, 2]) + 1e-12))
-            # SECANTS_REASON
+            # With 3 of them 0.2 % of the rays do not settle, with 6 or 24 fewer than 0.01 % differ.
             for _ in range(12):
                 other = here + step
                 g = self._above(o, d, other)
