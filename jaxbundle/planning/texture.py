@@ -60,8 +60,8 @@ class Texture:
     ) -> Float[np.ndarray, " n"]:
         """Grey values of patches of the given widths at surface coordinates, object unit."""
         out = np.empty(len(s))
-        # Batches of 2¹² to 2¹⁷ samples, whose arrays stay in the cache, take the same time; a million
-        # at once takes twice as long.
+        # Batches of 2¹² to 2¹⁷ samples, whose arrays stay in the cache, take the same time; a
+        # million at once takes twice as long.
         batch = 1 << 15
         for first in range(0, len(s), batch):
             part = slice(first, first + batch)
