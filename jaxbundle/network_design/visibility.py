@@ -11,7 +11,7 @@ so that thin walls also hide, and reduced by 4·s so that targets on its surface
 visible.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, project
 from jaxbundle.cameras.convert import image_area
 from jaxbundle.cameras.field_of_view import field_of_view_of_rays
+from jaxbundle.cameras.scalars import Parameters
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.tables import Camera
@@ -188,7 +189,8 @@ def _image(
     angle = jnp.arctan2(across, depth)
     inside = jnp.minimum(angle, view.angle)
     aside = jnp.sin(inside) / across
-    xy = project(view.model, interior, x * aside, y * aside, -jnp.cos(inside))
+    p = cast(Parameters, interior)  # an array unpacks like a tuple
+    xy = project(view.model, p, x * aside, y * aside, -jnp.cos(inside))
     return jnp.stack(xy), angle
 
 

@@ -44,7 +44,7 @@ def name_contradiction(
         alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
     else:
         images = network.images
-        there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+        there = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
         if there.any():
             alone.place(there, images.position[there], many.matrices(images.angles[there]))
     intersect(seen, alone, START_VALUE_DEMANDS)

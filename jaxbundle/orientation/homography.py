@@ -130,7 +130,7 @@ def _similarity(scale: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Arra
     return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, one]])
 
 
-def _products(H: Float[Array, "3 3"], i: int, j: int) -> Float[Array, "6"]:
+def _products(H: Float[AnyArray, "3 3"], i: int, j: int) -> Float[Array, "6"]:
     """hᵢᵀ·B·hⱼ as the coefficients of (B11, B12, B22, B13, B23, B33)."""
     a, b = H[:, i], H[:, j]
     return jnp.stack(

@@ -27,7 +27,7 @@ def null_vector(
     A: Float[AnyArray, "rows n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
-    _, s, Vt = _right_singular(stop_gradient(A))
+    s, Vt = _right_singular(stop_gradient(A))
     root = (Vt[-1], s[-1] ** 2)
     # The derivatives of an SVD divide by singular values, of which the last is zero for exact data;
     # those of the root need only that it is a single one.
@@ -36,14 +36,14 @@ def null_vector(
 
 def _null_equations(
     root: tuple[Float[Array, " n"], Float[Array, ""]], _: None, A: Float[AnyArray, "rows n"]
-) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+) -> tuple[Float[AnyArray, " n"], Float[Array, ""]]:
     h, eigenvalue = root
     return A.T @ (A @ h) - eigenvalue * h, 0.5 * (h @ h - 1)
 
 
 def null_space(A: Float[AnyArray, "rows n"], k: int) -> Float[Array, "k n"]:
     """The k right singular vectors of the least singular values, without derivative."""
-    return _right_singular(stop_gradient(A))[2][-k:]
+    return _right_singular(stop_gradient(A))[1][-k:]
 
 
 def normalisation(
@@ -60,7 +60,7 @@ def extent(points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]) -> Fl
     """Extents along the principal axes relative to the largest: (1, 0, 0) of points on a line."""
     mean, _ = normalisation(points, weights)
     rows = stop_gradient(jnp.sqrt(weights)[:, None] * (points - mean))
-    s = _right_singular(rows)[1]
+    s, _ = _right_singular(rows)
     return s / jnp.where(s[0] > 0, s[0], 1)
 
 
@@ -79,7 +79,8 @@ def ones_unless(weights: Float[AnyArray, " n"] | None, points: AnyArray) -> Floa
 
 def _right_singular(
     A: Float[AnyArray, "rows n"],
-) -> tuple[Float[Array, "_ n"], Float[Array, " n"], Float[Array, "n n"]]:
-    """SVD with all right singular vectors: empty rows are added to a flat matrix."""
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Singular values and all right singular vectors: empty rows are added to a flat matrix."""
     missing = max(A.shape[1] - A.shape[0], 0)
-    return jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)
+    _, s, Vt = jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)
+    return s, Vt

@@ -59,7 +59,7 @@ def resect(
     """X0, M of images, and the part of their points that agree within `tolerance` (c = 1); 0: no
     pose."""
     rows = [spread(len(a)) for a in xy]
-    return run_in_lanes(
+    X0, M, part = run_in_lanes(
         _resect,
         LANES,
         _gather_slots(xy, rows),
@@ -67,6 +67,7 @@ def resect(
         _weights(rows),
         tolerance,
     )
+    return X0, M, part
 
 
 def refine(
@@ -77,7 +78,7 @@ def refine(
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
     """X0, M of images improved from start values by points of weight > 0."""
     rows = [spread(len(a)) for a in xy]
-    return run_in_lanes(
+    X0, M = run_in_lanes(
         _refine,
         LANES,
         *poses,
@@ -85,6 +86,7 @@ def refine(
         _gather_slots(X, rows),
         _gather_slots(weights, rows),
     )
+    return X0, M
 
 
 def orient_pairs(
@@ -98,7 +100,7 @@ def orient_pairs(
     """M, b of pairs of images, the part of the points that agree within `tolerance`, and the
     median angle of intersection (radians)."""
     rows = [spread(len(a)) for a in xy1]
-    return run_in_lanes(
+    M, b, part, angle = run_in_lanes(
         _orient_pair,
         LANES,
         _gather_slots(xy1, rows),
@@ -106,6 +108,7 @@ def orient_pairs(
         _weights(rows),
         tolerance,
     )
+    return M, b, part, angle
 
 
 def intersect(
@@ -114,7 +117,8 @@ def intersect(
     weights: Float[np.ndarray, "n rays"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """X, angle of intersection and status of points with up to `RAYS` rays, [n, RAYS, …]."""
-    return run_in_lanes(_intersect, POINT_LANES, X0, rays, weights)
+    X, angle, status = run_in_lanes(_intersect, POINT_LANES, X0, rays, weights)
+    return X, angle, status
 
 
 def similarity(
@@ -188,7 +192,7 @@ def _resect(
     X: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
     tolerance: Float[Array, ""],
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     # One key for all: equal data give equal start values, whatever else is in the network.
     key = jax.random.key(0)
     found, good = robust_resection(key, xy, X, weights, threshold=tolerance)
@@ -218,7 +222,7 @@ def _orient_pair(
     xy2: Float[Array, "slots 2"],
     weights: Float[Array, " slots"],
     tolerance: Float[Array, ""],
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     key = jax.random.key(0)
     found, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
     ray = lambda xy: jnp.append(xy, -1.0) / jnp.sqrt(1 + xy @ xy)
@@ -234,7 +238,7 @@ def _orient_pair(
 @jax.vmap
 def _intersect(
     X0: Float[Array, "rays 3"], rays: Float[Array, "rays 3"], weights: Float[Array, " rays"]
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     found = intersection(X0, rays, weights)
     return found.X, found.angle, found.status
 
@@ -245,7 +249,7 @@ def _similarity(
     source: Float[Array, "slots 3"],
     target: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     found = absolute_orientation(source, target, weights)
     return (*_as_matrix(found.tau), found.status)
 
@@ -259,7 +263,7 @@ def _similarity_by_rays(
     weights: Float[Array, " slots"],
     A: Float[Array, "3 3"],
     t: Float[Array, "3"],
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     scale = jnp.cbrt(jnp.linalg.det(A))
     omega = rotation_vector_from_matrix(A / scale)
     start = jnp.concatenate([t, omega, jnp.log(scale)[None]])
@@ -277,7 +281,7 @@ def _similarity_by_rays(
     return (*_as_matrix(tau), jnp.linalg.norm(off, axis=1))
 
 
-def _as_matrix(tau: Float[Array, "7"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+def _as_matrix(tau: Float[AnyArray, "7"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     """A = exp(s)·R and t."""
     t = transform_point(tau, jnp.zeros(3))
     return jax.vmap(transform_point, (None, 0), 1)(tau, jnp.eye(3)) - t[:, None], t
@@ -316,7 +320,7 @@ def _weights(rows: Sequence[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "items 
 
 
 def run_in_lanes(
-    program: Callable[..., tuple[Array, ...]], lanes: int, *arrays: Float[AnyArray, "items *_"]
+    program: Callable[..., tuple[AnyArray, ...]], lanes: int, *arrays: Float[AnyArray, "items *_"]
 ) -> tuple[np.ndarray, ...]:
     """The program applied to items, `lanes` at a time; missing ones repeat the last."""
     number = len(arrays[0])

@@ -175,7 +175,7 @@ def _refine_best(
     return jax.tree.map(lambda a: a[k], refined), scores[k]
 
 
-def _after(done: Float[Array, "..."], arrays: PyTree) -> PyTree:
+def _after(done: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
     """The arrays, which wait for `done`: adds zero. Decompositions that run side by side can hang
     jaxlib 0.10 on two cores; a barrier does not order them."""
     nothing = jnp.where(jnp.sum(done) > 1e300, 1.0, 0.0)
@@ -187,7 +187,7 @@ def _misclosures(
     xy1: Float[AnyArray, "n 2"],
     xy2: Float[AnyArray, "n 2"],
     sqrt_weight: Float[AnyArray, " n"],
-) -> Float[Array, " n"]:
+) -> Float[AnyArray, " n"]:
     M, b = pair
     return sqrt_weight * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
@@ -235,7 +235,7 @@ def _find_simpler(
     H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 
-    def variance_of(computed: Float[Array, "n 2"], unknowns: int) -> Float[Array, ""]:
+    def variance_of(computed: Float[AnyArray, "n 2"], unknowns: int) -> Float[Array, ""]:
         """The differences contain the errors of both images: twice the variance."""
         redundancy = 2 * n - unknowns
         spread = jnp.sum(p[:, None] * (computed - xy2) ** 2)

@@ -108,10 +108,10 @@ def _misclosures(
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],
     sqrt_weight: Float[AnyArray, " n"],
-) -> Float[Array, " 2n"]:
+) -> Float[AnyArray, " 2n"]:
     computed = jax.vmap(image_of, (None, 0))(pose, X)
     return (sqrt_weight[:, None] * (computed - xy)).ravel()
 
 
-def _behind(pose: Pose, X: Float[AnyArray, "n 3"]) -> Bool[Array, " n"]:
+def _behind(pose: Pose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
     return jax.vmap(to_camera, (None, 0))(pose, X)[:, 2] >= 0

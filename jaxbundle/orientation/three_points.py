@@ -46,7 +46,7 @@ def three_points(
 
 
 def _distances(
-    cosines: Float[Array, "3 3"], sides: Float[Array, "3"]
+    cosines: Float[AnyArray, "3 3"], sides: Float[Array, "3"]
 ) -> tuple[Float[Array, "4 3"], Bool[Array, "4"]]:
     """s [4, 3] for squared sides of sum 1, and which of them solve the equations."""
     Q = jnp.stack([_law_of_cosines(i, j, cosines[i, j]) for i, j in SIDES])

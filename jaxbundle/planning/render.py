@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.arguments import at_least_zero, integer, numeric_array, vector
@@ -30,6 +29,7 @@ from jaxbundle.planning.shapes import Shape, Tangent
 from jaxbundle.planning.texture import Texture
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import Scalar
 
 NO_RAY = np.array([0.0, 0.0, 1.0])
 """Direction in place of a missing ray; what it meets is discarded."""
@@ -190,7 +190,7 @@ def _rays(
     parameters: tuple[float, ...],
     x: Float[np.ndarray, " batch"],
     y: Float[np.ndarray, " batch"],
-) -> tuple[Array, Array, Array]:
+) -> tuple[Scalar, Scalar, Scalar]:
     return image_ray(model, parameters, x, y)
 
 
@@ -208,7 +208,7 @@ def _render_strip(
     along = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
     moved = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
     o, d = o[:-1, :-1], d[:-1, :-1]
-    ray = np.isfinite(d + along[0] + along[1]).all(-1)
+    ray = np.all(np.isfinite(d + along[0] + along[1]), axis=-1)
     t, surface = first_hits(scene, o, np.where(ray[..., None], d, NO_RAY))
     t, surface = np.where(ray, t, np.inf), np.where(ray, surface, -1)
     point = o + np.where(np.isfinite(t), t, np.nan)[..., None] * d

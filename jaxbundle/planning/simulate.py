@@ -45,6 +45,7 @@ from jaxbundle.network.tables import (
 )
 from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 RAYS_AT_ONCE = 2_000_000
 """Rays projected in one call, so that memory does not grow with stations × targets: some ten
@@ -291,12 +292,12 @@ def _camera_of_station(
                 "index of the camera of every station"
             )
         return np.arange(stations) % len(cameras)
-    given = numeric_array("camera_of_station", given, "indices of cameras")
-    if given.shape != (stations,) or not np.isin(given, np.arange(len(cameras))).all():
+    indices = numeric_array("camera_of_station", given, "indices of cameras")
+    if indices.shape != (stations,) or not np.isin(indices, np.arange(len(cameras))).all():
         raise InputError(
             f"camera_of_station must be {stations} indices below {len(cameras)}, one a station"
         )
-    return given.astype(np.int64)
+    return indices.astype(np.int64)
 
 
 def _roles(
@@ -348,10 +349,11 @@ def _disturbance(
     disturb: float | Sequence[float], rays: Float[np.ndarray, "rays 3"]
 ) -> Float[np.ndarray, "3"]:
     """σ of the start values of positions, angles and points."""
-    if numeric_array("disturb", disturb, "a fraction, or three σ").ndim == 0:
+    sigma = numeric_array("disturb", disturb, "a fraction, or three σ")
+    if sigma.ndim == 0:
         length = float(np.linalg.norm(rays, axis=1).mean())
-        disturb = (disturb * length, disturb, disturb * length)
-    return _not_negative(disturb, 3, "disturb")
+        sigma = sigma * np.array([length, 1.0, length])
+    return _not_negative(sigma, 3, "disturb")
 
 
 def _ends(
@@ -462,17 +464,17 @@ def _images_of(
     position: Float[np.ndarray, "i 3"],
     angles: Float[np.ndarray, "i 3"],
     targets: Float[np.ndarray, "P 3"],
-) -> tuple[Float[Array, "i P 2"], Bool[Array, "i P"]]:
+) -> tuple[Float[Array, "i P 2"], Bool[AnyArray, "i P"] | bool]:
     """Image coordinates [i, P, 2], and whether their rays lead back to the targets [i, P]."""
     matrices = jax.vmap(matrix_from_omega_phi_kappa)(angles)
 
     def image_of(
         M: Float[Array, "3 3"],
-        centre: Float[Array, "3"],
+        centre: Float[AnyArray, "3"],
         X: Float[Array, ""],
         Y: Float[Array, ""],
         Z: Float[Array, ""],
-    ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    ) -> tuple[Float[Array, "2"], Bool[AnyArray, ""] | bool]:
         X, Y, Z = X - centre[0], Y - centre[1], Z - centre[2]
         ray = tuple(M[k, 0] * X + M[k, 1] * Y + M[k, 2] * Z for k in range(3))
         x, y = project(model, p, *ray)

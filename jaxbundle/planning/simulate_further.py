@@ -70,7 +70,7 @@ def simulate_further(
 
 
 def _expose_moving(
-    truth: Network, rows: RollingShutter, values: Mapping[str, PyTree]
+    truth: Network, rows: RollingShutter, values: dict[str, PyTree]
 ) -> Float[np.ndarray, "rays 2"]:
     """The image points of the truth in the moving camera: an image point is exposed with
     its line, which depends on the image point."""
