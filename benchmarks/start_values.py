@@ -115,7 +115,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("settings", nargs="*")
-    chosen = parser.parse_args().settings or [f.name for f in dataclasses.fields(DEFAULTS)]
+    # Those of intermediate adjustments have no effect without `improve`.
+    unused = "first_improvement", "improvement_growth"
+    names = [f.name for f in dataclasses.fields(DEFAULTS) if f.name not in unused]
+    chosen = parser.parse_args().settings or names
     jaxbundle.enable_x64()
     title = f"{'images':>6} {'points':>6} {'lost':>6} {'kept':>6} {'error':>9} {'time':>9}"
     cases = networks(0.1)

@@ -152,7 +152,8 @@ def grow(
 
 def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
     """Repeat everything, images from all their points and points from all their rays."""
-    # FINISH_REASON
+    # Twice: the second time images are refined by points that already come from refined images.
+    # More passes would approach what the adjustment computes anyway.
     for _ in range(2):
         intersect(sights, model, START_VALUE_DEMANDS, again=True)
         _refine(sights, model, settings)
