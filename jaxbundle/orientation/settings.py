@@ -2,9 +2,8 @@
 
 "Half" and "double" below are measured by `benchmarks/start_values.py`: four networks of 57 images
 and 723 points without start values, the camera with a distortion it does not know, a tenth of the
-image points wrong. The defaults orient all images in 5.9 s, leave out 63 right image points and keep 38
-wrong ones; the largest error of a projection centre is 0.18 of their extent (in the strip, which
-bends by the distortion).
+image points wrong. The defaults orient all images, leave out 63 right image points and keep 38
+wrong ones; the largest error of a projection centre is 0.18 of their extent.
 """
 
 import dataclasses
@@ -18,8 +17,8 @@ class StartValueSettings:
     Images:
 
     - `min_points`: known points of an image for its resection, from 4: three have up to four
-      solutions, a fourth chooses. Half: 16 more right image points are left out; double: 20 % more
-      time.
+      solutions, a fourth chooses. Half: 16 more right image points are left out; double is as good
+      here.
     - `sufficient_points`: an image waits, while others have more, below this many known points,
       from `min_points`. Half and double are as good here.
     - `waiting_share`: or below this share (0 to 1) of the points of the image that has the most;
@@ -37,7 +36,7 @@ class StartValueSettings:
     - `min_common_points`: from 6: five have up to ten solutions, a sixth chooses. Half and double
       are as good here.
     - `max_pairs`: that are oriented relatively, in lanes of `many.LANES`. Half: 21 more right image
-      points are left out; double: no better, in one and a half times the time.
+      points are left out; double is no better.
     - `max_seeds`: of these, tried until one is sufficient. Half is as good here, double no better.
     - `good_angle`: an angle of intersection beyond which a wider one is no better. Half and double
       are as good here.
