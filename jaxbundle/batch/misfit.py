@@ -33,6 +33,9 @@ FAR_OUTSIDE = 1.0
 """Points farther outside the image, in image sizes, are not measurements."""
 SMALLEST_EXTENT = 0.05
 """If the image points span less of the image, they are probably no pixels."""
+OUTSIDE_OF_GOOD = 0.01
+"""If a larger fraction is outside although the camera fits, its image has another size: points
+found by correlation are never outside, and blunders are fewer."""
 LARGEST_OUTSIDE = 0.5
 """If a larger fraction of image points is outside the image, their axes are probably wrong."""
 
@@ -152,6 +155,14 @@ def remarks(
         middle = rows["interior"][:, columns]
         good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
     remark = [""] * len(batch)
+    outside = (batch.visible & _beyond(batch.xy, frame, model.axes == "down", 0)).sum((1, 2))
+    part = outside / np.maximum(batch.visible.sum((1, 2)), 1)
+    for camera in np.flatnonzero(good & (part > OUTSIDE_OF_GOOD)):
+        remark[camera] = (
+            f"{100 * part[camera]:.0f} % of the image points are outside the image of "
+            f"{frame[0]:g} × {frame[1]:g} pixels: is image_size right (width, height), or are x "
+            "and y exchanged?"
+        )
     beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))
     vague = rows["undetermined"].any(1)
     for camera in np.flatnonzero(~good & batch.finite):

@@ -119,10 +119,20 @@ def name_image_extent(network: Network) -> str:
     for c, given in enumerate(network.cameras):
         xy = network.observations.xy[camera == c]
         centre, half = image_frame(given)
-        if not len(xy) or not np.isfinite(half).all():
+        if not len(xy):
             continue
         unit = get_model(given.model).unit
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
+        if not np.isfinite(half).all():
+            # Six points are in one quadrant of an image by chance once in 4⁵ = 1000 times.
+            if unit == "mm" and len(xy) >= 6 and ((low > 0).all() or (high < 0).all()):
+                return (
+                    f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, "
+                    f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} mm, all on one side of the "
+                    "image centre: are they counted from a corner? Expected are "
+                    f"{EXPECTED_CONVENTION[unit]}"
+                )
+            continue
         said = (
             f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, {low[1]:.4g} to "
             f"{high[0]:.4g}, {high[1]:.4g} {unit}, where the image is from "
