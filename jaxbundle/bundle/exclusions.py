@@ -30,7 +30,7 @@ from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.determined import have_one_line, see_a_line
 from jaxbundle.orientation.growth import (
-    FOR_ITSELF,
+    START_VALUE_DEMANDS,
     Demands,
     Model,
     are_held,
@@ -45,7 +45,7 @@ from jaxbundle.orientation.network import (
 )
 from jaxbundle.orientation.sights import Sights, sights
 
-COMES_BACK = Demands(FOR_ITSELF.angle, 1.0)
+COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
 """On points and image points that come back: adjusted images are better than start values, which
 may miss by three times as much; blunders should not come back with the others."""
 LARGEST_SIGMA = 0.01
@@ -227,8 +227,8 @@ def take_back(
     lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
     seen = sights(given.replace(cameras=lens))
     model = _adjusted_model(problem, values, given, seen)
-    model.held = are_held(given.points)
-    new = model.held & ~model.known
+    model.control = are_held(given.points)
+    new = model.control & ~model.known
     model.X[new], model.known[new] = given.points.position[new], True
     before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
     straight = see_a_line(seen, model, factor) & ~model.placed

@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.sightings import count_controlled_axes
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.conventions import EXPECTED, image_frame
+from jaxbundle.orientation.conventions import EXPECTED_CONVENTION, image_frame
 from jaxbundle.orientation.network import lacks_start_values
 
 MUCH_BETTER = 5.0
@@ -57,7 +57,7 @@ def name_mirrored(
     axes = "v (or u)" if unit == "px" else "y (or x)"
     return (
         f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
-        f"{REMEDY} or {axes} of the image coordinates (expected: {EXPECTED[unit]})"
+        f"{REMEDY} or {axes} of the image coordinates (expected: {EXPECTED_CONVENTION[unit]})"
     )
 
 

@@ -89,7 +89,7 @@ def _part(network: Network, model: Model, use, rows) -> Network:
     images, points = network.images, network.points
     angles = np.full((len(images), 3), np.nan)
     angles[model.placed] = many.angles(model.M[model.placed])
-    held = model.held & use
+    held = model.control & use
     roles = tuple("fixed" if h else "tie" for h in held)
     cameras = tuple(dataclasses.replace(c, free=(), sigma={}) for c in network.cameras)
     part = network.replace(

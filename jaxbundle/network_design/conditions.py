@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, show
 from jaxbundle.display import print_in_one_screen
@@ -50,7 +51,8 @@ class Conditions:
     obstacles: tuple[Box, ...] = ()
     targets: Box | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
+        # Frozen: what is given is normalised once here, so that all else reads tuples of floats.
         put = lambda name, value: object.__setattr__(self, name, value)
         for name in ("room", "targets"):
             if getattr(self, name) is not None:
@@ -85,7 +87,7 @@ class Conditions:
         return np.broadcast_to(normals, (points, 3))
 
 
-def box(name: str, given) -> Box:
+def box(name: str, given: ArrayLike) -> Box:
     """Lowest and highest corner of a box.
 
     **Raises:** `InputError`."""
@@ -101,7 +103,7 @@ def box(name: str, given) -> Box:
     return tuple(low), tuple(high)
 
 
-def interval(name: str, given) -> tuple[float, float]:
+def interval(name: str, given: ArrayLike) -> tuple[float, float]:
     """A smallest and a largest length; the largest may be infinite.
 
     **Raises:** `InputError`."""
@@ -114,7 +116,7 @@ def interval(name: str, given) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def unit_vectors(given) -> np.ndarray:
+def unit_vectors(given: ArrayLike) -> Float[np.ndarray, "*points 3"]:
     """Directions of length 1.
 
     **Raises:** `InputError`."""

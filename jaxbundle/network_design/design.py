@@ -13,6 +13,7 @@ densification of an existing network.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import integer, one_of, positive, show
 from jaxbundle.choices import DESIGNED, ORDERS
@@ -32,23 +33,17 @@ from jaxbundle.network_design.feasible import (
     targets_of,
     try_stations,
 )
-from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs, make_pairs
+from jaxbundle.network_design.pairs import MIN_TARGETS, StationTargetPairs, make_pairs
 from jaxbundle.network_design.priors import use_prior_tables
 from jaxbundle.network_design.realise import problem_of, realise
-from jaxbundle.network_design.result import Design, State
+from jaxbundle.network_design.result import Design, DesignState
 from jaxbundle.network_design.search import Step, configuration, make_program, satisfies, search
-from jaxbundle.network_design.variables import Start, bounds, choose_variables
+from jaxbundle.network_design.settings import DEFAULTS, DesignSettings
+from jaxbundle.network_design.variables import Configuration, Variables, bounds, choose_variables
 from jaxbundle.network_design.weights import select
 
-ROLLED = 0.1
-"""Random initial roll, radians, since zero roll is often a saddle point."""
-CANDIDATES, REFINED = 48, 2
-"""Number of positions tried for a further photograph, and of the best ones refined."""
-ROUGH_SOFTNESS = 0.1
-"""Softness of the conditions in this comparison."""
 
-
-def design(
+def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
     network: Network,
     aim: str | Aim = "mean",
     *,
@@ -61,6 +56,7 @@ def design(
     starts: int = 1,
     max_iterations: int = 60,
     seed: int = 0,
+    settings: DesignSettings = DEFAULTS,
 ) -> Design:
     """Design a network: minimise an aim under conditions.
 
@@ -77,7 +73,7 @@ def design(
     - `sigma_image`: σ of future image coordinates, in the unit of the camera models; default: the
       median of the network.
     - `starts`: number of searches of first order, all but one from random stations in the room.
-    - `max_iterations`: per round of the search; `seed`: random seed.
+    - `max_iterations`: per round of the search; `seed`: random seed; `settings`: of the search.
 
     **Returns:** a `Design`. Both of its states are without softness of the visibility.
 
@@ -90,27 +86,41 @@ def design(
     if conditions is not None and not isinstance(conditions, Conditions):
         raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
+    # Check points have no part in an adjustment, and so none in its σ.
     network = use_prior_tables(split_check_points(require_network(network))[0])
     sigma = _sigma(network, sigma_image)
     integer("starts", starts)
     if order == "zero":
         return _design_datum(network, aim, conditions, sigma, seed)
     if order == "second":
-        return _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed)
+        return _design_weights(
+            network, aim, conditions, sigma, photographs, max_iterations, seed, settings
+        )
     if order == "third":
         more = 1 if photographs is None else integer("photographs", photographs)
-        return _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed)
+        return _add_photographs(
+            network, aim, conditions, sigma, more, max_iterations, seed, settings
+        )
     if photographs is not None:
         raise InputError('photographs: their number is designed by order "second" or "third"')
+    pairs = make_pairs(network, aim, conditions, sigma)
     return _design_configuration(
-        network, aim, conditions, sigma, tuple(free), stations, starts, max_iterations, seed
+        pairs, network, tuple(free), stations, starts, max_iterations, seed, settings
     )
 
 
 def _design_configuration(
-    network, aim, conditions, sigma, free, stations, starts, max_iterations, seed
+    pairs: StationTargetPairs,
+    network: Network,
+    free: tuple[str, ...],
+    stations: Sequence[str] | None,
+    starts: int,
+    max_iterations: int,
+    seed: int,
+    settings: DesignSettings,
 ) -> Design:
-    pairs = make_pairs(network, aim, conditions, sigma)
+    """First order: the best of several searches."""
+    conditions, origin = pairs.conditions, pairs.problem.origin
     check_feasible(pairs)
     moving = _rows_of(stations, pairs.problem.network.images.id)
     tie = np.flatnonzero(pairs.problem.network.points.has_role("tie"))
@@ -124,12 +134,13 @@ def _design_configuration(
     best, path, converged = None, [], True
     for attempt in range(starts):
         begin = _roll(
-            start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
+            start if attempt == 0 else _place_at_random(pairs, start, moving, seed + attempt),
             variables,
             seed + attempt,
+            settings.initial_roll,
         )
-        end, steps, done = search(pairs, variables, begin, program, ends, max_iterations)
-        if not satisfies(conditions, variables, pairs.problem.origin, end):
+        end, steps, done = search(pairs, variables, begin, program, ends, max_iterations, settings)
+        if not satisfies(conditions, variables, origin, end, settings.edge_sharpness):
             continue
         after = _state(pairs, network, end.values, seed)
         if best is None or _better(after, best):
@@ -139,19 +150,35 @@ def _design_configuration(
             "design: the stations cannot satisfy their conditions (apart, obstacles); "
             "give a larger room, or more starts"
         )
-    best = before if _better(before, best) and _keeps(conditions, pairs, variables, start) else best
+    # The result is never worse than the start, if that satisfies the conditions of stations.
+    low, high = boxes[0]
+    inside = bool(((start.values.position >= low) & (start.values.position <= high)).all())
+    if _better(before, best) and inside:
+        allowed = satisfies(conditions, variables, origin, start, settings.edge_sharpness)
+        best = before if allowed else best
     _require_determined(best)
-    return Design("first", aim, conditions, before, best, tuple(path), converged)
+    return Design("first", pairs.aim, conditions, before, best, tuple(path), converged)
 
 
-def _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed) -> Design:
+def _design_weights(
+    network: Network,
+    aim: Aim,
+    conditions: Conditions,
+    sigma: float,
+    photographs: int | None,
+    max_iterations: int,
+    seed: int,
+    settings: DesignSettings,
+) -> Design:
+    """Second order: the best of the given photographs."""
     if photographs is None:
         raise InputError('photographs: order "second" needs the number of candidates to select')
     candidates = network.images.id
     pairs = make_pairs(network, aim, conditions, sigma)
     values = start_at(pairs).values
+    # Candidates with too few visible targets are undetermined at any weight: they go first.
     rays = np.bincount(pairs.problem.image[pairs.measured(values)], minlength=len(network.images))
-    seeing = rays >= FEWEST_TARGETS
+    seeing = rays >= MIN_TARGETS
     if seeing.any() and not seeing.all():
         network = keep_images(network, seeing)
         pairs = make_pairs(network, aim, conditions, sigma)
@@ -163,7 +190,7 @@ def _design_weights(network, aim, conditions, sigma, photographs, max_iterations
             "them; give further candidates, or leave these targets out"
         )
     before = _state(pairs, network, values, seed)
-    found = select(pairs, integer("photographs", photographs), max_iterations)
+    found = select(pairs, integer("photographs", photographs), max_iterations, settings)
     ids = network.images.id
     taken = pairs.measured(values) & found.chosen[pairs.problem.image]
     after = _state(pairs, network, values, seed, taken)
@@ -183,7 +210,19 @@ def _design_weights(network, aim, conditions, sigma, photographs, max_iterations
     )
 
 
-def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed) -> Design:
+def _add_photographs(
+    network: Network,
+    aim: Aim,
+    conditions: Conditions,
+    sigma: float,
+    more: int,
+    max_iterations: int,
+    seed: int,
+    settings: DesignSettings,
+) -> Design:
+    """Third order: further photographs, one after the other."""
+    # Greedily: each is a search in six variables. Together they would be one in 6·n, with as many
+    # more local minima as there are ways to distribute photographs over good places.
     states, path, added, tried, converged = [], [], [], [], True
     for k in range(more):
         measured = bool(len(network.observations))
@@ -191,7 +230,7 @@ def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed
         new = np.arange(len(network.images)) == len(network.images) - 1
         pairs = make_pairs(network, aim, conditions, sigma, new if measured else None)
         check_feasible(pairs)
-        start, steps, done, places = _best_place(pairs, new, max_iterations, seed + k)
+        start, steps, done, places = _best_place(pairs, new, max_iterations, seed + k, settings)
         path += steps
         converged = converged and done
         added.append(id)
@@ -215,31 +254,49 @@ def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed
     )
 
 
-def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
+def _best_place(
+    pairs: StationTargetPairs,
+    new: Bool[np.ndarray, " images"],
+    max_iterations: int,
+    seed: int,
+    settings: DesignSettings,
+) -> tuple[
+    Configuration,
+    list[Step],
+    bool,
+    tuple[Float[np.ndarray, "tried 3"], Float[np.ndarray, " tried"]],
+]:
     """Compare random positions and refine the best."""
-    moving = np.flatnonzero(new)
+    moving, origin = np.flatnonzero(new), pairs.problem.origin
     start = start_at(pairs)
     variables = choose_variables(start.values, DESIGNED[:3], moving, np.zeros(0, int))
     program = make_program(pairs, configuration(pairs, variables))
-    position, rotation, target = try_stations(pairs, CANDIDATES, seed)
-    begins = [_place(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
-    aims = np.array([program(variables.vector(s), s, ROUGH_SOFTNESS)[0] for s in begins])
+    position, rotation, target = try_stations(pairs, settings.candidates, seed)
+    begins = [_place(start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
+    softness = settings.candidate_softness
+    aims = np.array([program(variables.vector(s), s, softness)[0] for s in begins])
     boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
     ends = lambda start: bounds(variables, start, *boxes)
+    # Only the best few: the aim has a local minimum in every region from which other targets are
+    # seen, which a search from one of them does not leave.
     best = None
-    for k in np.argsort(aims)[:REFINED]:
-        end, steps, done = search(pairs, variables, begins[k], program, ends, max_iterations)
-        value = program(variables.vector(end), end, 0.03)[0]
-        if satisfies(pairs.conditions, variables, pairs.problem.origin, end) and (
+    for k in np.argsort(aims)[: settings.refined]:
+        end, steps, done = search(
+            pairs, variables, begins[k], program, ends, max_iterations, settings
+        )
+        value = program(variables.vector(end), end, settings.softness[-1])[0]
+        if satisfies(pairs.conditions, variables, origin, end, settings.edge_sharpness) and (
             best is None or value < best[0]
         ):
             best = value, end, steps, done
     if best is None:
         raise NotSolvedError("design: no place for a further photograph satisfies the conditions")
-    return *best[1:], (position + pairs.problem.origin, np.exp(aims))
+    return *best[1:], (position + origin, np.exp(aims))
 
 
-def _design_datum(network, aim, conditions, sigma, seed) -> Design:
+def _design_datum(
+    network: Network, aim: Aim, conditions: Conditions, sigma: float, seed: int
+) -> Design:
     """Inner constraints on all object points, the datum of the smallest mean σ of them (Meissl
     1969), compared with the datum of the network."""
     if aim.measure == "reliability" or aim.of != "points":
@@ -257,12 +314,22 @@ def _design_datum(network, aim, conditions, sigma, seed) -> Design:
     given = {"datum": network.datum, "datum_points": network.datum_points}
     noisy, exact = after.network.replace(**given), after.exact.replace(**given)
     problem = problem_of(exact)
-    before = State(noisy, exact, np.nan if problem is None else aim_of(problem, aim), after.lost)
+    before = DesignState(
+        noisy, exact, np.nan if problem is None else aim_of(problem, aim), after.lost
+    )
     return Design("zero", aim, conditions, before, after)
 
 
-def _state(pairs: Pairs, network: Network, values: Values, seed: int, measured=None) -> State:
+def _state(
+    pairs: StationTargetPairs,
+    network: Network,
+    values: Values,
+    seed: int,
+    measured: Bool[np.ndarray, " rays"] | None = None,
+) -> DesignState:
     """The visibility of targets at these values."""
+    # Soft visibility is for the search: states count what satisfies the conditions, as a
+    # photogrammetrist will.
     measured = pairs.measured(values) if measured is None else measured
     exact = realise(pairs, values, measured, None, network.residuals)
     lost, aim = lost_targets(pairs, measured), float("nan")
@@ -271,23 +338,16 @@ def _state(pairs: Pairs, network: Network, values: Values, seed: int, measured=N
     if not np.isfinite(aim) and (problem := problem_of(exact)) is not None:
         aim = aim_of(problem, pairs.aim)  # Of the remaining targets.
     noisy = realise(pairs, values, measured, seed, network.residuals)
-    return State(noisy, exact, aim, lost)
+    return DesignState(noisy, exact, aim, lost)
 
 
-def _better(a: State, b: State) -> bool:
+def _better(a: DesignState, b: DesignState) -> bool:
     """Fewer lost targets first, then the smaller aim."""
     value = lambda state: state.aim if np.isfinite(state.aim) else np.inf
     return (len(a.lost), value(a)) < (len(b.lost), value(b))
 
 
-def _keeps(conditions, pairs, variables, start) -> bool:
-    """Whether the start satisfies the conditions of stations."""
-    low, high = room_of(conditions, pairs)
-    inside = ((start.values.position >= low) & (start.values.position <= high)).all()
-    return bool(inside) and satisfies(conditions, variables, pairs.problem.origin, start)
-
-
-def _require_determined(state: State) -> None:
+def _require_determined(state: DesignState) -> None:
     if not np.isfinite(state.aim):
         raise NotSolvedError(
             "design: no network that determines the aim was found; give more stations, more "
@@ -295,26 +355,34 @@ def _require_determined(state: State) -> None:
         )
 
 
-def _roll(start: Start, variables, seed: int) -> Start:
+def _roll(start: Configuration, variables: Variables, seed: int, sigma: float) -> Configuration:
     """A small roll, so that the search leaves a symmetrical start."""
     x = variables.vector(start)
     if "roll" not in variables.sizes:
         return start
     random = np.random.default_rng(seed)
     part = variables.parts(np.arange(len(x)))["roll"].ravel()
-    x[part] = ROLLED * random.standard_normal(len(part))
-    return variables.placed(start, x)
+    x[part] = sigma * random.standard_normal(len(part))
+    return variables.compiled_place(start, x)
 
 
-def _elsewhere(pairs: Pairs, start: Start, moving, seed: int) -> Start:
+def _place_at_random(
+    pairs: StationTargetPairs, start: Configuration, moving: Int[np.ndarray, " moving"], seed: int
+) -> Configuration:
     """The moving stations at random in the room."""
     position, rotation, target = try_stations(pairs, len(moving), seed)
     for row, p, q, t in zip(moving, position, rotation, target):
-        start = _place(pairs, start, np.array([row]), p, q, t)
+        start = _place(start, np.array([row]), p, q, t)
     return start
 
 
-def _place(pairs: Pairs, start: Start, rows, position, rotation, target: int) -> Start:
+def _place(
+    start: Configuration,
+    rows: Int[np.ndarray, " rows"],
+    position: Float[np.ndarray, "3"],
+    rotation: Float[np.ndarray, "4"],
+    target: int,
+) -> Configuration:
     """Some stations at other positions."""
     values = start.values
     positions, rotations, look = (
@@ -322,7 +390,9 @@ def _place(pairs: Pairs, start: Start, rows, position, rotation, target: int) ->
     )
     positions[rows], rotations[rows] = position, rotation
     look[rows] = np.asarray(values.point)[target]
-    return Start(Values(values.camera, positions, rotations, values.point, values.other), look)
+    return Configuration(
+        Values(values.camera, positions, rotations, values.point, values.other), look
+    )
 
 
 def _with_another(network: Network) -> tuple[Network, str]:

@@ -1,17 +1,19 @@
 """The network of all pairs of stations and targets: the problem whose precision is designed.
 
-Kept image points (`kept`) are unchanged; every other pair of a station
-and a target is an observation with weight 1/σ times its visibility.
+Measured image points are unchanged; every other pair of a station and a target is an observation
+whose 1/σ is multiplied by its visibility, so that its weight p = 1/σ² is multiplied by the square.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property, partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.errors import InputError
@@ -32,7 +34,7 @@ from jaxbundle.network_design.aims import (
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.visibility import (
     Rules,
-    View,
+    UsableFormat,
     image_of,
     margins,
     rules_of,
@@ -42,29 +44,30 @@ from jaxbundle.network_design.visibility import (
 )
 from jaxbundle.types import AnyArray
 
-FEWEST_RAYS = 2
-"""Minimum rays of a determined target."""
-FEWEST_TARGETS = 3
-"""Minimum rays of an included photograph."""
-IDLE = 3e-4
-"""The factor of the weights 1/σ of an excluded photograph: 1e-7 of its information."""
+MIN_RAYS = 2
+"""Of a determined target: four coordinates for three unknowns."""
+MIN_TARGETS = 3
+"""Of an included photograph: six coordinates for six unknowns."""
+IDLE_VISIBILITY = 3e-4
+"""Of the rays of an excluded photograph, the factor of 1/σ: 1e-7 of its information, which no aim
+shows, and far above rounding (1e-16), so that its orientation stays determined."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Pairs:
+class StationTargetPairs:
     """A problem of all pairs, its aim and its conditions.
 
-    `kept`: the weights of rays independent of the design, 1 for measured and 0 for missing
-    ones; NaN for all others. `views`: the image of every camera;
-    `rules`: the conditions of rays; `normals`: of all points; `interest`: the points of the aim.
+    `given_visibility`: of rays independent of the design, 1 for measured and 0 for missing ones;
+    NaN for all others. `views`: the image of every camera; `rules`: the conditions of rays;
+    `normals`: of all points; `interest`: the points of the aim.
     """
 
     problem: Problem
     aim: Aim
     task: Task
     conditions: Conditions
-    kept: Float[np.ndarray, " rays"]
-    views: tuple[View, ...]
+    given_visibility: Float[np.ndarray, " rays"]
+    views: tuple[UsableFormat, ...]
     rules: Rules
     normals: Float[np.ndarray, "points 3"] | None
     interest: Bool[np.ndarray, " points"]
@@ -72,13 +75,13 @@ class Pairs:
     @property
     def soft(self) -> Bool[np.ndarray, " rays"]:
         """Which rays depend on the design."""
-        return np.isnan(self.kept)
+        return np.isnan(self.given_visibility)
 
     def of_camera(self, c: int) -> Int[np.ndarray, " rows"]:
         """The rays of a camera."""
         return np.flatnonzero(self.problem.camera == c)
 
-    def each_ray(self, function, values: Values):
+    def each_ray(self, function: Callable[..., PyTree], values: Values) -> Any:
         """`function(view, position, rotation, interior, point, normal)` of every ray, stacked in
         their order."""
         image, point, found, order = self.problem.image, self.problem.point, [], []
@@ -88,13 +91,13 @@ class Pairs:
             normal = None if self.normals is None else jnp.asarray(self.normals)[point[rows]]
             axes = 0, 0, None, 0, None if normal is None else 0
             mapped = jax.vmap(partial(function, view), axes)
-            at = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
+            take = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
             found.append(
                 mapped(
-                    at(values.position, image),
-                    at(values.rotation, image),
+                    take(values.position, image),
+                    take(values.rotation, image),
                     interior,
-                    at(values.point, point),
+                    take(values.point, point),
                     normal,
                 )
             )
@@ -102,20 +105,24 @@ class Pairs:
         back = np.argsort(np.concatenate(order))
         return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *found)
 
-    def weights(self, values: Values, softness) -> Float[Array, " rays"]:
+    def visibilities(
+        self, values: Values, softness: float | Float[AnyArray, ""]
+    ) -> Float[Array, " rays"]:
         """The visibility of every ray, 0 to 1."""
-        one = lambda view, p, q, interior, X, n: visibility(
+        of_ray = lambda view, p, q, interior, X, n: visibility(
             margins(view, self.rules, p, q, interior, X, n, softness), softness
         )
-        return jnp.where(self.soft, self.each_ray(one, values), np.nan_to_num(self.kept))
+        of_others = np.nan_to_num(self.given_visibility)
+        return jnp.where(self.soft, self.each_ray(of_ray, values), of_others)
 
-    def data(self, values: Values, weight: Float[AnyArray, " rays"]) -> EngineData:
-        """The numbers of the design, padded to the sizes of the plan: weights are 1/σ times
-        `weight`, image coordinates those of the values."""
+    def data(self, values: Values, visibilities: Float[AnyArray, " rays"]) -> EngineData:
+        """The numbers of the design, padded to the sizes of the plan: 1/σ times the visibilities,
+        image coordinates those of the values."""
         xy, data = self.predict(values), self.problem.data
-        weight = jnp.asarray(data.image_weight) * jnp.asarray(weight)[:, None]
-        at = lambda d: (d.start, d.image_xy, d.image_weight)
-        data = eqx.tree_at(at, data, (values, xy, weight))
+        # The network's `image_weight` is 1/σ, the root of the weight.
+        sqrt_p = jnp.asarray(data.image_weight) * jnp.asarray(visibilities)[:, None]
+        fields = lambda d: (d.start, d.image_xy, d.image_weight)
+        data = eqx.tree_at(fields, data, (values, xy, sqrt_p))
         return fill_data(self.problem.system, self.problem.layout.data(data))
 
     def aim_at(self, measured: Bool[np.ndarray, " rays"], values: Values) -> float:
@@ -123,35 +130,33 @@ class Pairs:
         rays are excluded: their rays have a negligible weight, so that they stay determined."""
         image = self.problem.image
         rays = np.bincount(image[measured], minlength=len(self.problem.network.images))
-        weight = np.where(rays[image] < FEWEST_TARGETS, IDLE, np.asarray(measured, float))
-        data = self._fill(values, weight)
+        idle = rays[image] < MIN_TARGETS
+        visibilities = np.where(idle, IDLE_VISIBILITY, np.asarray(measured, float))
+        data = self._compiled_data(values, visibilities)
         return float(jnp.exp(log_aim(self.task, data)[0]))
 
     @cached_property
-    def _fill(self):
+    def _compiled_data(self) -> Callable[..., EngineData]:
         return jax.jit(self.data)
 
-    def seen(self, values: Values) -> dict[str, Bool[np.ndarray, " rays"]]:
-        """Which rays satisfy which conditions, without softness."""
-        return {k: np.asarray(v) for k, v in self._seen(values).items()}
-
     @cached_property
-    def _seen(self):
-        one = lambda view, p, q, interior, X, n: visible(
+    def _test_all(self) -> Callable[[Values], dict[str, Bool[Array, " rays"]]]:
+        """Which rays satisfy which conditions, without softness."""
+        test_ray = lambda view, p, q, interior, X, n: visible(
             margins(view, self.rules, p, q, interior, X, n)
         )
-        return jax.jit(lambda values: self.each_ray(one, values))
+        return jax.jit(lambda values: self.each_ray(test_ray, values))
 
     @cached_property
-    def predict(self):
+    def predict(self) -> Callable[[Values], Float[Array, "rays 2"]]:
         """The image coordinates of all rays at given values, [rays, 2]."""
-        one = lambda view, p, q, interior, X, n: image_of(view, p, q, interior, X)
-        return jax.jit(lambda values: self.each_ray(one, values))
+        of_ray = lambda view, p, q, interior, X, _: image_of(view, p, q, interior, X)
+        return jax.jit(lambda values: self.each_ray(of_ray, values))
 
     def measured(self, values: Values) -> Bool[np.ndarray, " rays"]:
         """Which rays are measured: those that satisfy all conditions, and already measured ones."""
-        seen = np.logical_and.reduce(list(self.seen(values).values()))
-        return np.where(self.soft, seen, self.kept > 0)
+        seen = np.logical_and.reduce([np.asarray(v) for v in self._test_all(values).values()])
+        return np.where(self.soft, seen, self.given_visibility > 0)
 
 
 def make_pairs(
@@ -160,7 +165,7 @@ def make_pairs(
     conditions: Conditions,
     sigma: float,
     new: Bool[np.ndarray, " images"] | None = None,
-) -> Pairs:
+) -> StationTargetPairs:
     """The problem of all pairs of a network without check points.
 
     **Arguments:** `sigma`: of future image coordinates, in the unit of the cameras' models; `new`:
@@ -170,26 +175,28 @@ def make_pairs(
     **Raises:** `InputError` for a network that cannot be designed, or an aim that depends on the
     datum.
     """
+    # All pairs, so that visibility is a number that changes smoothly and the sizes of arrays, with
+    # them the compiled programs, do not depend on where stations are.
     _refuse(require_network(network))
     images, points, rays = network.images, network.points, network.observations
     shape = len(images), len(points)
     new = np.ones(len(images), bool) if new is None else new
-    kept, xy = np.zeros(shape), np.zeros((*shape, 2))
+    visibilities, xy = np.zeros(shape), np.zeros((*shape, 2))
     sigmas = np.full((*shape, 2), sigma)
-    kept[rays.image, rays.point], xy[rays.image, rays.point] = 1.0, rays.xy
+    visibilities[rays.image, rays.point], xy[rays.image, rays.point] = 1.0, rays.xy
     sigmas[rays.image, rays.point] = rays.sigma
-    kept[new], xy[new], sigmas[new] = np.nan, 0.0, sigma
+    visibilities[new], xy[new], sigmas[new] = np.nan, 0.0, sigma
     i, p = np.indices(shape).reshape(2, -1)
     observations = Observations(i, p, xy.reshape(-1, 2), sigmas.reshape(-1, 2), Source("pairs"))
     full = check_tables(network.replace(observations=observations, residuals="corrected"))
     problem = make_problem(full)
     refuse_arbitrary(aim, problem)
-    return Pairs(
+    return StationTargetPairs(
         problem,
         aim,
         task_of(problem, aim),
         conditions,
-        kept.ravel(),
+        visibilities.ravel(),
         views=tuple(view_of(c, conditions.edge) for c in problem.network.cameras),
         rules=rules_of(conditions, problem.origin),
         normals=conditions.of_points(len(points)),
@@ -214,7 +221,7 @@ def _refuse(network: Network) -> None:
                 f"{table.source(row)}: {table.id[row]!r} has no start values; a "
                 f"design starts from {words}"
             )
-    others = [one for one in network.further if not isinstance(one, CameraParameters)]
+    others = [rows for rows in network.further if not isinstance(rows, CameraParameters)]
     if others:
         raise InputError(
             f"{others[0].source.name}: a design uses image points, distances, control "

@@ -20,19 +20,21 @@ from jaxbundle.network.tables import Network
 def use_prior_tables(network: Network) -> Network:
     """The network with the priors of its tables `exterior_priors` and `camera_parameters` at its
     own values."""
-    kept = []
-    for one in network.further:
-        if isinstance(one, ExteriorPriors):
-            network = _of_images(network, one)
-        elif isinstance(one, CameraParameters):
-            kept.append(_at_own_values(network, one))
+    further = []
+    for rows in network.further:
+        if isinstance(rows, ExteriorPriors):
+            network = _move_to_images(network, rows)
+        elif isinstance(rows, CameraParameters):
+            further.append(_observe_present_values(network, rows))
         else:
-            kept.append(one)
-    return network.replace(further=tuple(kept))
+            further.append(rows)
+    return network.replace(further=tuple(further))
 
 
-def _of_images(network: Network, given: ExteriorPriors) -> Network:
+def _move_to_images(network: Network, given: ExteriorPriors) -> Network:
     """σ of orientations in the table of images; two of the same element are combined."""
+    # Independent observations of one element: their weights p = 1/σ² add. σ = 0 is fixed, and
+    # stays.
     sigma = network.images.sigma.copy()
     weight = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
     np.add.at(weight, rows_of(given.image, network.images), 1 / given.sigma**2)
@@ -41,7 +43,7 @@ def _of_images(network: Network, given: ExteriorPriors) -> Network:
     return network.replace(images=dataclasses.replace(network.images, sigma=sigma))
 
 
-def _at_own_values(network: Network, given: CameraParameters) -> CameraParameters:
+def _observe_present_values(network: Network, given: CameraParameters) -> CameraParameters:
     values = {
         camera.id: {**default_parameters(get_model(camera.model)), **camera.parameters}
         for camera in network.cameras

@@ -17,7 +17,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.arrays import Data
 from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, points_of_interest
 
 FIELDS = ("image", "control", "exterior", "interior", "distance")
@@ -67,45 +67,40 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     truth, exact = problem.data.start, problem.data
     functions = functions_of(problem, aim)
     interest = np.flatnonzero(points_of_interest(problem))
-    of = _points_of(interest) if functions is None else lambda values: functions(values)[None]
+    points = lambda values: np.asarray(values.point)[interest]
+    of = points if functions is None else lambda values: functions(values)[None]
     random = np.random.default_rng(seed)
+    # Adjusted, not propagated: the linear propagation is what is to be proved.
     found = []
     for _ in range(draws):
-        values = _adjust(problem, _measure(exact, random))
-        if values is not None:
+        data = problem.layout.data(_measure(exact, random))
+        minimum = find_minimum(with_data(problem.system, data))
+        if bool(converged(minimum.termination)):
+            values = problem.layout.values(minimum.values)
             found.append(np.asarray(of(values)) - np.asarray(of(truth)))
     if not found:
         raise NotSolvedError("design: none of the simulated networks could be adjusted")
     d = np.array(found)
+    # Redundancy numbers do not show in deviations: a reliability is proved by the mean σ of the
+    # same network.
     shape = aim if aim.measure != "reliability" else Aim("mean")
+    # About zero, not about their mean: a bias of the adjustment is a deviation too.
     blocks = np.einsum("nki,nkj->kij", d, d) / len(d)
     return Proof(aim_of(problem, shape), measure(shape, blocks), draws, draws - len(d))
 
 
-def _points_of(interest):
-    return lambda values: np.asarray(values.point)[interest]
-
-
 def _measure(exact: Data, random: np.random.Generator) -> Data:
     """Simulated data."""
+
+    def sigma_of(name: str) -> np.ndarray:
+        """0 of what is not measured. The network's `weight` is 1/σ, the root of the weight."""
+        sqrt_p = np.asarray(exact.weight(name))
+        return np.where(sqrt_p > 0, 1 / np.where(sqrt_p > 0, sqrt_p, 1.0), 0.0)
+
     noisy = {
         name: np.asarray(exact.measured(name))
-        + random.standard_normal(exact.measured(name).shape) * _sigma(exact.weight(name))
+        + random.standard_normal(exact.measured(name).shape) * sigma_of(name)
         for name in FIELDS
     }
     xy = noisy.pop("image")
     return dataclasses.replace(exact, image_xy=xy, **noisy)
-
-
-def _adjust(problem: Problem, data: Data) -> Values | None:
-    """The adjusted values, in the datum of the problem; None without solution."""
-    system = with_data(problem.system, problem.layout.data(data))
-    minimum = find_minimum(system)
-    if not bool(converged(minimum.termination)):
-        return None
-    return problem.layout.values(minimum.values)
-
-
-def _sigma(weight):
-    weight = np.asarray(weight)
-    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)

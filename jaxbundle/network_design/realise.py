@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.errors import InputError, NotSolvedError
@@ -12,14 +12,14 @@ from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matr
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
-from jaxbundle.network.tables import Network, Source
-from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs
+from jaxbundle.network.tables import Distances, Network, Source
+from jaxbundle.network_design.pairs import MIN_TARGETS, StationTargetPairs
 
 _angles = jax.jit(jax.vmap(lambda q: omega_phi_kappa_from_matrix(matrix_from_quaternion(q))))
 
 
 def realise(
-    pairs: Pairs,
+    pairs: StationTargetPairs,
     values: Values,
     measured: Bool[np.ndarray, " rays"],
     seed: int | None = 0,
@@ -54,15 +54,18 @@ def realise(
         distances=_distances(network, points.position, seed),
     )
     seen = np.bincount(rays.image[rows], minlength=len(images))
-    return keep_images(moved, seen >= FEWEST_TARGETS)
+    return keep_images(moved, seen >= MIN_TARGETS)
 
 
-def _distances(network: Network, points, seed: int | None):
+def _distances(
+    network: Network, points: Float[np.ndarray, "points 3"], seed: int | None
+) -> Distances:
     """Distances simulated after targets have moved."""
     given = network.distances
     ends = points[given.points], network.points.position[given.points]
     length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
-    moved = np.abs(length - before) > 1e-12 * before
+    moved = np.abs(length - before) > 1e-12 * before  # beyond rounding
+    # A stream of its own: the noise of image points does not depend on whether there are distances.
     noise = (
         np.zeros(len(given))
         if seed is None

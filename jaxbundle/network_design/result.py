@@ -1,6 +1,7 @@
 """A designed network: before and after, the gain, and the proof."""
 
 import dataclasses
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxbundle.types import present
 
 
 @dataclasses.dataclass(frozen=True)
-class State:
+class DesignState:
     """A network with its visible targets: `network` with simulated measurements, `exact` without
     noise; the `aim`, NaN if it is not determined; targets `lost`, with fewer than two rays."""
 
@@ -62,8 +63,8 @@ class Design:
     order: str
     aim: Aim
     conditions: Conditions
-    before: State
-    after: State
+    before: DesignState
+    after: DesignState
     path: tuple[Step, ...] = ()
     converged: bool = True
     bound: float | None = None
@@ -103,6 +104,8 @@ class Design:
         y down."""
         from jaxbundle.geometry import matrix_from_omega_phi_kappa
 
+        # From y up and z backwards, as in photogrammetry, to y down and z forwards, as in computer
+        # vision.
         images, flip = self.network.images, np.diag([1.0, -1.0, -1.0])
         found = np.tile(np.eye(4), (len(images), 1, 1))
         for pose, X0, angles in zip(found, images.position, images.angles):
@@ -111,7 +114,8 @@ class Design:
         return found
 
     def __str__(self) -> str:
-        unit = self._unit
+        points = self.aim.of == "points" and self.aim.measure != "reliability"
+        unit = f" [{self.after.network.object_unit}]" if points else ""
         lines = [f"Design of {ORDERS[self.order]}", f"aim: {self.aim}", ""]
         lines.append(f"{'':22}{'before':>14}{'after':>14}")
         rows = [
@@ -128,15 +132,10 @@ class Design:
         lines += ["", *self._remarks()]
         return "\n".join(lines)
 
-    @property
-    def _unit(self) -> str:
-        points = self.aim.of == "points" and self.aim.measure != "reliability"
-        return f" [{self.after.network.object_unit}]" if points else ""
-
-    def _remarks(self):
+    def _remarks(self) -> Iterator[str]:
         if np.isnan(self.before.aim):
             yield "gain: the start does not determine the aim"
-        elif self.gain > 1 + 1e-9:
+        elif self.gain > 1 + 1e-9:  # beyond rounding
             yield f"gain: the aim is {self.gain:.3g} times smaller"
         else:
             yield "gain: none; the start is as good as any found"

@@ -6,31 +6,28 @@ sharper in every round. Values that are not finite, by rounding or a singular de
 worst.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from jaxtyping import Float
+from jaxtyping import Array, Float, PyTree
 
+from jaxbundle.leastsquares.indexing.rows import Data as EngineData
 from jaxbundle.network.arrays import Values
 from jaxbundle.network_design.aims import log_aim
 from jaxbundle.network_design.conditions import Conditions
-from jaxbundle.network_design.pairs import Pairs
-from jaxbundle.network_design.variables import Start, Variables
+from jaxbundle.network_design.pairs import StationTargetPairs
+from jaxbundle.network_design.settings import DEFAULTS, DesignSettings
+from jaxbundle.network_design.variables import Configuration, Variables
 from jaxbundle.types import AnyArray
 
-ROUNDS = (0.3, 0.1, 0.03)
-"""Softness of the conditions."""
 UNDETERMINED_AIM = 1e3
-"""The logarithm of an undetermined aim."""
-SMALLEST_CHANGE = 1e-4
-"""A change of the logarithm of the aim that ends a round."""
-EDGE_ROUNDING = 20.0
-"""Edges of obstacles are rounded to 1/20 of their half size for projection centres."""
+"""The logarithm of an undetermined aim: beyond that of every number (e⁷⁰⁹), and finite, so that a
+line search steps back from it."""
 
 
 class Step(NamedTuple):
@@ -42,23 +39,27 @@ class Step(NamedTuple):
 
 
 def make_program(
-    pairs: Pairs, design: Callable[..., tuple[Values, AnyArray]]
+    pairs: StationTargetPairs, design: Callable[..., tuple[Values, AnyArray]]
 ) -> Callable[..., tuple[float, Float[np.ndarray, " variables"]]]:
     """`(x, *given) -> (log aim, gradient)`; `design(x, *given)` gives values and weights of rays.
 
     In three programs; the largest by far, that of the aim, is shared by all designs
     of one shape. An undetermined aim has the worst value, with zero gradient."""
 
-    def data(x, given):
+    def data(x: Float[Array, " variables"], given: tuple[PyTree, ...]) -> EngineData:
         return pairs.data(*design(x, *given))
 
     forward = eqx.filter_jit(data)
 
     @eqx.filter_jit
-    def back(x, given, slopes):
+    def back(
+        x: Float[Array, " variables"], given: tuple[PyTree, ...], slopes: EngineData
+    ) -> Float[Array, " variables"]:
         return jax.vjp(lambda x: data(x, given), x)[1](slopes)[0]
 
-    def program(x, *given):
+    def program(
+        x: Float[AnyArray, " variables"], *given: PyTree
+    ) -> tuple[float, Float[np.ndarray, " variables"]]:
         # A Python number as softness would cause a new compilation.
         x, given = jnp.asarray(x), jax.tree.map(jnp.asarray, given)
         value, slopes = log_aim(pairs.task, forward(x, given))
@@ -70,18 +71,23 @@ def make_program(
     return program
 
 
-def configuration(pairs: Pairs, variables: Variables) -> Callable:
+def configuration(pairs: StationTargetPairs, variables: Variables) -> Callable:
     """The design of first order, a function `(x, start, softness)`."""
 
-    def design(x, start, softness):
+    def design(
+        x: Float[Array, " variables"], start: Configuration, softness: Float[Array, ""]
+    ) -> tuple[Values, Float[Array, " rays"]]:
         values = variables.place(start, x).values
-        return values, pairs.weights(values, softness)
+        return values, pairs.visibilities(values, softness)
 
     return design
 
 
 def station_margins(
-    conditions: Conditions, variables: Variables, origin: Float[np.ndarray, "3"]
+    conditions: Conditions,
+    variables: Variables,
+    origin: Float[np.ndarray, "3"],
+    edge_sharpness: float = DEFAULTS.edge_sharpness,
 ) -> Callable | None:
     """`(x, start) -> margins` of projection centres, positive if the conditions are satisfied:
     distances of stations, and stations outside of obstacles. None without conditions."""
@@ -89,9 +95,9 @@ def station_margins(
         return None
     boxes = np.array(conditions.obstacles).reshape(-1, 2, 3) - origin
     middle, half = boxes.mean(1), (boxes[:, 1] - boxes[:, 0]) / 2
-    sharp = EDGE_ROUNDING / half.mean(1)
+    sharp = edge_sharpness / half.mean(1)
 
-    def margins(x, start):
+    def margins(x: Float[AnyArray, " variables"], start: Configuration) -> Float[Array, " margins"]:
         position = variables.place(start, x).values.position
         images = len(position)
         i, j = np.triu_indices(images, 1)
@@ -100,6 +106,8 @@ def station_margins(
         if conditions.apart > 0:
             away = position[i[moves]] - position[j[moves]]
             found.append(jnp.sum(away**2, 1) / conditions.apart**2 - 1)
+        # Outside of a box is outside of one of its faces: the largest of three distances, smooth.
+        # Less log 3, so that it is never more than the largest.
         out = jnp.abs(position[variables.images][:, None] - middle) - half
         nearest = (logsumexp(sharp[:, None] * out, axis=2) - np.log(3)) / sharp
         found.append((nearest / variables.unit).ravel())
@@ -109,71 +117,95 @@ def station_margins(
 
 
 def search(
-    pairs: Pairs,
+    pairs: StationTargetPairs,
     variables: Variables,
-    start: Start,
+    start: Configuration,
     program: Callable,
-    ends: Callable[[Start], tuple[np.ndarray, np.ndarray]],
+    ends: Callable[[Configuration], tuple[np.ndarray, np.ndarray]],
     max_iterations: int,
-    rounds: tuple[float, ...] = ROUNDS,
-) -> tuple[Start, list[Step], bool]:
+    settings: DesignSettings = DEFAULTS,
+) -> tuple[Configuration, list[Step], bool]:
     """The best configuration from a start.
 
     **Arguments:** `ends`: smallest and largest variables at a start; `max_iterations`: of a round.
 
     **Returns:** the configuration, the steps, and whether the last round converged."""
-    from scipy.optimize import minimize
-
-    margins = station_margins(pairs.conditions, variables, pairs.problem.origin)
-    conditions = () if margins is None else _compile(margins)
+    origin = pairs.problem.origin
+    margins = station_margins(pairs.conditions, variables, origin, settings.edge_sharpness)
+    conditions: list[dict[str, Any]] = []
+    if margins is not None:
+        as_numbers = lambda f: lambda x, start: np.asarray(f(jnp.asarray(x), start))
+        value, slope = eqx.filter_jit(margins), eqx.filter_jit(jax.jacfwd(margins))
+        conditions = [{"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)}]
+    options = {"maxiter": max_iterations, "ftol": settings.smallest_change}
     steps: list[Step] = []
     converged = False
-    for softness in rounds:
-        low, high = ends(start)
-        latest: list[tuple[np.ndarray, float]] = []
-
-        def log_aim(x, start=start, softness=softness, latest=latest):
-            value, slope = program(x, start, softness)
-            latest[:] = [(np.array(x), value)]
-            return value, slope
-
-        def keep(x, start=start, softness=softness, latest=latest):
-            if not latest or not np.allclose(latest[0][0], x, 1e-9, 1e-9):
-                log_aim(x)
-            value = latest[0][1]
-            position = variables.positions(start, x) + pairs.problem.origin
-            steps.append(Step(softness, float(np.exp(min(value, 700.0))), position))
-
-        x = np.clip(variables.vector(start), low, high)
-        if not steps:
-            keep(x)
-        bound = [{**c, "args": (start,)} for c in conditions]
-        found = minimize(
-            log_aim,
-            x,
-            jac=True,
-            method="SLSQP",
-            bounds=np.stack([low, high], 1),
-            callback=keep,
-            constraints=bound,
-            options={"maxiter": max_iterations, "ftol": SMALLEST_CHANGE},
+    for softness in settings.softness:
+        function = lambda x, at=start, s=softness: program(x, at, s)
+        record = lambda x, aim, at=start, s=softness: steps.append(
+            Step(s, aim, variables.positions(at, x) + origin)
         )
-        start = jax.tree.map(np.asarray, variables.placed(start, np.clip(found.x, low, high)))
-        converged = bool(found.success)
+        bound = [{**c, "args": (start,)} for c in conditions]
+        begin, limits = variables.vector(start), ends(start)
+        x, converged = _minimise(function, begin, limits, bound, options, record, not steps)
+        start = jax.tree.map(np.asarray, variables.compiled_place(start, x))
     return start, steps, converged
 
 
-def _compile(margins):
-    value, slope = eqx.filter_jit(margins), eqx.filter_jit(jax.jacfwd(margins))
-    as_numbers = lambda f: lambda x, start: np.asarray(f(jnp.asarray(x), start))
-    return ({"type": "ineq", "fun": as_numbers(value), "jac": as_numbers(slope)},)
+def _minimise(
+    function: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    x: Float[np.ndarray, " variables"],
+    limits: tuple[np.ndarray, np.ndarray],
+    constraints: Sequence[dict[str, Any]],
+    options: dict[str, Any],
+    record: Callable[[np.ndarray, float], None],
+    with_start: bool,
+) -> tuple[Float[np.ndarray, " variables"], bool]:
+    """The minimum of a logarithm of the aim, and whether it converged; `record(x, aim)` gets every
+    iteration, and `with_start` the first x."""
+    from scipy.optimize import minimize
+
+    # SLSQP tells its callback x only: the aim there is that of the last evaluation, mostly.
+    latest: list[tuple[np.ndarray, float]] = []
+
+    def log_aim(x: Float[np.ndarray, " variables"]) -> tuple[float, np.ndarray]:
+        value, slope = function(x)
+        latest[:] = [(np.array(x), value)]
+        return value, slope
+
+    def keep(x: Float[np.ndarray, " variables"]) -> None:
+        if not latest or not np.allclose(latest[0][0], x, 1e-9, 1e-9):
+            log_aim(x)
+        record(x, float(np.exp(min(latest[0][1], 700.0))))  # e⁷¹⁰ is infinite
+
+    low, high = limits
+    x = np.clip(x, low, high)
+    if with_start:
+        keep(x)
+    found = minimize(
+        log_aim,
+        x,
+        jac=True,
+        method="SLSQP",
+        bounds=np.stack([low, high], 1),
+        callback=keep,
+        constraints=constraints,
+        options=options,
+    )
+    return np.clip(found.x, low, high), bool(found.success)
 
 
 def satisfies(
-    conditions: Conditions, variables: Variables, origin: np.ndarray, start: Start
+    conditions: Conditions,
+    variables: Variables,
+    origin: Float[np.ndarray, "3"],
+    start: Configuration,
+    edge_sharpness: float = DEFAULTS.edge_sharpness,
 ) -> bool:
     """Whether the stations satisfy their conditions, to a thousandth of their lengths."""
-    margins = station_margins(conditions, variables, origin)
+    margins = station_margins(conditions, variables, origin, edge_sharpness)
     if margins is None:
         return True
+    # A margin of squared distances: 2e-3 is a thousandth of the distance. SLSQP satisfies
+    # constraints to about its tolerance of the aim only.
     return bool((jax.jit(margins)(variables.vector(start), start) > -2e-3).all())

@@ -9,13 +9,14 @@ to the point, then by the roll ρ about it,
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 from jaxbundle.choices import DESIGNED
 from jaxbundle.errors import InputError
@@ -24,11 +25,9 @@ from jaxbundle.network.arrays import Values
 from jaxbundle.types import AnyArray
 
 AXIS = np.array([0.0, 0.0, -1.0])
-ROOM_OF_SIGHT = 0.25
-"""Margin of the viewed points beyond the targets, relative to their extent."""
 
 
-class Start(eqx.Module):
+class Configuration(eqx.Module):
     """The quantities changed by the variables: values of the network, and the viewed points,
     relative to its origin."""
 
@@ -40,8 +39,8 @@ class Start(eqx.Module):
 class Variables:
     """The variable rows and the parts of the vector of variables; `unit`: of lengths."""
 
-    images: np.ndarray
-    points: np.ndarray
+    images: Int[np.ndarray, " images"]
+    points: Int[np.ndarray, " points"]
     free: tuple[str, ...]
     unit: float
 
@@ -52,7 +51,7 @@ class Variables:
         every = {"position": (i, 3), "direction": (i, 3), "roll": (i, 1), "targets": (p, 3)}
         return {name: every[name] for name in DESIGNED if name in self.free and every[name][0]}
 
-    def parts(self, x) -> dict[str, Array]:
+    def parts(self, x: Shaped[AnyArray, " variables"]) -> dict[str, AnyArray]:
         """The vector by name, [rows, columns]."""
         found, begin = {}, 0
         for name, (rows, columns) in self.sizes.items():
@@ -60,7 +59,7 @@ class Variables:
             begin += rows * columns
         return found
 
-    def vector(self, start: Start) -> Float[np.ndarray, " variables"]:
+    def vector(self, start: Configuration) -> Float[np.ndarray, " variables"]:
         """The variables of the start: roll 0."""
         rows = {
             "position": np.asarray(start.values.position)[self.images] / self.unit,
@@ -71,7 +70,7 @@ class Variables:
         return np.concatenate([np.zeros(0), *(rows[name].ravel() for name in self.sizes)])
 
     def positions(
-        self, start: Start, x: Float[np.ndarray, " variables"]
+        self, start: Configuration, x: Float[np.ndarray, " variables"]
     ) -> Float[np.ndarray, "images 3"]:
         """Projection centres at these variables."""
         found = np.array(start.values.position)
@@ -80,15 +79,18 @@ class Variables:
         return found
 
     @cached_property
-    def placed(self):
+    def compiled_place(
+        self,
+    ) -> Callable[["Configuration", Float[AnyArray, " variables"]], "Configuration"]:
         """`place`, compiled."""
         return jax.jit(lambda start, x: self.place(start, x))
 
-    def place(self, start: Start, x: Float[AnyArray, " variables"]) -> Start:
+    def place(self, start: Configuration, x: Float[AnyArray, " variables"]) -> Configuration:
         """The network at these variables."""
         parts, values = self.parts(x), start.values
         position, look = (jnp.asarray(rows) for rows in (values.position, start.look))
         rotation, point = jnp.asarray(values.rotation), jnp.asarray(values.point)
+        # The position first: the direction is that from the new position to the viewed point.
         if "position" in parts:
             position = position.at[self.images].set(parts["position"] * self.unit)
         if "direction" in parts:
@@ -97,11 +99,12 @@ class Variables:
             turned = jax.vmap(turn_axis)(rotation[self.images], away)
             rotation = rotation.at[self.images].set(turned)
         if "roll" in parts:
-            rolled = jax.vmap(_roll)(rotation[self.images], parts["roll"][:, 0])
+            roll = lambda q, angle: retract_quaternion(q, jnp.zeros(3).at[2].set(angle))
+            rolled = jax.vmap(roll)(rotation[self.images], parts["roll"][:, 0])
             rotation = rotation.at[self.images].set(rolled)
         if "targets" in parts:
             point = point.at[self.points].set(parts["targets"] * self.unit)
-        return Start(Values(values.camera, position, rotation, point, values.other), look)
+        return Configuration(Values(values.camera, position, rotation, point, values.other), look)
 
 
 def turn_axis(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
@@ -110,18 +113,19 @@ def turn_axis(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Arra
     d = d / jnp.sqrt(jnp.sum(d**2))
     axis, cosine = jnp.cross(d, AXIS), d @ AXIS
     square = jnp.sum(axis**2)
+    # δ = axis·angle/sine, which is 1 + sine²/6 near zero: below 1e-6 rad, where the quotient of two
+    # roundings has no derivative, the series is exact to 1e-24.
     small = square < 1e-12
     sine = jnp.sqrt(jnp.where(small, 1.0, square))
     times = jnp.where(small, 1.0 + square / 6, jnp.arctan2(sine, cosine) / sine)
     return retract_quaternion(q, times * axis)
 
 
-def _roll(q, roll):
-    return retract_quaternion(q, jnp.zeros(3).at[2].set(roll))
-
-
 def choose_variables(
-    values: Values, free: tuple[str, ...], images: np.ndarray, points: np.ndarray
+    values: Values,
+    free: tuple[str, ...],
+    images: Int[np.ndarray, " images"],
+    points: Int[np.ndarray, " points"],
 ) -> Variables:
     """The variables of these rows.
 
@@ -144,19 +148,22 @@ def points_on_axes(values: Values) -> Float[np.ndarray, "images 3"]:
     axis = np.asarray(_axes(np.asarray(values.rotation)))
     depth = ((middle - position) * axis).sum(1)
     size = np.linalg.norm(middle - position, axis=1)
+    # At least a tenth of the distance in front of a camera that looks away from the targets.
     return position + np.maximum(depth, 0.1 * size)[:, None] * axis
 
 
 def bounds(
     variables: Variables,
-    start: Start,
+    start: Configuration,
     room: Float[np.ndarray, "2 3"],
     targets: Float[np.ndarray, "2 3"],
 ) -> tuple[Float[np.ndarray, " variables"], Float[np.ndarray, " variables"]]:
     """The smallest and largest values of the variables; boxes relative to the origin."""
     points = np.concatenate([np.asarray(start.values.point), start.look])
     low, high = points.min(0), points.max(0)
-    spare = ROOM_OF_SIGHT * max((high - low).max(), 1e-9)
+    # Cameras may look past the targets by a quarter of their extent. Farther, a viewed point says
+    # less about the direction and the search has nothing to gain.
+    spare = 0.25 * max((high - low).max(), 1e-9)
     boxes = {
         "position": room,
         "targets": targets,

@@ -11,7 +11,7 @@ so that thin walls also hide, and reduced by 4·s so that targets on its surface
 visible.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, project
 from jaxbundle.cameras.convert import image_area
 from jaxbundle.cameras.field_of_view import field_of_view_of_rays
+from jaxbundle.cameras.scalars import Parameters
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.tables import Camera
@@ -29,18 +30,14 @@ from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.types import AnyArray
 
 WIDE_ANGLE = np.radians(70.0)
-"""Rays of narrower cameras are compared by tangents of the angle off the axis, others by the
+"""Rays of cameras with a smaller largest angle are compared by tangents of the angle off the axis,
+as a perspective camera images them; of fisheyes, whose tangents grow without limit, by the
 angle."""
 LARGEST_ANGLE = np.radians(87.0)
 """Angles off the axis whose tangents are compared; beyond, the angle is added."""
-AT_CORNERS = 1e-6
-"""Tolerance of a ray beyond the corner of the image: rounding."""
-WIDENED, SPARED = 3.0, 4.0
-MARGIN_TOLERANCE = 1e-9
-"""Margins down to this count as satisfied: rounding, and targets on the surface of an obstacle."""
 
 
-class View(NamedTuple):
+class UsableFormat(NamedTuple):
     """The image of a camera: its model, the corners of the usable format, and the
     largest angle off the axis (radians)."""
 
@@ -59,21 +56,24 @@ class Rules(eqx.Module):
     obstacles: Float[AnyArray, "obstacles 2 3"] | None
 
 
-def view_of(camera: Camera, edge: float) -> View:
+def view_of(camera: Camera, edge: float) -> UsableFormat:
     """The image of a camera.
 
     **Raises:** `InputError` if its format is not known."""
     model = get_model(camera.model)
     try:
         low, high = image_area(model, camera.image_size, camera.pixel_size)
-        size = present_size(camera)
+        if camera.image_size is None:
+            raise ValueError("image_size is not given")
         given = {**default_parameters(model), **camera.parameters}
-        field = field_of_view_of_rays(model, given, size, camera.pixel_size)
+        field = field_of_view_of_rays(model, given, camera.image_size, camera.pixel_size)
     except ValueError as error:
         raise InputError(
             f"camera {camera.id}: its field of view is not known: {error}; a design needs "
             "image_size, and pixel_size of a model in mm"
         ) from None
+    # Beyond the radius to which a distortion is one-to-one there are no rays, and the search, which
+    # moves targets over the edge of the image, would have no gradient.
     if not np.isfinite(field.diagonal):
         raise InputError(
             f"camera {camera.id}: there is no ray to the corners of its image; a "
@@ -81,16 +81,7 @@ def view_of(camera: Camera, edge: float) -> View:
         )
     inner = edge * (high - low)
     low, high = (tuple(map(float, corner)) for corner in (low + inner, high - inner))
-    return View(model, low, high, field.diagonal / 2)
-
-
-def present_size(camera: Camera) -> tuple[int, int]:
-    """The image size of a camera.
-
-    **Raises:** `ValueError`."""
-    if camera.image_size is None:
-        raise ValueError("image_size is not given")
-    return camera.image_size
+    return UsableFormat(model, low, high, field.diagonal / 2)
 
 
 def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
@@ -106,7 +97,7 @@ def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
 
 
 def image_of(
-    view: View,
+    view: UsableFormat,
     position: Float[AnyArray, "3"],
     rotation: Float[AnyArray, "4"],
     interior: Float[AnyArray, " parameters"],
@@ -119,7 +110,7 @@ def image_of(
 
 
 def margins(
-    view: View,
+    view: UsableFormat,
     rules: Rules,
     position: Float[AnyArray, "3"],
     rotation: Float[AnyArray, "4"],
@@ -146,9 +137,11 @@ def margins(
     return found
 
 
-def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
+def visibility(found: dict[str, Array], softness: float | Float[AnyArray, ""]) -> Float[Array, ""]:
     """The smooth weight of a ray, 0 to 1, from its margins at this softness."""
-    spared = lambda name: SPARED if name == "obstacles" else 0.0
+    # A target on the surface of an obstacle widened by 3·s has the margin −3·s; four more make it
+    # 1/(1 + e⁻¹) = 0.73 visible, and one behind a thin wall (−6·s) 0.12.
+    spared = lambda name: 4.0 if name == "obstacles" else 0.0
     return jnp.exp(
         sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name))) for name, m in found.items())
     )
@@ -156,11 +149,20 @@ def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
 
 def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
     """Which conditions a ray satisfies, by its margins."""
-    return {name: jnp.all(m >= -MARGIN_TOLERANCE) for name, m in found.items()}
+    # Rounding: targets on the surface of an obstacle have the margin 0.
+    return {name: jnp.all(m >= -1e-9) for name, m in found.items()}
 
 
-def _in_view(view: View, interior, x, y, depth):
+def _in_view(
+    view: UsableFormat,
+    interior: Float[AnyArray, " parameters"],
+    x: Float[Array, ""],
+    y: Float[Array, ""],
+    depth: Float[Array, ""],
+) -> Float[Array, "5"]:
     """Margins of the four edges of the format and of the angle off the axis."""
+    # The angle as well, since the image is that of the nearest ray inside: targets behind the
+    # camera would else lie within the format.
     xy, angle = _image(view, interior, x, y, depth)
     low, high = jnp.array(view.low), jnp.array(view.high)
     half = (high - low) / 2
@@ -169,32 +171,48 @@ def _in_view(view: View, interior, x, y, depth):
         off = (jnp.tan(flat) + angle - flat) / np.tan(view.angle)
     else:
         off = angle / view.angle
-    return jnp.concatenate([(xy - low) / half, (high - xy) / half, (1 + AT_CORNERS - off)[None]])
+    # The corners themselves are in view: 1e-6 beyond them is rounding.
+    return jnp.concatenate([(xy - low) / half, (high - xy) / half, (1 + 1e-6 - off)[None]])
 
 
-def _image(view: View, interior, x, y, depth):
+def _image(
+    view: UsableFormat,
+    interior: Float[AnyArray, " parameters"],
+    x: Float[Array, ""],
+    y: Float[Array, ""],
+    depth: Float[Array, ""],
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """The image of a ray, or of the nearest one inside the field of view, and its angle off the
     axis."""
+    # The 1e-18 keeps the root differentiable on the axis: 1e-9 rad.
     across = jnp.sqrt(x * x + y * y + 1e-18 * (x * x + y * y + depth * depth))
     angle = jnp.arctan2(across, depth)
     inside = jnp.minimum(angle, view.angle)
     aside = jnp.sin(inside) / across
-    xy = project(view.model, interior, x * aside, y * aside, -jnp.cos(inside))
+    p = cast(Parameters, interior)  # an array unpacks like a tuple
+    xy = project(view.model, p, x * aside, y * aside, -jnp.cos(inside))
     return jnp.stack(xy), angle
 
 
-def _within(x, ends):
+def _within(x: Float[Array, ""], ends: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """Margins of a length between two ends, the second of which may be infinite."""
     low, high = ends[0], ends[1]
     scale = jnp.where(jnp.isfinite(high), (high - low) / 2, jnp.maximum(low, 1e-12))
     return jnp.stack([x - low, jnp.where(jnp.isfinite(high), high - x, scale)]) / scale
 
 
-def _outside(box, point, position, softness):
+def _outside(
+    box: Float[AnyArray, "2 3"],
+    point: Float[AnyArray, "3"],
+    position: Float[AnyArray, "3"],
+    softness: float | Float[AnyArray, ""],
+) -> Float[Array, ""]:
     """The length of the ray within a box, negative, in half mean edges; if the ray misses
     the box, a positive measure of the distance."""
     scale = jnp.mean(box[1] - box[0]) / 2
-    wider = WIDENED * softness * scale
+    # Intersection of a ray and a box by slabs (Kay and Kajiya, 1986): it is inside from the last
+    # entry to the first exit.
+    wider = 3 * softness * scale
     direction = position - point
     length = jnp.sqrt(jnp.sum(direction**2))
     safe = jnp.where(jnp.abs(direction) < 1e-12 * length, 1e-12 * length, direction)

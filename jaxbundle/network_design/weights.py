@@ -11,6 +11,7 @@ is a lower bound for any choice of n photographs. The largest weights are chosen
 photographs exchanged while this reduces the aim (Fedorov 1972).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -18,12 +19,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network_design.pairs import IDLE, Pairs
+from jaxbundle.network_design.pairs import IDLE_VISIBILITY, StationTargetPairs
 from jaxbundle.network_design.search import UNDETERMINED_AIM, make_program
+from jaxbundle.network_design.settings import DEFAULTS, DesignSettings
+from jaxbundle.types import AnyArray
 
-IDLE_WEIGHT = IDLE**2
+IDLE_WEIGHT = IDLE_VISIBILITY**2
 """The weight of an unselected photograph, so that its orientation stays determined."""
-MOST_EXCHANGES = 50
+Squared = Callable[[Float[AnyArray, " images"]], tuple[float, Float[np.ndarray, " images"]]]
+"""`weights -> (log aim², gradient)`."""
 
 
 class Selection(NamedTuple):
@@ -37,7 +41,12 @@ class Selection(NamedTuple):
     converged: bool
 
 
-def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selection:
+def select(
+    pairs: StationTargetPairs,
+    photographs: int,
+    max_iterations: int = 100,
+    settings: DesignSettings = DEFAULTS,
+) -> Selection:
     """The photographs to take.
 
     **Raises:** `InputError` for an impossible number, `NotSolvedError` if no selection
@@ -54,10 +63,10 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
     start = np.full(images, photographs / images)
     aims: list[float] = []
 
-    def keep(w):
+    def record(w: Float[np.ndarray, " images"]) -> None:
         aims.append(float(np.exp(min(program(w)[0] / 2, 700.0))))
 
-    keep(start)
+    record(start)
     if program(start)[0] >= 2 * UNDETERMINED_AIM:
         raise NotSolvedError("design: all candidates together do not determine the network")
     found = minimize(
@@ -66,16 +75,18 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
         jac=True,
         method="SLSQP",
         bounds=[(IDLE_WEIGHT, 1.0)] * images,
-        callback=keep,
+        callback=record,
         constraints=[
             {"type": "eq", "fun": lambda w: w.sum() - photographs, "jac": lambda w: np.ones_like(w)}
         ],
+        # The problem is convex and its gradient cheap: to the end, since the bound depends on it.
         options={"maxiter": max_iterations, "ftol": 1e-8},
     )
     weight = np.clip(found.x, IDLE_WEIGHT, 1.0)
     chosen = np.zeros(images, bool)
     chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
-    chosen = _exchange(program, chosen)
+    chosen = _exchange(program, chosen, settings.max_exchanges)
+    # The smallest ∇T·w' of n whole photographs is the sum of the n smallest slopes.
     value, slope = program(weight)
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
@@ -85,35 +96,40 @@ def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selecti
     )
 
 
-def _program(pairs: Pairs):
+def _program(pairs: StationTargetPairs) -> Squared:
     """`weights -> (log aim², gradient)`."""
     values = pairs.problem.data.start
     seen = pairs.measured(values).astype(float)
     image = pairs.problem.image
+    # Visibilities multiply 1/σ, w the weight 1/σ².
     program = make_program(pairs, lambda w: (values, seen * jnp.sqrt(w)[image]))
 
-    def squared(w):
+    def squared(w: Float[AnyArray, " images"]) -> tuple[float, Float[np.ndarray, " images"]]:
         value, slope = program(np.maximum(w, IDLE_WEIGHT))
         return 2 * value, 2 * slope
 
     return squared
 
 
-def _exchange(program, chosen):
+def _exchange(
+    program: Squared, chosen: Bool[np.ndarray, " images"], max_exchanges: int
+) -> Bool[np.ndarray, " images"]:
     """Photographs exchanged, the best pair at a time, while the aim falls."""
     aim = lambda chosen: program(chosen.astype(float))[0]
     best = aim(chosen)
-    for _ in range(MOST_EXCHANGES):
+    for _ in range(max_exchanges):
         found = best, chosen
+        # The slope at nearly zero weight tells what a photograph adds; at zero the derivative of √w
+        # is infinite. The eight that add most are tried in place of every chosen one; all pairs
+        # would cost candidates times chosen evaluations.
         slope = program(np.maximum(chosen.astype(float), 1e-3))[1]
-        # Those with the most valuable weight are added, those with the least are removed.
         coming = np.flatnonzero(~chosen)[np.argsort(slope[~chosen])][:8]
         for new in coming:
             for old in np.flatnonzero(chosen):
                 tried = chosen.copy()
                 tried[[new, old]] = True, False
                 value = aim(tried)
-                if value < found[0] - 1e-9:
+                if value < found[0] - 1e-9:  # better beyond rounding, so that exchanges end
                     found = value, tried
         if found[1] is chosen:
             return chosen

@@ -7,7 +7,7 @@ Image coordinates are ideal ones divided by the principal distance, unless said 
 
 from jaxbundle.orientation.absolute import AbsoluteOrientation as AbsoluteOrientation
 from jaxbundle.orientation.absolute import absolute_orientation as absolute_orientation
-from jaxbundle.orientation.dlt import Camera as Camera
+from jaxbundle.orientation.dlt import CameraWithPose as CameraWithPose
 from jaxbundle.orientation.dlt import RefinedCamera as RefinedCamera
 from jaxbundle.orientation.dlt import decompose as decompose
 from jaxbundle.orientation.dlt import direct_linear_transformation as direct_linear_transformation

@@ -20,12 +20,9 @@ from jaxbundle.geometry import (
     transform_point,
 )
 from jaxbundle.leastsquares.iterations.small import inverse
-from jaxbundle.orientation.linear import extent, normalisation, ones_unless
+from jaxbundle.orientation.linear import are_collinear, normalisation, ones_unless
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
-
-LINE = 1e-7
-"""Points with a smaller second extent, relative to the first, are collinear."""
 
 
 class AbsoluteOrientation(eqx.Module):
@@ -61,10 +58,12 @@ def absolute_orientation(
     scale = jnp.sum(p[:, None] * turned * y) / jnp.sum(p[:, None] * x * x)
     omega = rotation_vector_from_quaternion(q)
     tau = jnp.concatenate([Y - scale * R @ X, omega, jnp.log(scale)[None]])
-    line = jnp.maximum(_on_a_line(source, p), _on_a_line(target, p))
-    root = jnp.sqrt(p)[:, None]
+    line = are_collinear(source, p) | are_collinear(target, p)
+    sqrt_p = jnp.sqrt(p)[:, None]
     computed = lambda t: jax.vmap(transform_point, (None, 0))(t, source)
-    J = (root[:, :, None] * jax.jacfwd(computed)(tau)).reshape(-1, 7)
+    # The Jacobian by differentiation, not by hand: it is needed once, and the seven columns are
+    # those of `transform_point`, whose parameters τ the network uses as well.
+    J = (sqrt_p[:, :, None] * jax.jacfwd(computed)(tau)).reshape(-1, 7)
     N = jnp.where(line, jnp.eye(7, dtype=J.dtype), J.T @ J)
     v = computed(tau) - target
     return AbsoluteOrientation(
@@ -80,6 +79,9 @@ def rotation_between(
     x: Float[AnyArray, "n 3"], y: Float[AnyArray, "n 3"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "4"]:
     """The unit quaternion of the rotation that best maps directions x to y (Horn, 1987)."""
+    # The quaternion q maximises qᵀ·N·q, N built from the 3 × 3 sums S = Σ p·x·yᵀ: the eigenvector
+    # of the largest eigenvalue, which `eigh` puts last. An SVD of S would need a test of det R for
+    # reflections (Arun, Huang and Blostein, 1987); a quaternion is a rotation always.
     S = jnp.einsum("n,ni,nj->ij", weights, x, y)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = S
     rows = [
@@ -89,7 +91,3 @@ def rotation_between(
         [xy - yx, zx + xz, yz + zy, zz - xx - yy],
     ]
     return jnp.linalg.eigh(jnp.array(rows))[1][:, -1]
-
-
-def _on_a_line(points, weights):
-    return extent(points, weights)[1] < LINE

@@ -10,13 +10,11 @@ from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import sights
 
-LARGEST_MISCLOSURE = 3.0
-"""Limit for the median misclosure of image points, in tolerances of start values."""
 
-
-def name_angle_unit(network: Network) -> str:
+def name_angle_unit(network: Network, settings: StartValueSettings = DEFAULTS) -> str:
     """The unit in which the start values of the images fit the measurements, in words; empty if the
     given one fits, or no other does."""
     seen, images = sights(network), network.images
@@ -36,7 +34,9 @@ def name_angle_unit(network: Network) -> str:
         off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]
         missed[unit] = float(np.median(off))
     best = min(missed, key=missed.__getitem__)
-    if not (missed[best] < 1 and missed[network.angle_unit] > LARGEST_MISCLOSURE):
+    # Half of the image points out of the question in the given unit, half within the tolerance in
+    # another; start values that are only poor are neither.
+    if not (missed[best] < 1 and missed[network.angle_unit] > settings.gross_ratio):
         return ""
     return (
         f"the start values of the images fit the measurements if omega, phi, kappa are in {best}, "

@@ -27,17 +27,14 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail, level_of_one
 
-SIGNIFICANCE = 0.05
-"""Probability of suspecting any point of control without contradictions."""
-PAIRS_UP_TO = 20
+MAX_POINTS_FOR_PAIRS = 20
 """With at most this many points two are also tested together: two errors of one size, as of
-exchanged names, hide each other in the estimated σ of a few points."""
-FEWEST_AGREEING = 4
+exchanged names, hide each other in the estimated σ of a few points. Of 20 points there are 190
+pairs, each with a σ estimated anew."""
+MIN_AGREEING = 4
 """Control points that remain at least: three of a similarity always nearly agree."""
-LEAST_REDUNDANCY = 3.0
-"""Least redundancy of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %."""
-ROUNDS, SETTLED = 200, 1e-3
-"""Largest number of iterations of estimated σ; relative change at which they end."""
+MIN_REDUNDANCY = 3.0
+"""Of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +74,7 @@ class Assessment:
     factor: float = 1.0
 
 
-def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICANCE) -> Assessment:
+def assess(found: Discrepancies, assumed: float, significance: float = 0.05) -> Assessment:
     """Find the control points that contradict the others.
 
     The most improbable point, or pair of points, is left out while its probability is below the
@@ -85,7 +82,8 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     least half of the points stay: if more contradict their given σ, these are wrong, and all are
     multiplied by one factor.
 
-    **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one.
+    **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one;
+    `significance`: probability of suspecting any point of control without contradictions.
     """
     if not len(found):
         nothing, lacking = np.zeros((0, 3)), (True, True)
@@ -106,7 +104,7 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
     sigma, redundancy, guessed = _resolve(found, used, assumed)
     error, spread = np.full((2, len(found), 3), np.nan)
     probability = np.full(len(found), np.nan)
-    common = _Model.of(found, used, used, assumed) if used.sum() > PAIRS_UP_TO else None
+    common = _linearise(found, used, used, assumed) if used.sum() > MAX_POINTS_FOR_PAIRS else None
     for i in range(len(found)):
         test = _predict(found, used, [i], assumed, common if used[i] else None)
         if test is not None:
@@ -117,7 +115,7 @@ def assess(found: Discrepancies, assumed: float, significance: float = SIGNIFICA
 def _search(found: Discrepancies, assumed: float, significance: float) -> Bool[np.ndarray, " n"]:
     """Which points do not contradict the others."""
     used = np.ones(len(found), bool)
-    fewest = max(FEWEST_AGREEING, (len(found) + 1) // 2)
+    fewest = max(MIN_AGREEING, (len(found) + 1) // 2)
     while worst := _most_improbable(found, used, assumed, significance, used.sum() - fewest):
         used[worst] = False
     left_out = np.flatnonzero(~used).tolist()
@@ -128,14 +126,18 @@ def _search(found: Discrepancies, assumed: float, significance: float) -> Bool[n
 
 
 def _most_improbable(
-    found: Discrepancies, used, assumed: float, significance: float, most: int
+    found: Discrepancies,
+    used: Bool[np.ndarray, " n"],
+    assumed: float,
+    significance: float,
+    most: int,
 ) -> list[int]:
     """The point, or else the two points, of at most this number, that are most improbable; none if
     chance explains all."""
     rows = np.flatnonzero(used).tolist()
-    few = len(rows) <= PAIRS_UP_TO
+    few = len(rows) <= MAX_POINTS_FOR_PAIRS
     # of many points one changes the estimated σ by too little to matter
-    common = None if few else _Model.of(found, used, used, assumed)
+    common = None if few else _linearise(found, used, used, assumed)
     for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * few):
         if tests and len(tests[0]) <= most:
             p = [_probability(found, used, test, assumed, common) for test in tests]
@@ -145,13 +147,18 @@ def _most_improbable(
 
 
 def _probability(
-    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: "_Model | None" = None
+    found: Discrepancies,
+    used: Bool[np.ndarray, " n"],
+    tested: Sequence[int],
+    assumed: float,
+    model: "_WeightedDiscrepancies | None" = None,
 ) -> float:
+    """The probability of a larger T by chance; 1 of points that cannot be tested."""
     test = _predict(found, used, tested, assumed, model)
     return 1.0 if test is None else test[2]
 
 
-class _Model(NamedTuple):
+class _WeightedDiscrepancies(NamedTuple):
     """σ [n, 3] and its redundancy in the plane and in height; W and W·d of the controlled axes of
     some points, their `rows` among all axes."""
 
@@ -161,39 +168,49 @@ class _Model(NamedTuple):
     Wd: Float[np.ndarray, " m"]
     rows: Int[np.ndarray, " m"]
 
-    @staticmethod
-    def of(found: Discrepancies, others, all_, assumed: float) -> "_Model":
-        """With σ estimated from `others`, W of `all_`."""
-        sigma, redundancy, _ = _resolve(found, others, assumed)
-        W, d, rows = _weight_matrix(found, sigma, all_)
-        return _Model(sigma, redundancy, W, W @ d, rows)
+
+def _linearise(
+    found: Discrepancies,
+    others: Bool[np.ndarray, " n"],
+    points: Bool[np.ndarray, " n"],
+    assumed: float,
+) -> _WeightedDiscrepancies:
+    """W and W·d of `points`, with σ estimated from `others`."""
+    sigma, redundancy, _ = _resolve(found, others, assumed)
+    W, d, rows = _weight_matrix(found, sigma, points)
+    return _WeightedDiscrepancies(sigma, redundancy, W, W @ d, rows)
 
 
 def _predict(
-    found: Discrepancies, used, tested: Sequence[int], assumed: float, model: _Model | None = None
-):
+    found: Discrepancies,
+    used: Bool[np.ndarray, " n"],
+    tested: Sequence[int],
+    assumed: float,
+    model: _WeightedDiscrepancies | None = None,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float] | None:
     """Error of the prediction of the first tested point, its σ, and the probability of a larger T
     of all of them; None if the others do not predict them.
 
     **Arguments:** `model`: of all used points, instead of one with σ from the others."""
     if model is None:
-        others, all_ = used.copy(), used.copy()
-        others[list(tested)], all_[list(tested)] = False, True
-        model = _Model.of(found, others, all_, assumed)
+        others, points = used.copy(), used.copy()
+        others[list(tested)], points[list(tested)] = False, True
+        model = _linearise(found, others, points, assumed)
     rows = model.rows
     mine = np.flatnonzero(np.isin(rows // 3, tested))
     if not len(mine):
         return None
-    own = model.W[np.ix_(mine, mine)]
-    scale = np.abs(np.diag(own)).max(initial=0.0)
-    if not scale or np.linalg.eigvalsh(own)[0] < 1e-9 * scale:
+    W_tested = model.W[np.ix_(mine, mine)]
+    # W_DD is singular where the others leave D open, by G: then it is zero but for rounding.
+    scale = np.abs(np.diag(W_tested)).max(initial=0.0)
+    if not scale or np.linalg.eigvalsh(W_tested)[0] < 1e-9 * scale:
         return None
-    covariance = np.linalg.inv(own)
+    covariance = np.linalg.inv(W_tested)
     e = covariance @ model.Wd[mine]
     unknown, p = np.isnan(found.sigma).ravel()[rows[mine]], []
     for height, freedom in enumerate(model.redundancy):
         part = np.flatnonzero((rows[mine] % 3 == 2) == height)
-        if not len(part) or (unknown[part].any() and freedom < LEAST_REDUNDANCY):
+        if not len(part) or (unknown[part].any() and freedom < MIN_REDUNDANCY):
             continue  # an assumed σ tests nothing
         T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
         p.append(
@@ -201,6 +218,7 @@ def _predict(
             if unknown[part].any()
             else chi2_tail(T, len(part))
         )
+    # Bonferroni: the smaller of two probabilities counts twice.
     p = min(1.0, len(p) * min(p, default=1.0))
     error, spread = np.full(3, np.nan), np.full(3, np.nan)
     first = rows[mine] // 3 == tested[0]
@@ -209,7 +227,9 @@ def _predict(
     return error, spread, p
 
 
-def _weight_matrix(found: Discrepancies, sigma, used):
+def _weight_matrix(
+    found: Discrepancies, sigma: Float[np.ndarray, "n 3"], used: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """W and d of the controlled axes of the used points; their rows among all axes."""
     rows = np.flatnonzero((used[:, None] & np.isfinite(sigma)).ravel())
     n = 3 * len(found)
@@ -222,7 +242,9 @@ def _weight_matrix(found: Discrepancies, sigma, used):
     return W, found.difference.ravel()[rows], rows
 
 
-def _resolve(found: Discrepancies, used, assumed: float):
+def _resolve(
+    found: Discrepancies, used: Bool[np.ndarray, " n"], assumed: float
+) -> tuple[Float[np.ndarray, "n 3"], tuple[float, float], tuple[bool, bool]]:
     """σ of control with the unknown ones estimated from the used points, their redundancy in the
     plane and in height, and whether they had to be assumed."""
     unknown = np.isnan(found.sigma)
@@ -235,7 +257,9 @@ def _resolve(found: Discrepancies, used, assumed: float):
     start = np.abs(found.difference - np.median(found.difference[used], axis=0))
     for group in here:
         sigma[group] = max(1.4826 * np.median(start[group & used[:, None]]), assumed)
-    for number in range(ROUNDS):
+    # The fixed point converges linearly, slowly where C dominates; a σ to 0.1 % is far more than
+    # its own σ of 10 to 40 % deserves, and after 200 rounds the last one is good enough.
+    for number in range(200):
         W, d, rows = _weight_matrix(found, sigma, used)
         Wd, before = W @ d, sigma.copy()
         for group in here:
@@ -247,10 +271,10 @@ def _resolve(found: Discrepancies, used, assumed: float):
             if number == 0:
                 # with a σ that dominates C; where the estimate is small, its share is hardly any
                 redundancy[0 if group[:, :2].any() else 1] = float(before[group][0] ** 2 * trace)
-        if np.abs(sigma[unknown] / before[unknown] - 1).max() < SETTLED:
+        if np.abs(sigma[unknown] / before[unknown] - 1).max() < 1e-3:
             break
     plane, height = (
-        bool(g.any()) and (r < LEAST_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
+        bool(g.any()) and (r < MIN_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
         for g, r in zip(groups, redundancy)
     )
     for group, few in zip(groups, (plane, height)):

@@ -12,29 +12,17 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import sights
 
-LARGEST_MISCLOSURE = 3.0
-"""Limit for the median misclosure of image points, in tolerances of start values; as of
-`angle_units`."""
-MUCH_BETTER = 10.0
-"""Least ratio of the misclosures of the expected convention and of another that fits."""
-MOST_RAYS = 2000
-"""Image points that are tried: the median of so many is known to 2 %."""
-OUTSIDE_SHARE = 0.25
-"""Part of the image points outside the image from which another origin is suspected: of centred
-coordinates three quarters are outside, of a few blunders less."""
-FEWEST_POINTS = 6
-"""Points that are all in one quadrant of an image by chance once in 4⁵ = 1000 times."""
-SMALL_PART = 0.02
-"""Part of an image, about its first pixel, in which all points lie if they are in mm: sensors of 36
-mm have 2000 columns and more."""
+IDENTITY = (1, 0, 0, 1)
+"""The symmetry of the expected convention: a 2 × 2 matrix, row by row."""
 SYMMETRIES = {
     (1, 0, 0, -1): "{y} is counted in the other direction",
     (-1, 0, 0, 1): "{x} is counted in the other direction",
@@ -44,14 +32,13 @@ SYMMETRIES = {
     (0, -1, 1, 0): "the image is turned by 90°",
     (0, 1, -1, 0): "the image is turned by −90°",
 }
-SAME = (1, 0, 0, 1)
-EXPECTED = {
+EXPECTED_CONVENTION = {
     "px": "pixels from the centre of the upper-left pixel, u right, v down",
     "mm": "mm from the image centre, x right, y up",
 }
 
 
-def name_image_convention(network: Network) -> str:
+def name_image_convention(network: Network, settings: StartValueSettings = DEFAULTS) -> str:
     """The convention in which the image coordinates fit the start values, in words; empty if the
     expected one does, or no other."""
     images, points, rays = network.images, network.points, network.observations
@@ -60,16 +47,18 @@ def name_image_convention(network: Network) -> str:
     rows = np.flatnonzero(placed[rays.image] & known[rays.point])
     if not len(rows):
         return ""
-    rows = rows[many.spread(len(rows), MOST_RAYS)]
+    # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise a
+    # factor of ten, of up to sixteen conventions.
+    rows = rows[many.spread(len(rows), 2000)]
     some = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]
     missed: dict[tuple[tuple[int, int, int, int], bool], float]
-    missed = {(SAME, False): _misclosure(some, placed, known)}
-    if missed[SAME, False] <= LARGEST_MISCLOSURE:
+    missed = {(IDENTITY, False): _misclosure(some, placed, known)}
+    if missed[IDENTITY, False] <= settings.gross_ratio:
         return ""
     m, half = centres[camera], halves[camera]
-    for symmetry, shifted in itertools.product([SAME, *SYMMETRIES], [False, True]):
+    for symmetry, shifted in itertools.product([IDENTITY, *SYMMETRIES], [False, True]):
         if (symmetry, shifted) in missed or shifted and not np.isfinite(half).all():
             continue
         # Centred coordinates instead of those from a corner, or the other way round.
@@ -78,7 +67,9 @@ def name_image_convention(network: Network) -> str:
         changed = dataclasses.replace(some.observations, xy=xy)
         missed[symmetry, shifted] = _misclosure(some.replace(observations=changed), placed, known)
     best = min(missed, key=lambda k: missed[k])  # The expected one, and simple ones, come first.
-    if not MUCH_BETTER * missed[best] < missed[SAME, False]:
+    # A wrong convention misses by parts of the image, the right one by the errors of start values,
+    # a few hundredths of it. Of sixteen conventions one is always somewhat better by chance.
+    if not 10 * missed[best] < missed[IDENTITY, False]:
         return ""
     unit = get_model(network.cameras[0].model).unit
     x, y = ("u", "v") if unit == "px" else ("x", "y")
@@ -89,11 +80,11 @@ def name_image_convention(network: Network) -> str:
             if unit == "px"
             else "they are counted from a corner of the image"
         )
-    if best[0] != SAME:
+    if best[0] != IDENTITY:
         words.append(SYMMETRIES[best[0]].format(x=x, y=y))
     return (
         f"the image coordinates fit the start values if {' and '.join(words)}: expected are "
-        f"{EXPECTED[unit]}; change them in the input"
+        f"{EXPECTED_CONVENTION[unit]}; change them in the input"
     )
 
 
@@ -109,7 +100,9 @@ def image_frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarra
     return np.zeros(2), np.array(size) * pitch / 2 if known else np.full(2, np.nan)
 
 
-def _misclosure(network: Network, placed, known) -> float:
+def _misclosure(
+    network: Network, placed: Bool[np.ndarray, " images"], known: Bool[np.ndarray, " points"]
+) -> float:
     """The median misclosure of start values, in tolerances; infinite if half have no ray."""
     seen, images = sights(network), network.images
     if 2 * len(seen.row) < len(network.observations):
@@ -131,11 +124,13 @@ def name_image_extent(network: Network) -> str:
         unit = get_model(given.model).unit
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
         if not np.isfinite(half).all():
-            if unit == "mm" and len(xy) >= FEWEST_POINTS and ((low > 0).all() or (high < 0).all()):
+            # Six points are in one quadrant of an image by chance once in 4⁵ = 1000 times.
+            if unit == "mm" and len(xy) >= 6 and ((low > 0).all() or (high < 0).all()):
                 return (
                     f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, "
                     f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} mm, all on one side of the "
-                    f"image centre: are they counted from a corner? Expected are {EXPECTED[unit]}"
+                    "image centre: are they counted from a corner? Expected are "
+                    f"{EXPECTED_CONVENTION[unit]}"
                 )
             continue
         said = (
@@ -144,11 +139,17 @@ def name_image_extent(network: Network) -> str:
             f"{(centre - half)[0]:.4g}, {(centre - half)[1]:.4g} to "
             f"{(centre + half)[0]:.4g}, {(centre + half)[1]:.4g}"
         )
-        if unit == "px" and (np.abs([low, high]) < SMALL_PART * 2 * half).all():
-            return f"{said}: are they in mm? Expected are {EXPECTED[unit]}"
+        # In mm all points lie within 2 % of the image about its first pixel: a sensor of 36 mm has
+        # 2000 columns and more.
+        if unit == "px" and (np.abs([low, high]) < 0.02 * 2 * half).all():
+            return f"{said}: are they in mm? Expected are {EXPECTED_CONVENTION[unit]}"
+        # Of coordinates from the centre, taken for coordinates from a corner, three quarters lie
+        # outside the image; blunders are fewer than a quarter.
         outside = (np.abs(xy - centre) > half).any(1).mean()
         shifted = np.where(centre == 0, half, 0.0)
-        if outside > OUTSIDE_SHARE and (np.abs(xy - shifted) <= half).all(1).mean() > 0.99:
+        if outside > 0.25 and (np.abs(xy - shifted) <= half).all(1).mean() > 0.99:
             origin = "the image centre" if unit == "px" else "a corner of the image"
-            return f"{said}: are they counted from {origin}? Expected are {EXPECTED[unit]}"
+            return (
+                f"{said}: are they counted from {origin}? Expected are {EXPECTED_CONVENTION[unit]}"
+            )
     return ""

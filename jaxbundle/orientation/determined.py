@@ -23,24 +23,25 @@ for 2n − 4; two points always are.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.orientation.growth import Model
 from jaxbundle.orientation.sights import Sights
 
-SIGNIFICANCE = 0.001
-"""Probability that parallel rays are taken for converging ones: the level of the tests of
-single observations."""
-
 
 def have_one_line(
-    seen: Sights, model: Model, points: Bool[np.ndarray, " points"], factor: float = 1.0
+    seen: Sights,
+    model: Model,
+    points: Bool[np.ndarray, " points"],
+    factor: float = 1.0,
+    significance: float = 0.001,
 ) -> tuple[Bool[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
     """Which of these points have two or more rays from placed images that are one line, and which
     of them because the images were taken from one place.
 
-    **Arguments:** `factor`: of the a priori σ of the rays, such as σ0."""
+    **Arguments:** `factor`: of the a priori σ of the rays, such as σ0; `significance`: probability
+    that parallel rays are taken for converging ones, that of the tests of single observations."""
     none = np.zeros(seen.points, bool)
     rows = np.flatnonzero(model.placed[seen.image] & points[seen.point] & (seen.sigma > 0))
     image, point = seen.image[rows], seen.point[rows]
@@ -55,23 +56,29 @@ def have_one_line(
     p = 1 / ((factor * seen.sigma[rows]) ** 2 * (1 + 3 / measured))
     S = total(p[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(-1, 3, 3)
     u = np.linalg.eigh(S)[1][:, :, 2]
-    weight = np.maximum(np.bincount(point, p, seen.points), 1e-300)[:, None]
-    away = model.X0[image] - (total(p[:, None] * model.X0[image]) / weight)[point]
+    sum_of_p = np.maximum(np.bincount(point, p, seen.points), 1e-300)[:, None]
+    away = model.X0[image] - (total(p[:, None] * model.X0[image]) / sum_of_p)[point]
     u = u[point]
     across = lambda v: v - (v * u).sum(1, keepdims=True) * u
     r, off = across(away), across(d) * np.sign((d * u).sum(1, keepdims=True))
     usual = usual_distances(seen, model)[image, None]
     misses = lambda v: np.bincount(point, p * np.square(v).sum(1), seen.points)
-    limit = _quantiles(2 * number - 2)
+    limit = _quantiles(2 * number - 2, significance)
     one_line = number > 1
+    # One value of s is not enough: rays that converge at the usual distance by chance, or because
+    # the point is there, pass its test too.
     for distance in (0.5 * usual, usual, 2 * usual):
         one_line &= misses(r / distance + off) < limit
     return one_line, one_line & (misses(away / usual) < limit)
 
 
-def see_a_line(seen: Sights, model: Model, factor: float = 1.0) -> Bool[np.ndarray, " images"]:
+def see_a_line(
+    seen: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
+) -> Bool[np.ndarray, " images"]:
     """Which images see known points on a line only, or fewer than three. Images that are not placed
-    count as at the usual distance."""
+    count as at the usual distance.
+
+    **Arguments:** as of `have_one_line`."""
     rows = np.flatnonzero(model.known[seen.point] & (seen.sigma > 0))
     image = seen.image[rows]
     number = np.bincount(image, minlength=seen.images)
@@ -79,16 +86,16 @@ def see_a_line(seen: Sights, model: Model, factor: float = 1.0) -> Bool[np.ndarr
     away = np.linalg.norm(X - model.X0[image], axis=1)
     away = np.where(placed, away, usual_distances(seen, model)[image])
     # Distances of the points from the image weigh their offsets; the line is that of least squares.
-    root = 1 / (factor * seen.sigma[rows] * away)
+    sqrt_p = 1 / (factor * seen.sigma[rows] * away)
     total = lambda values: np.stack(
         [np.bincount(image, v, seen.images) for v in values.reshape(len(rows), -1).T], 1
     )
-    weight = np.maximum(np.bincount(image, root**2, seen.images), 1e-300)[:, None]
-    away = X - (total(root[:, None] ** 2 * X) / weight)[image]
-    scaled = root[:, None] * away
+    sum_of_p = np.maximum(np.bincount(image, sqrt_p**2, seen.images), 1e-300)[:, None]
+    away = X - (total(sqrt_p[:, None] ** 2 * X) / sum_of_p)[image]
+    scaled = sqrt_p[:, None] * away
     C = total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3)
     off = np.linalg.eigvalsh(C)[:, :2].sum(1)
-    return (number > 0) & (off < _quantiles(2 * number - 4))
+    return (number > 0) & (off < _quantiles(2 * number - 4, significance))
 
 
 def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
@@ -103,9 +110,8 @@ def usual_distances(seen: Sights, model: Model) -> Float[np.ndarray, " images"]:
     return found
 
 
-def _quantiles(degrees) -> np.ndarray:
+def _quantiles(degrees: Int[np.ndarray, " n"], significance: float) -> Float[np.ndarray, " n"]:
     """χ² quantiles of whole degrees of freedom; infinite for none."""
     values, index = np.unique(degrees, return_inverse=True)
-    return np.array([chi2_quantile(1 - SIGNIFICANCE, int(k)) if k > 0 else np.inf for k in values])[
-        index
-    ]
+    quantile = lambda k: chi2_quantile(1 - significance, int(k)) if k > 0 else np.inf
+    return np.array([quantile(k) for k in values])[index]

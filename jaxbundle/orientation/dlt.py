@@ -25,16 +25,19 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import adjust
-from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
+from jaxbundle.orientation.linear import (
+    RANK_TOLERANCE,
+    extent,
+    normalisation,
+    null_vector,
+    ones_unless,
+)
 from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
-SMALLEST_SINGULAR_VALUE = 1e-7
-"""Extents of points, and second last singular values, below this part of the first are zero."""
 
-
-class Camera(eqx.Module):
+class CameraWithPose(eqx.Module):
     """Interior orientation (fx, fy, s, x0, y0) and radial K1, K2, … in image units, and pose."""
 
     interior: Float[AnyArray, "5"]
@@ -45,7 +48,7 @@ class Camera(eqx.Module):
 class RefinedCamera(eqx.Module):
     """A camera, vᵀPv, and the cofactors in the order of `interior`, δX0, δθ (radians), `radial`."""
 
-    camera: Camera
+    camera: CameraWithPose
     vtpv: Float[AnyArray, ""]
     cofactor: Float[AnyArray, "u u"]
     status: Int[AnyArray, ""]
@@ -69,9 +72,9 @@ def direct_linear_transformation(
     p = ones_unless(weights, xy)
     (m, k), (n, l) = normalisation(X, p), normalisation(xy, p)
     Y = jnp.pad((X - m) / k, ((0, 0), (0, 1)), constant_values=1)
-    x, nil, root = (xy - n) / l, jnp.zeros_like(Y), jnp.sqrt(p)[:, None]
-    rows_x = root * jnp.hstack([Y, nil, -x[:, :1] * Y])
-    rows_y = root * jnp.hstack([nil, Y, -x[:, 1:] * Y])
+    x, nil, sqrt_p = (xy - n) / l, jnp.zeros_like(Y), jnp.sqrt(p)[:, None]
+    rows_x = sqrt_p * jnp.hstack([Y, nil, -x[:, :1] * Y])
+    rows_y = sqrt_p * jnp.hstack([nil, Y, -x[:, 1:] * Y])
     h, singular = null_vector(jnp.concatenate([rows_x, rows_y]))
     a, b, c = h.reshape(3, 4)
     P = jnp.stack([l * a + n[0] * c, l * b + n[1] * c, c])
@@ -79,14 +82,14 @@ def direct_linear_transformation(
     at_mean = P[2, :3] @ m + P[2, 3]
     size = extent(X, p)
     status = first_of(
-        (size[1] < SMALLEST_SINGULAR_VALUE, Status.COLLINEAR_POINTS),
-        (size[2] < SMALLEST_SINGULAR_VALUE, Status.COPLANAR_POINTS),
-        (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0], Status.UNDETERMINED),
+        (size[1] < RANK_TOLERANCE, Status.COLLINEAR_POINTS),
+        (size[2] < RANK_TOLERANCE, Status.COPLANAR_POINTS),
+        (singular[-2] < RANK_TOLERANCE * singular[0], Status.UNDETERMINED),
     )
     return P / jnp.where(at_mean == 0, 1, at_mean), status
 
 
-def decompose(P: Float[AnyArray, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
+def decompose(P: Float[AnyArray, "3 4"]) -> tuple[CameraWithPose, Int[Array, ""]]:
     """The camera without distortion whose projection matrix is P, w > 0 in front of it.
 
     `BEHIND_THE_CAMERA`: the image is mirrored (y down); the camera then sees it from behind.
@@ -94,6 +97,8 @@ def decompose(P: Float[AnyArray, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
     # w = −q is positive in front: −P's left part has the determinant fx·fy·|m₃|³ > 0
     mirrored = jnp.linalg.det(P[:, :3]) > 0
     A = jnp.where(mirrored, P, -P)
+    # An RQ decomposition by Gram–Schmidt, from the last row to the first, differentiable and with
+    # the signs of D·M·K fixed; that of LAPACK leaves the signs of the diagonal open.
     length = jnp.linalg.norm(A[2, :3])
     a, b, m3 = A[:, :3] / length
     x0, y0 = a @ m3, b @ m3
@@ -104,12 +109,12 @@ def decompose(P: Float[AnyArray, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
     fx = jnp.linalg.norm(rest)
     M = jnp.stack([-rest / fx, m2, m3])
     X0 = -jnp.linalg.solve(A[:, :3], A[:, 3])
-    camera = Camera(jnp.stack([fx, fy, skew, x0, y0]), jnp.zeros(0, P.dtype), Pose(X0, M))
+    camera = CameraWithPose(jnp.stack([fx, fy, skew, x0, y0]), jnp.zeros(0, P.dtype), Pose(X0, M))
     return camera, first_of((mirrored, Status.BEHIND_THE_CAMERA))
 
 
 def refine_camera(
-    camera: Camera,
+    camera: CameraWithPose,
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
@@ -122,7 +127,7 @@ def refine_camera(
     """
     p = ones_unless(weights, xy)
     missing = radial - camera.radial.shape[0]
-    start = Camera(camera.interior, jnp.pad(camera.radial, (0, missing)), camera.pose)
+    start = CameraWithPose(camera.interior, jnp.pad(camera.radial, (0, missing)), camera.pose)
     data = (xy, X, jnp.sqrt(p))
     fit = adjust(_misclosures, _retract, start, data, 11 + radial)
     behind = jax.vmap(to_camera, (None, 0))(fit.estimate.pose, X)[:, 2] >= 0
@@ -133,27 +138,32 @@ def refine_camera(
     return RefinedCamera(fit.estimate, fit.vtpv, fit.cofactor, status)
 
 
-def project(camera: Camera, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
+def project(camera: CameraWithPose, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
     """The image of a point without distortion, relative to the principal point."""
     fx, fy, skew = camera.interior[:3]
     x, y = image_of(camera.pose, X)
     return jnp.stack([fx * x + skew * y, fy * y])
 
 
-def correct(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
+def correct(camera: CameraWithPose, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """A measured point relative to the principal point, corrected for radial distortion."""
     reduced = jnp.asarray(xy) - camera.interior[3:]
     square = reduced @ reduced
     return reduced * (1 + sum(K * square ** (i + 1) for i, K in enumerate(camera.radial)))
 
 
-def _misclosures(camera, xy, X, root):
-    one = lambda xy, X, root: root * (project(camera, X) - correct(camera, xy))
-    return jax.vmap(one)(xy, X, root).ravel()
+def _misclosures(
+    camera: CameraWithPose,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    sqrt_weight: Float[AnyArray, " n"],
+) -> Float[Array, " 2n"]:
+    point = lambda xy, X, sqrt_p: sqrt_p * (project(camera, X) - correct(camera, xy))
+    return jax.vmap(point)(xy, X, sqrt_weight).ravel()
 
 
-def _retract(camera, delta):
-    return Camera(
+def _retract(camera: CameraWithPose, delta: Float[Array, " u"]) -> CameraWithPose:
+    return CameraWithPose(
         camera.interior + delta[:5],
         camera.radial + delta[11:],
         retract_pose(camera.pose, delta[5:11]),

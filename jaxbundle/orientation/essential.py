@@ -25,14 +25,16 @@ from jaxbundle.orientation.linear import normalisation, null_space, null_vector,
 from jaxbundle.orientation.pose import ray_of
 from jaxbundle.types import AnyArray
 
-REAL = 1e-6
-"""A root is real if its imaginary part is below this part of its length."""
 
-# Exponents of x, y, z: the ten of degree three first, then the basis of the quotient.
-_CUBIC = [(3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2),
-          (0, 1, 2), (0, 0, 3)]  # fmt: skip
-_BASIS = [(2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0),
-          (0, 0, 1), (0, 0, 0)]  # fmt: skip
+def _exponents(degree: int) -> list[tuple[int, int, int]]:
+    """Exponents of the monomials xⁱ·yʲ·zᵏ of a degree, by falling powers of x and y."""
+    return [(n - j, j, degree - n) for n in range(degree, -1, -1) for j in range(n + 1)]
+
+
+# The ten monomials of degree three are eliminated; the ten of lower degree are a basis of the
+# polynomials modulo the ten equations, in which multiplication by x is a matrix.
+_CUBIC = _exponents(3)
+_BASIS = [*_exponents(2), *_exponents(1), *_exponents(0)]
 
 
 @without_masks
@@ -74,8 +76,9 @@ def five_solutions(
     xy2: Float[AnyArray, "n 2"],
     weights: Float[AnyArray, " n"] | None = None,
 ) -> tuple[Float[Array, "10 3 3"], Bool[Array, "10"]]:
-    """As `five_points`, of any length, and essential only to rounding, or not at all if invalid:
-    sufficient for `orientations`."""
+    """As `five_points`, but without projection to the nearest essential matrix: of any length, and
+    essential only to rounding, or not at all if invalid. `orientations` takes the nearest itself.
+    """
     p = ones_unless(weights, xy1)
     a1, a2 = jax.vmap(ray_of)(stop_gradient(xy1)), jax.vmap(ray_of)(stop_gradient(xy2))
     space = null_space(_coplanarity(a1, a2, stop_gradient(p)), 4).reshape(4, 3, 3)
@@ -83,11 +86,15 @@ def five_solutions(
     reduced = jnp.linalg.solve(equations[:, :10], equations[:, 10:])
     times_x = jnp.asarray(_TAKE_CUBIC) @ -reduced + jnp.asarray(_TAKE_BASIS)
     x, vectors = jnp.linalg.eig(jnp.where(jnp.isfinite(times_x), times_x, 0))
+    # An eigenvector holds the values of the basis at a solution: its last entries are x, y, z, 1.
     last = vectors[9]
     xyz = vectors[6:9] / jnp.where(jnp.abs(last) > 0, last, 1)
     size = 1 + jnp.sum(jnp.abs(xyz), 0)
     usable = (jnp.abs(last) > 0) & jnp.all(jnp.isfinite(times_x))
-    valid = usable & (jnp.max(jnp.abs(xyz.imag), 0) < REAL * size)
+    # Rounding moves a double root by the root of 1e-16, 1e-8 of its length, off the real axis;
+    # 1e-6 leaves room for the elimination before. Truly complex pairs of noisy points are farther
+    # off, and serve as start values in `relative_orientation` all the same.
+    valid = usable & (jnp.max(jnp.abs(xyz.imag), 0) < 1e-6 * size)
     xyzw = jnp.concatenate([xyz.real, jnp.ones_like(xyz.real[:1])])
     E = jnp.einsum("as,aij->sij", jnp.where(usable, xyzw, 1), space)
     return E, valid
@@ -102,24 +109,29 @@ def orientations(E: Float[AnyArray, "3 3"]) -> tuple[Float[Array, "4 3 3"], Floa
     return jnp.stack([M[0], M[0], M[1], M[1]]), jnp.stack([b, -b, b, -b])
 
 
-def _to_normalised(xy, weights):
+def _to_normalised(
+    xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]
+) -> Float[Array, "3 3"]:
     """T with T·(x, y, −1) = (x', y', −1), of mean 0 and mean square 1 a coordinate."""
     (x, y), size = normalisation(xy, weights)
     nil, one = jnp.zeros_like(x), jnp.ones_like(x)
     return jnp.array([[one / size, nil, x / size], [nil, one / size, y / size], [nil, nil, one]])
 
 
-def _coplanarity(a1, a2, weights):
+def _coplanarity(
+    a1: Float[AnyArray, "n 3"], a2: Float[AnyArray, "n 3"], weights: Float[AnyArray, " n"]
+) -> Float[Array, "n 9"]:
+    """√p times the coefficients of a₂ᵀ·E·a₁ = 0, the elements of E row by row."""
     return jnp.sqrt(weights)[:, None] * (a2[:, :, None] * a1[:, None, :]).reshape(-1, 9)
 
 
-def _nearest_essential(E):
+def _nearest_essential(E: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The nearest matrix with singular values (1, 1, 0)."""
     U, _, Vt = jnp.linalg.svd(E)
     return U[:, :2] @ Vt[:2]
 
 
-def _cubic_equations(space):
+def _cubic_equations(space: Float[Array, "4 3 3"]) -> Float[Array, "10 20"]:
     """Coefficients [10, 20] of 2·E·Eᵀ·E − tr(E·Eᵀ)·E and det E, `_CUBIC` and `_BASIS`."""
     square = jnp.einsum("aij,bkj->ikab", space, space)
     trace = jnp.einsum("iiab->ab", square)
@@ -129,7 +141,7 @@ def _cubic_equations(space):
     return jnp.concatenate([nine, determinant.reshape(1, 64)]) @ jnp.asarray(_COLLECT)
 
 
-def _collect():
+def _collect() -> Float[np.ndarray, "64 20"]:
     """Sums the products of three of (x, y, z, 1) that are the same monomial [64, 20]."""
     monomials = _CUBIC + _BASIS
     out = np.zeros((64, 20))
@@ -139,7 +151,7 @@ def _collect():
     return out
 
 
-def _times_x():
+def _times_x() -> tuple[Float[np.ndarray, "10 10"], Float[np.ndarray, "10 10"]]:
     """Where x times the basis is found: among the cubic monomials, or in the basis again."""
     cubic, basis = np.zeros((10, 10)), np.zeros((10, 10))
     for row, (i, j, k) in enumerate(_BASIS):
@@ -152,3 +164,4 @@ def _times_x():
 _COLLECT = _collect()
 _TAKE_CUBIC, _TAKE_BASIS = _times_x()
 _PERMUTATION = np.cross(np.eye(3)[:, None], np.eye(3)[None])
+"""The permutation symbol of Levi-Civita: det E = Σ εⱼₖₗ·E₁ⱼ·E₂ₖ·E₃ₗ."""

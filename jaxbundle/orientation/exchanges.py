@@ -15,33 +15,43 @@ from jaxtyping import Bool, Float
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.growth import FITS, FOR_ITSELF, Model, are_controlled, intersect
+from jaxbundle.orientation.control_consistency import MIN_AGREEING
+from jaxbundle.orientation.growth import START_VALUE_DEMANDS, Model, are_controlled, intersect
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
-TRIPLES = 120
-"""Largest number of tested similarities of three points."""
-ALL_PAIRS_UP_TO = 12
-"""With at most this many points every swap of two is tried."""
-FEWEST_AGREEING = 4
-"""Minimum number of consistent points before the others are suspected; three always agree."""
-EXPECTED = 4.0
-"""Distance of a point in space, in σ of its coordinates, that chance explains: χ² of three degrees
-of freedom exceeds its square once in a thousand points."""
-EQUAL_FIT_RATIO = 3.0
-"""Explanations with a fit worse than the best by at most this factor are also reported."""
+MAX_POINTS_FOR_TRIALS = 12
+"""With at most this many points every swap of two (66) is tried, and every similarity of three
+(220) tested. More points have a majority, which needs no trial."""
 
 
-def name_contradiction(network: Network, seen: Sights | None = None, model=None) -> str:
+def name_contradiction(
+    network: Network,
+    seen: Sights | None = None,
+    model: Model | None = None,
+    settings: StartValueSettings = DEFAULTS,
+) -> str:
     """Which control points contradict the others and the correction, in words; empty if
     none do, or if no swap and no single point explains it.
 
     `model`: images oriented in any frame; default: those of the start values."""
     seen = sights(network) if seen is None else seen
     points = network.points
-    alone = _without_control(network, seen, model)
+    # The points determined by the images alone.
+    alone = Model.empty(seen)
+    if model is not None:
+        alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
+    else:
+        images = network.images
+        there = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
+        if there.any():
+            alone.place(there, images.position[there], many.matrices(images.angles[there]))
+    intersect(seen, alone, START_VALUE_DEMANDS)
     control = np.flatnonzero(are_controlled(points) & alone.known)
-    found = contradiction(alone.X[control], points.position[control], points.sigma[control])
+    found = contradiction(
+        alone.X[control], points.position[control], points.sigma[control], settings
+    )
     if found is None:
         return ""
     ids, unit = [points.id[p] for p in control], network.object_unit
@@ -86,27 +96,39 @@ def contradiction(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
     sigma: Float[np.ndarray, "n 3"] | None = None,
+    settings: StartValueSettings = DEFAULTS,
 ) -> Contradiction | None:
     """How two lists of points contradict each other after a similarity; None where they do not, or
     where no explanation is found.
 
-    Start values fit to 1/`FITS` of the extent, and control to `EXPECTED` of the largest of its
-    `sigma` (NaN: exact); the tolerance is the root of the sum of both squares."""
+    Start values fit to the extent by `extent_to_misfit`, and control to four times the largest of
+    its `sigma` (NaN: exact); the tolerance is the root of the sum of both squares."""
     n = len(source)
     if n < 3:
         return None
     largest = 0.0 if sigma is None else float(np.nan_to_num(sigma, posinf=0.0).max())
-    tolerance = float(np.hypot(np.ptp(target, axis=0).max() / FITS, EXPECTED * largest))
+    # Four σ of a coordinate: chance exceeds it in space once in a thousand points (the root of the
+    # 99.9 % quantile of χ² with three degrees of freedom is 4.03).
+    extent = np.ptp(target, axis=0).max()
+    tolerance = float(np.hypot(extent / settings.extent_to_misfit, 4 * largest))
     off = _misfits(source, target, np.ones(n, bool))
     if off is None or off.max() < tolerance:
         return None
     good = _agreeing(source, target, tolerance)
-    if good.sum() >= max(FEWEST_AGREEING, n / 2):
+    if good.sum() >= max(MIN_AGREEING, n / 2):
         return _by_majority(source, target, good, tolerance, off.max())
     return _by_trial(source, target, tolerance, off.max())
 
 
-def _by_majority(source, target, good, tolerance, before):
+def _by_majority(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    good: Bool[np.ndarray, " n"],
+    tolerance: float,
+    before: float,
+) -> Contradiction | None:
+    """Two of the points outside the largest consistent group are exchanged if both fit when
+    swapped; the others are wrong."""
     found = many.similarity(source, target, good.astype(float))
     if found is None:
         return None
@@ -123,12 +145,18 @@ def _by_majority(source, target, good, tolerance, before):
     return Contradiction(before, max(off), exchanges, sorted(suspects), together=True)
 
 
-def _by_trial(source, target, tolerance, before):
+def _by_trial(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    tolerance: float,
+    before: float,
+) -> Contradiction | None:
+    """Every swap of two, and every point left out: those after which all points fit."""
     n = len(source)
-    if n > ALL_PAIRS_UP_TO:
+    if n > MAX_POINTS_FOR_TRIALS:
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
-    trials += [((), (k,)) for k in range(n) if n >= FEWEST_AGREEING]
+    trials += [((), (k,)) for k in range(n) if n >= MIN_AGREEING]
     found = []
     for pair, left_out in trials:
         order = np.arange(n)
@@ -139,19 +167,25 @@ def _by_trial(source, target, tolerance, before):
             found.append((off[use].max(), pair, left_out))
     if not found:
         return None
+    # Of few points several explanations fit. Their misfits are of a few redundant coordinates each,
+    # whose chance differs by a factor of three easily; what fits worse than that is no equal.
     best = min(found)[0]
-    found = [entry for entry in sorted(found) if entry[0] <= EQUAL_FIT_RATIO * best]
+    found = [entry for entry in sorted(found) if entry[0] <= 3 * best]
     exchanges = [pair for _, pair, _ in found if pair]
     wrong = [k for *_, left_out in found for k in left_out]
     return Contradiction(before, best, exchanges, wrong, together=False)
 
 
-def _agreeing(source, target, tolerance) -> Bool[np.ndarray, " n"]:
-    """The most points that fit one similarity from three of them, seen once more."""
-    triples = list(itertools.islice(itertools.combinations(range(len(source)), 3), 2 * TRIPLES))
-    if len(source) > ALL_PAIRS_UP_TO:
+def _agreeing(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], tolerance: float
+) -> Bool[np.ndarray, " n"]:
+    """The most points that fit one similarity from three of them, and after it once more."""
+    if len(source) <= MAX_POINTS_FOR_TRIALS:
+        triples = list(itertools.combinations(range(len(source)), 3))
+    else:
+        # With half of the points wrong an eighth of the triples is good: fifteen of 120.
         rng = np.random.default_rng(0)
-        triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIPLES)]
+        triples = [rng.choice(len(source), 3, replace=False) for _ in range(120)]
     best = np.zeros(len(source), bool)
     for triple in triples:
         use = np.isin(np.arange(len(source)), triple)
@@ -162,25 +196,14 @@ def _agreeing(source, target, tolerance) -> Bool[np.ndarray, " n"]:
     return best if off is None else off < tolerance
 
 
-def _misfits(source, target, use):
+def _misfits(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    use: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"] | None:
     """Distances of points after the similarity of some of them; None: these are on a line."""
     found = many.similarity(source, target, use.astype(float))
     if found is None:
         return None
     A, t = found
     return np.linalg.norm(source @ A.T + t - target, axis=1)
-
-
-def _without_control(network: Network, seen: Sights, model: Model | None) -> Model:
-    """The points determined by the images alone."""
-    alone = Model.empty(seen)
-    if model is None:
-        images = network.images
-        there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
-        if there.any():
-            M = many.matrices(images.angles[there])
-            alone.place(there, images.position[there], M)
-    else:
-        alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
-    intersect(seen, alone, FOR_ITSELF)
-    return alone

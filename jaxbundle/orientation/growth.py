@@ -2,38 +2,24 @@
 
     known points ──resection──▶ images ──intersection──▶ more points ──▶ …
 
-An image is resected from at least `FEWEST_POINTS` known points, most of which must agree; images
+An image is resected from at least `min_points` known points, enough of which must agree; images
 with the most known points come first. A point is intersected from at least two consistent rays with
 an angle above `Demands.angle`. All tests use the tolerance of start values; the subsequent
-adjustment refines the result.
+adjustment refines the result. The numbers are those of `StartValueSettings`.
 """
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.network.tables import Points
 from jaxbundle.orientation import many
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import Sights, in_plane
 from jaxbundle.orientation.status import Status
-
-FEWEST_POINTS = 4
-"""Minimum known points of an image: three, and one to choose among their solutions."""
-ENOUGH, WAITING = 12, 0.4
-"""An image waits while it has fewer known points, or less than this fraction of the maximum of all
-images."""
-DRIFTS, LARGER = 30, 2.5
-"""Number of images for the first improvement of a model, and its growth factor until the next."""
-FITS = 30.0
-"""Control fits a model of start values, whose cameras may have an unknown distortion, to this part
-of its extent."""
-PARALLEL, FAR_AWAY = 2e-3, 2e3
-"""Maximum angle, radians, between the rays of a distant point and their mean; and its distance, in
-radii of the positions of the images."""
-AGREEING_SHARE = 0.4
-"""Minimum fraction of consistent points of an image or a pair."""
+from jaxbundle.types import Index
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,22 +31,24 @@ class Demands:
     miss: float
 
 
-FOR_OTHERS = Demands(0.02, 1.0)
-"""A point known well enough for resection."""
-FOR_ITSELF = Demands(1e-3, 4.0)
-"""A point that needs a start value."""
+RESECTION_DEMANDS = Demands(0.02, 1.0)
+"""A point known well enough for resection: an angle of 0.02 (1.1°) makes an error of a direction 50
+times as large along the ray, which an image from the side sees in full."""
+START_VALUE_DEMANDS = Demands(1e-3, 4.0)
+"""A point that needs a start value: the adjustment decides about it. Its rays may miss it by more
+than `gross_ratio`, so that one bad ray of two is excluded and named, not the point lost."""
 
 
 @dataclasses.dataclass
 class Model:
-    """Images and points of one frame; a point that is `held` (control) is never intersected."""
+    """Images and points of one frame; a point that is `control` is never intersected."""
 
     X0: Float[np.ndarray, "images 3"]
     M: Float[np.ndarray, "images 3 3"]
     placed: Bool[np.ndarray, " images"]
     X: Float[np.ndarray, "points 3"]
     known: Bool[np.ndarray, " points"]
-    held: Bool[np.ndarray, " points"]
+    control: Bool[np.ndarray, " points"]
 
     @classmethod
     def empty(cls, sights: Sights) -> "Model":
@@ -74,24 +62,29 @@ class Model:
             np.zeros(points, bool),
         )
 
-    def place(self, image, X0, M) -> None:
+    def place(
+        self,
+        image: Index | Bool[np.ndarray, " images"],
+        X0: Float[np.ndarray, "*_ 3"],
+        M: Float[np.ndarray, "*_ 3 3"],
+    ) -> None:
         """An image, or several, with their poses."""
         self.X0[image], self.M[image], self.placed[image] = X0, M, True
 
-    def without(self, images: Bool[np.ndarray, " images"]) -> "Model":
-        """A copy without these images, and with only the held points."""
-        X = np.where(self.held[:, None], self.X, np.nan)
+    def copy_without(self, images: Bool[np.ndarray, " images"]) -> "Model":
+        """A copy without these images, and with only the control points."""
+        X = np.where(self.control[:, None], self.X, np.nan)
         return dataclasses.replace(
             self,
             X0=self.X0.copy(),
             M=self.M.copy(),
             placed=self.placed & ~images,
             X=X,
-            known=self.known & self.held,
+            known=self.known & self.control,
         )
 
     def transform(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
-        """The same model in the frame X' = A·X + t, A a rotation times a scale."""
+        """The model in the frame X' = A·X + t, A a rotation times a scale."""
         R = A / np.cbrt(np.linalg.det(A))
         return dataclasses.replace(self, X0=self.X0 @ A.T + t, M=self.M @ R.T, X=self.X @ A.T + t)
 
@@ -103,16 +96,19 @@ def are_controlled(points: Points) -> Bool[np.ndarray, " points"]:
     )
 
 
-def are_held(points: Points) -> Bool[np.ndarray, " points"]:
-    """Controlled points whose coordinates serve as start values: σ below 1/`FITS` of the extent of
-    control. Less exact ones, such as those of handheld receivers, are intersected like tie points;
-    with them the model is moved to control, but no ray contradicts them."""
+def are_held(
+    points: Points, settings: StartValueSettings = DEFAULTS
+) -> Bool[np.ndarray, " points"]:
+    """Controlled points whose coordinates serve as start values: σ below the misfit allowed of
+    control (`extent_to_misfit`). Less exact ones, such as those of handheld receivers, are
+    intersected like tie points; with them the model is moved to control, but no ray contradicts
+    them."""
     known = are_controlled(points)
     if known.sum() < 3:  # they have no extent to compare with
         return known
     extent = np.ptp(points.position[known], axis=0).max()
     sigma = np.where(points.has_role("fixed")[:, None], 0.0, np.nan_to_num(points.sigma))
-    return known & (sigma.max(1) * FITS <= extent)
+    return known & (sigma.max(1) * settings.extent_to_misfit <= extent)
 
 
 Improve = Callable[[Sights, Model], None]
@@ -122,41 +118,49 @@ Improve = Callable[[Sights, Model], None]
 def grow(
     sights: Sights,
     model: Model,
-    among: Bool[np.ndarray, " images"] | None = None,
+    candidates: Bool[np.ndarray, " images"] | None = None,
     improve: Improve | None = None,
+    settings: StartValueSettings = DEFAULTS,
 ) -> None:
-    """Orient as many images as possible (`among` these), and intersect their points.
+    """Orient as many images as possible, all or the `candidates`, and intersect their points.
 
-    A growing model drifts; `improve` is called whenever it has grown by the factor `LARGER`."""
-    among = np.ones(sights.images, bool) if among is None else among
+    A growing model drifts: every image inherits the errors of the points it is resected from.
+    `improve` is called whenever the model has grown by a factor (2.5), so that all calls together
+    cost less than twice the last one."""
+    candidates = np.ones(sights.images, bool) if candidates is None else candidates
+    # Known points at the last try: an image is tried again only when it has more.
     tried = np.zeros(sights.images, int)
-    due = max(DRIFTS, LARGER * model.placed.sum())
-    intersect(sights, model, FOR_OTHERS)
+    due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
+    intersect(sights, model, RESECTION_DEMANDS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
-        waiting = among & ~model.placed & (known >= FEWEST_POINTS) & (known > tried)
+        waiting = candidates & ~model.placed & (known >= settings.min_points) & (known > tried)
         if not waiting.any():
             break
+        # Several at a time, those with the most points first; on repeated structures the images
+        # with few points are those most easily placed wrongly, and later they have more.
         most = known[waiting].max()
-        enough = min(max(ENOUGH, WAITING * most), most)
+        enough = min(max(settings.sufficient_points, settings.waiting_share * most), most)
         chosen = np.flatnonzero(waiting & (known >= enough))
         tried[chosen] = known[chosen]
-        if place_images(sights, model, chosen):
-            intersect(sights, model, FOR_OTHERS)
+        if _place_images(sights, model, chosen, settings):
+            intersect(sights, model, RESECTION_DEMANDS)
         if improve is not None and model.placed.sum() >= due:
             improve(sights, model)
-            due = LARGER * model.placed.sum()
+            due = settings.improvement_growth * model.placed.sum()
 
 
-def finish(sights: Sights, model: Model) -> None:
+def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
     """Repeat everything, images from all their points and points from all their rays."""
+    # Twice: the second time images are refined by points that already come from refined images.
+    # More passes would approach what the adjustment computes anyway.
     for _ in range(2):
-        intersect(sights, model, FOR_ITSELF, again=True)
-        _refine(sights, model)
-    intersect(sights, model, FOR_ITSELF, again=True)
+        intersect(sights, model, START_VALUE_DEMANDS, again=True)
+        _refine(sights, model, settings)
+    intersect(sights, model, START_VALUE_DEMANDS, again=True)
 
 
-def place_far_points(sights: Sights, model: Model) -> None:
+def place_far_points(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
     """Unknown points with at least three parallel rays: far away in their direction. Such rays
     hardly intersect, because of noise often behind the cameras.
 
@@ -170,42 +174,51 @@ def place_far_points(sights: Sights, model: Model) -> None:
     direction /= np.where(number > 0, np.linalg.norm(direction, axis=1), 1.0)[:, None]
     widest = np.zeros(sights.points)
     np.fmax.at(widest, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
-    far = (number >= 3) & (widest < PARALLEL) & ~model.held
+    far = (number >= 3) & (widest < settings.parallel_angle) & ~model.control
     if not far.any() or 2 * far.sum() > model.known.sum():
         return
     centres = model.X0[model.placed]
     middle = centres.mean(0)
     spread = np.sqrt(((centres - middle) ** 2).sum(1).mean())
-    model.X[far] = middle + FAR_AWAY * spread * direction[far]
+    model.X[far] = middle + settings.far_distance * spread * direction[far]
     model.known[far] = True
 
 
-def place_images(sights: Sights, model: Model, images) -> int:
+def _place_images(
+    sights: Sights, model: Model, images: Int[np.ndarray, " some"], settings: StartValueSettings
+) -> int:
     """Resect images from their known points; returns the number of oriented images."""
-    images, rows, R, xy = _turned(sights, model, images)
+    images, rows, R, xy = _in_planes(sights, model, images, settings)
     if not len(images):
         return 0
     X0, M, part = many.resect(
         xy, [model.X[sights.point[r]] for r in rows], sights.tolerance[images]
     )
     number = np.minimum([len(r) for r in rows], many.SLOTS)
-    good = (part >= AGREEING_SHARE) & (part * number >= FEWEST_POINTS)
+    good = (part >= settings.agreeing_share) & (part * number >= settings.min_points)
     for i, image in enumerate(images):
         if good[i]:
             model.place(image, X0[i], R[i].T @ M[i])
     return int(good.sum())
 
 
-def _turned(sights, model, images):
+def _in_planes(
+    sights: Sights, model: Model, images: Int[np.ndarray, " some"], settings: StartValueSettings
+) -> tuple[
+    Int[np.ndarray, " usable"],
+    list[Int[np.ndarray, " _"]],
+    Float[np.ndarray, "usable 3 3"],
+    list[Float[np.ndarray, "_ 2"]],
+]:
     """For each of the images with enough known points: their rows, and their coordinates in a
     camera turned by R (`sights.in_plane`)."""
     usable, chosen, R, xy = [], [], [], []
     for image in images:
-        rows = np.arange(sights.image.size)[sights.of(image)]
+        rows = np.arange(sights.image.size)[sights.rows_of(image)]
         rows = rows[model.known[sights.point[rows]]]
         turn, at = in_plane(sights.ray[rows])
         there = np.isfinite(at).all(1)
-        if there.sum() >= FEWEST_POINTS:
+        if there.sum() >= settings.min_points:
             usable.append(image)
             chosen.append(rows[there])
             R.append(turn)
@@ -213,12 +226,14 @@ def _turned(sights, model, images):
     return np.array(usable, int), chosen, np.reshape(R, (-1, 3, 3)), xy
 
 
-def _refine(sights: Sights, model: Model) -> None:
+def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
     """All oriented images improved by consistent points."""
     error = misclosures(sights, model)
-    images, rows, R, xy = _turned(sights, model, np.flatnonzero(model.placed))
+    images, rows, R, xy = _in_planes(sights, model, np.flatnonzero(model.placed), settings)
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
-    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= FEWEST_POINTS]
+    # Of the rows that `many` uses: an image whose good points are not among these would be refined
+    # by none.
+    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= settings.min_points]
     if not use:
         return
     images, rows, R = images[use], [rows[k] for k in use], R[use]
@@ -252,7 +267,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     point = sights.point[rows]
     first = np.searchsorted(point, np.arange(sights.points))
     number = np.bincount(point, minlength=sights.points)
-    wanted = np.flatnonzero((number >= 2) & ~model.held & (again | ~model.known))
+    wanted = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
     if not len(wanted):
         return
     place = np.minimum(np.arange(many.RAYS), number[wanted, None] - 1)
@@ -271,7 +286,8 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
         sound = status == int(Status.SOUND)
         agree = sound & (off.max(1) < 1)
         X[todo], good[todo] = found, agree & (angle > demands.angle)
-        # blunders: of two contradicting rays either may be wrong
+        # One ray a round: the worst one draws the point to itself, so that good rays miss it as
+        # well. Of two contradicting rays either may be wrong.
         more = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(off).all(1)
         weights[todo[more], off[more].argmax(1)] = 0.0
         todo = todo[more]
@@ -279,8 +295,11 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
     model.X[wanted] = np.where(good[:, None], X, np.nan)
 
 
-def _across(d, rays):
-    """Tangent of the angle between a direction and a unit ray; large if it points backwards."""
+def _across(
+    d: Float[np.ndarray, "n rays 3"], rays: Float[np.ndarray, "n rays 3"]
+) -> Float[np.ndarray, "n rays"]:
+    """Tangent of the angle between a direction and a unit ray; 1000, above all tolerances but
+    finite (a ray from there is dropped like others), if it points backwards."""
     along = np.einsum("nkj,nkj->nk", d, rays)
     across = np.linalg.norm(np.cross(d, rays), axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -20,15 +20,16 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxbundle.arguments import without_masks
-from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
+from jaxbundle.orientation.linear import (
+    RANK_TOLERANCE,
+    are_collinear,
+    normalisation,
+    null_vector,
+    ones_unless,
+)
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
-
-LINE = 1e-7
-"""Points whose second extent is below this part of the first lie on a line."""
-SMALLEST_SINGULAR_VALUE = 1e-7
-"""Second last singular value, in parts of the first, of a system that determines nothing."""
 
 
 @without_masks
@@ -47,15 +48,16 @@ def homography(
     p = ones_unless(weights, source)
     (m, k), (n, l) = normalisation(source, p), normalisation(target, p)
     X = jnp.pad((source - m) / k, ((0, 0), (0, 1)), constant_values=1)
-    xy, nil, root = (target - n) / l, jnp.zeros_like(X), jnp.sqrt(p)[:, None]
-    rows_x = root * jnp.hstack([X, nil, -xy[:, :1] * X])
-    rows_y = root * jnp.hstack([nil, X, -xy[:, 1:] * X])
+    xy, nil, sqrt_p = (target - n) / l, jnp.zeros_like(X), jnp.sqrt(p)[:, None]
+    rows_x = sqrt_p * jnp.hstack([X, nil, -xy[:, :1] * X])
+    rows_y = sqrt_p * jnp.hstack([nil, X, -xy[:, 1:] * X])
     h, singular = null_vector(jnp.concatenate([rows_x, rows_y]))
     H = _similarity(l, n) @ h.reshape(3, 3) @ jnp.linalg.inv(_similarity(k, m))
     at_mean = H[2, :2] @ m + H[2, 2]
     status = first_of(
-        (extent(source, p)[1] < LINE, Status.COLLINEAR_POINTS),
-        (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0], Status.UNDETERMINED),
+        (are_collinear(source, p), Status.COLLINEAR_POINTS),
+        # The last singular value is zero of exact data; a second one leaves H open.
+        (singular[-2] < RANK_TOLERANCE * singular[0], Status.UNDETERMINED),
     )
     return H / jnp.where(at_mean == 0, 1, at_mean), status
 
@@ -80,13 +82,15 @@ def interior_from_homographies(
 
     **Returns:** `PARALLEL_PLANES` where the views determine no camera.
     """
-    p = jnp.ones(H.shape[0], H.dtype) if weights is None else weights
+    p = ones_unless(weights, H)
     H = jnp.diag(jnp.array([1 / size, 1 / size, 1.0])) @ H
     H = H / jnp.linalg.norm(H, axis=(1, 2), keepdims=True)
     v = jax.vmap(_products, (0, None, None))
     rows = jnp.concatenate([v(H, 0, 1), v(H, 0, 0) - v(H, 1, 1)]) * jnp.tile(p, 2)[:, None]
     used = jnp.array([0, 1, 2, 3, 4, 5] if skew else [0, 2, 3, 4, 5])
     b, singular = null_vector(rows[:, used])
+    # K from B = K⁻ᵀ·K⁻¹ in closed form (Zhang, 2000, appendix B); with noise B need not be positive
+    # definite, and then there is no camera.
     b11, b12, b22, b13, b23, b33 = jnp.zeros(6, b.dtype).at[used].set(b)
     minor = b11 * b22 - b12**2
     y0 = (b12 * b13 - b11 * b23) / minor
@@ -95,7 +99,7 @@ def interior_from_homographies(
     fx, fy = jnp.sqrt(jnp.where(squares > 0, squares, 1))
     s = -b12 * fx**2 * fy / scale
     x0 = s * y0 / fy - b13 * fx**2 / scale
-    bad = (singular[-2] < SMALLEST_SINGULAR_VALUE * singular[0]) | ~jnp.all(squares > 0)
+    bad = (singular[-2] < RANK_TOLERANCE * singular[0]) | ~jnp.all(squares > 0)
     return size * jnp.stack([fx, fy, s, x0, y0]), first_of((bad, Status.PARALLEL_PLANES))
 
 
@@ -112,18 +116,21 @@ def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5
     length = jnp.linalg.norm(A[:, :2], axis=0)
     unit = lambda a: a / jnp.linalg.norm(a)
     first, second = (A[:, :2] / length).T
+    # The bisectors of two unit vectors are perpendicular; so are the vectors at 45° to them, each
+    # turned by half of the error.
     p, q = unit(first + second), unit(first - second)
     first, second = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
     M = jnp.stack([first, second, jnp.cross(first, second)], 1)
     return Pose(-M.T @ A[:, 2] * 2 / jnp.sum(length), M)
 
 
-def _similarity(scale, shift):
+def _similarity(scale: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "3 3"]:
+    """The matrix of scale·[x, y] + shift in homogeneous coordinates."""
     nil, one = jnp.zeros_like(scale), jnp.ones_like(scale)
     return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, one]])
 
 
-def _products(H, i, j):
+def _products(H: Float[AnyArray, "3 3"], i: int, j: int) -> Float[Array, "6"]:
     """hᵢᵀ·B·hⱼ as the coefficients of (B11, B12, B22, B13, B23, B33)."""
     a, b = H[:, i], H[:, j]
     return jnp.stack(

@@ -22,9 +22,6 @@ from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
-PARALLEL = 1e-7
-"""Angle of intersection, in radians, below which rays are parallel."""
-
 
 class Intersection(eqx.Module):
     """X and its cofactors in the object unit, vᵀPv, angle of intersection in radians.
@@ -55,10 +52,17 @@ def intersection(
     """
     p = ones_unless(weights, X0)
     d = rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
-    angle = _widest(stop_gradient(d), p)
-    parallel = angle < PARALLEL
+    # Of the angles the sine is exact where the cosine is flat, and vice versa.
+    lines = stop_gradient(d)
+    sine = jnp.linalg.norm(jnp.cross(lines[:, None], lines[None]), axis=-1)
+    angles = jnp.arctan2(sine, jnp.abs(lines @ lines.T))
+    angle = jnp.max(jnp.where((p[:, None] > 0) & (p > 0), angles, 0))
+    # The least eigenvalue of N is p·angle²/2 of two rays: 5e-15·p at 1e-7 rad, of which rounding
+    # (1e-16) leaves one or two figures. Directions are measured to 1e-6 rad at best.
+    parallel = angle < 1e-7
     across = jnp.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None, :]
     N = jnp.einsum("n,nij->ij", p, across)
+    # Relative to the mean centre: with map coordinates in the millions g would lose their figures.
     middle = p @ X0 / jnp.sum(p)
     g = jnp.einsum("n,nij,nj->i", p, across, X0 - middle)
     start = jnp.linalg.solve(jnp.where(parallel, jnp.eye(3, dtype=d.dtype), N), g) + middle
@@ -74,26 +78,26 @@ def intersection(
     return Intersection(fit.estimate, fit.vtpv, cofactor, angle, status)
 
 
-def _widest(d, p):
-    """The sine is exact where the cosine is flat, and vice versa."""
-    sine = jnp.linalg.norm(jnp.cross(d[:, None], d[None]), axis=-1)
-    angles = jnp.arctan2(sine, jnp.abs(d @ d.T))
-    return jnp.max(jnp.where((p[:, None] > 0) & (p > 0), angles, 0))
-
-
-def _misclosures(X, X0, d, root):
-    return jax.vmap(misclosure, (None, 0, 0, 0))(X, X0, d, root).ravel()
+def _misclosures(
+    X: Float[AnyArray, "3"],
+    X0: Float[AnyArray, "n 3"],
+    d: Float[AnyArray, "n 3"],
+    sqrt_weight: Float[AnyArray, " n"],
+) -> Float[Array, " 2n"]:
+    return jax.vmap(misclosure, (None, 0, 0, 0))(X, X0, d, sqrt_weight).ravel()
 
 
 def misclosure(
     X: Float[AnyArray, "3"],
     X0: Float[AnyArray, "3"],
     d: Float[AnyArray, "3"],
-    root: Float[AnyArray, ""],
+    sqrt_weight: Float[AnyArray, ""],
 ) -> Float[Array, "2"]:
     """√p·v of a point and a ray: tangents of the angles across it; `d` of length 1."""
+    # The coordinate axis farthest from the ray is never parallel to it. The choice jumps, but |v|
+    # does not depend on it.
     axis = jnp.eye(3, dtype=d.dtype)[jnp.argmin(jnp.abs(stop_gradient(d)))]
     e = jnp.cross(d, axis)
     e = e / jnp.linalg.norm(e)
     r, s, t = jnp.stack([e, jnp.cross(d, e), d]) @ (X - X0)
-    return jnp.asarray(root) * jnp.stack([r / t, s / t])
+    return jnp.asarray(sqrt_weight) * jnp.stack([r / t, s / t])

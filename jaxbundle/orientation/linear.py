@@ -9,29 +9,41 @@ value. Its derivatives, of every order, also where that value is zero, are those
 import jax.numpy as jnp
 from jax import Array
 from jax.lax import stop_gradient
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.types import AnyArray
+
+RANK_TOLERANCE = 1e-7
+"""Singular values below this part of the largest count as zero: points lie on a line or in a plane,
+or linear equations leave a parameter open. It lies between rounding and noise: rounding is 1e-16 of
+a coordinate, so 1e-10 of the extent of points a million extents from the origin (map coordinates);
+measurements of images are good to 1e-6 of the format at best, which spreads even the points of a
+line by more. So it finds degenerate configurations of exact data; of measured data the cofactors
+show them."""
 
 
 def null_vector(
     A: Float[AnyArray, "rows n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
-    _, s, Vt = _right_singular(stop_gradient(A))
+    s, Vt = _right_singular(stop_gradient(A))
     root = (Vt[-1], s[-1] ** 2)
+    # The derivatives of an SVD divide by singular values, of which the last is zero for exact data;
+    # those of the root need only that it is a single one.
     return implicit_root(_null_equations, solve_dense, root, None, A)[0], s
 
 
-def _null_equations(root, _, A):
+def _null_equations(
+    root: tuple[Float[Array, " n"], Float[Array, ""]], _: None, A: Float[AnyArray, "rows n"]
+) -> tuple[Float[AnyArray, " n"], Float[Array, ""]]:
     h, eigenvalue = root
     return A.T @ (A @ h) - eigenvalue * h, 0.5 * (h @ h - 1)
 
 
 def null_space(A: Float[AnyArray, "rows n"], k: int) -> Float[Array, "k n"]:
     """The k right singular vectors of the least singular values, without derivative."""
-    return _right_singular(stop_gradient(A))[2][-k:]
+    return _right_singular(stop_gradient(A))[1][-k:]
 
 
 def normalisation(
@@ -48,8 +60,15 @@ def extent(points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]) -> Fl
     """Extents along the principal axes relative to the largest: (1, 0, 0) of points on a line."""
     mean, _ = normalisation(points, weights)
     rows = stop_gradient(jnp.sqrt(weights)[:, None] * (points - mean))
-    s = _right_singular(rows)[1]
+    s, _ = _right_singular(rows)
     return s / jnp.where(s[0] > 0, s[0], 1)
+
+
+def are_collinear(
+    points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
+) -> Bool[Array, ""]:
+    """Whether the points of weight > 0 lie on a line, or are one."""
+    return extent(points, weights)[1] < RANK_TOLERANCE
 
 
 def ones_unless(weights: Float[AnyArray, " n"] | None, points: AnyArray) -> Float[Array, " n"]:
@@ -58,7 +77,10 @@ def ones_unless(weights: Float[AnyArray, " n"] | None, points: AnyArray) -> Floa
     return ones if weights is None else jnp.asarray(weights)
 
 
-def _right_singular(A):
-    """SVD with all right singular vectors: empty rows are added to a flat matrix."""
+def _right_singular(
+    A: Float[AnyArray, "rows n"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Singular values and all right singular vectors: empty rows are added to a flat matrix."""
     missing = max(A.shape[1] - A.shape[0], 0)
-    return jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)
+    _, s, Vt = jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)
+    return s, Vt

@@ -16,11 +16,11 @@ from which little grows is replaced by the next.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
@@ -34,9 +34,8 @@ from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given
 from jaxbundle.orientation.conventions import name_image_extent
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
-    AGREEING_SHARE,
-    FEWEST_POINTS,
-    FOR_OTHERS,
+    RESECTION_DEMANDS,
+    Improve,
     Model,
     are_controlled,
     are_held,
@@ -45,29 +44,11 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import TOLERANCE, Sights, in_plane, sights
 from jaxbundle.types import Index
 
-FEWEST_COMMON = 6
-"""Minimum common points of a starting pair."""
-PAIRS = 16
-"""Largest number of pairs for relative orientation."""
-SEEDS = 6
-"""Largest number of pairs a model is grown from."""
-EXCLUSION_RATIO = 3.0
-"""Image points with larger misclosures, in tolerances, are excluded."""
-CONTRADICTED_SHARE = 0.1
-"""Fraction of rays that miss their control points, or of points whose rays do not intersect, above
-which a mirror image is tested."""
-LEAST_CONTROL = 3
-"""Minimum remaining control points for the datum."""
-SUFFICIENT_SHARE = 0.8
-"""A model that uses at least this fraction of the image points is accepted without alternatives."""
-DOUBTFUL = 0.5
-"""Share of agreeing rays, relative to the median of the images, below which one is resected
-again."""
-WIDE_ANGLE = 0.5
-"""Angle of intersection, radians, beyond which wider is no better."""
+CONTRADICTION = "that contradict the start values"
 
 
 @print_in_one_screen
@@ -140,7 +121,10 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
 
 
 def find_start_values(
-    network: Network, improve: Callable | None = None, tolerance: float = TOLERANCE
+    network: Network,
+    improve: Callable[[Network, Sights, Model], None] | None = None,
+    tolerance: float = TOLERANCE,
+    settings: StartValueSettings = DEFAULTS,
 ) -> Oriented:
     """Missing start values of a network; given ones are kept.
 
@@ -149,23 +133,27 @@ def find_start_values(
     Returns and raises like `jaxbundle.orient`, which adds intermediate adjustments.
     """
     network = check_tables(network)
-    for one in network.further:
-        network = one.begin(network)
+    for rows in network.further:
+        network = rows.begin(network)
     seen = sights(network, tolerance)
-    model, frame = _model(network, seen, improve and partial(improve, network))
+    model, frame = _orient(network, seen, improve and partial(improve, network), settings)
     if not model.placed.any():
-        why = _describe_mirror(network, seen) or _why_nothing(network, seen)
+        why = _describe_mirror(network, seen, settings) or _why_nothing(network, seen, settings)
         raise _no_start_values(network, why)
-    found = _result(network, seen, model, frame)
-    missed = _find_missed(network, seen, model)
-    finding = name_contradiction(network, seen, model) if missed.any() else ""
-    left = (are_controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
+    found = _result(network, seen, model, frame, settings)
+    # Control points that most of their rays miss grossly.
+    wrong = np.bincount(seen.point, _are_gross(seen, model, settings), seen.points)
+    rays = _rays_of(seen, model)
+    missed = are_held(network.points, settings) & (2 * wrong > rays)
+    finding = name_contradiction(network, seen, model, settings) if missed.any() else ""
+    left = (are_controlled(network.points) & ~missed & (rays > 0)).sum()
     why = ""
-    if _control_contradicts(network, seen, model):
-        why = _describe_mirror(network, seen) or (finding if left < LEAST_CONTROL else "")
+    if _control_contradicts(network, seen, model, settings):
+        # A datum needs three control points; with as many left the wrong ones are only excluded.
+        why = _describe_mirror(network, seen, settings) or (finding if left < 3 else "")
     if why:
         raise _no_start_values(network, why)
-    if missed.any() and left < LEAST_CONTROL:
+    if missed.any() and left < 3:
         finding = name_suspects(network, missed)
     if not finding:
         return found
@@ -175,69 +163,77 @@ def find_start_values(
 def _no_start_values(network: Network, why: str) -> NotSolvedError:
     extent = name_image_extent(network)
     causes = "; ".join(filter(None, (why, name_pixels(network), extent)))
-    return NotSolvedError(f"no start values found: {causes}", _names(network))
+    return NotSolvedError(
+        f"no start values found: {causes}", [f"image {id}" for id in network.images.id]
+    )
 
 
-def _find_missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
-    """Control points that most of their rays miss grossly."""
-    wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
-    return are_held(network.points) & (2 * wrong > _rays_of(seen, model))
-
-
-def _rays_of(seen: Sights, model: Model):
+def _rays_of(seen: Sights, model: Model) -> Int[np.ndarray, " points"]:
     """Rays of every point from oriented images."""
     return np.bincount(seen.point[model.placed[seen.image]], minlength=seen.points)
 
 
-def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
+def _control_contradicts(
+    network: Network, seen: Sights, model: Model, settings: StartValueSettings
+) -> bool:
     """Whether many rays miss their control points grossly, or many points have rays that do not
     intersect."""
     control = are_controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
-    wrong = _out_of_the_question(seen, model)
-    seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
+    wrong = _are_gross(seen, model, settings)
+    seen_twice = _rays_of(seen, model) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
-        wrong[rays].sum() > CONTRADICTED_SHARE * rays.sum()
-        or unmet.sum() > CONTRADICTED_SHARE * seen_twice.sum()
+        wrong[rays].sum() > settings.contradicted_share * rays.sum()
+        or unmet.sum() > settings.contradicted_share * seen_twice.sum()
     )
 
 
-def _describe_mirror(network: Network, seen: Sights) -> str:
+def _describe_mirror(network: Network, seen: Sights, settings: StartValueSettings) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
-    model = _from_a_pair(seen, Model.empty(seen), None)
-    return "" if model is None else describe_mirror(network, model)
+    model = _grow_from_a_pair(seen, Model.empty(seen), None, settings)
+    return "" if model is None else describe_mirror(network, model, settings)
 
 
-def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
-    model, frame = _given_model(network, seen), "in the frame given"
-    grow(seen, model, improve=improve)
+def _orient(
+    network: Network, seen: Sights, improve: Improve | None, settings: StartValueSettings
+) -> tuple[Model, str]:
+    """The model of steps 1 to 4 (see above), and its frame in words."""
+    model, frame = _start_from_given(network, seen, settings), "in the frame given"
+    grow(seen, model, improve=improve, settings=settings)
     if not model.placed.any():
-        approximate = _with_approximate_points(network, model)
-        grow(seen, approximate, improve=improve)
+        approximate = _with_approximate_points(network, model, settings)
+        grow(seen, approximate, improve=improve, settings=settings)
         model = approximate if approximate.placed.any() else model
     fixed = model.placed.any()
     while not model.placed.all():
-        part = _from_a_pair(seen, model, improve)
+        part = _grow_from_a_pair(seen, model, improve, settings)
         if part is None:
             break
         if model.placed.any():
             part = join(seen, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
-        grow(seen, model, improve=improve)
+        grow(seen, model, improve=improve, settings=settings)
+        # As soon as control is reached, it carries the rest: points that are held do not drift.
         if not fixed and (moved := move_to_given_frame(network, seen, model)):
             fixed, frame = True, "in the frame given"
-            model = _with_control(network, moved)
-            grow(seen, model, improve=improve)
-    finish(seen, model)
-    model = _place_doubtful_again(network, seen, model, improve)
-    place_far_points(seen, model)
+            model = _with_control(network, moved, settings)
+            grow(seen, model, improve=improve, settings=settings)
+    finish(seen, model, settings)
+    model = _place_doubtful_again(network, seen, model, improve, settings)
+    place_far_points(seen, model, settings)
     return (model, frame) if fixed else to_scale(network, model)
 
 
-def _place_doubtful_again(network: Network, seen: Sights, model: Model, improve) -> Model:
+def _place_doubtful_again(
+    network: Network,
+    seen: Sights,
+    model: Model,
+    improve: Improve | None,
+    settings: StartValueSettings,
+) -> Model:
     """The model, or a better one in which images with few agreeing rays are resected again, from
     the points of the others. An image that repeated parts of an object place wrongly was resected
     from few points, and hides it by leaving the others unknown."""
@@ -245,12 +241,13 @@ def _place_doubtful_again(network: Network, seen: Sights, model: Model, improve)
     if placed.sum() < 3:
         return model
     agreeing, share = _count_agreeing(seen, model)
-    doubtful = placed & ~_have_poses(network) & (share < DOUBTFUL * np.median(share[placed]))
+    limit = settings.doubtful_share * np.median(share[placed])
+    doubtful = placed & ~_have_poses(network) & (share < limit)
     if not doubtful.any() or (placed & ~doubtful).sum() < 2:
         return model
-    other = model.without(doubtful)
-    grow(seen, other, improve=improve)
-    finish(seen, other)
+    other = model.copy_without(doubtful)
+    grow(seen, other, improve=improve, settings=settings)
+    finish(seen, other, settings)
     lost = placed & ~other.placed & ~doubtful
     return model if lost.any() or _count_agreeing(seen, other)[0] <= agreeing else other
 
@@ -258,7 +255,7 @@ def _place_doubtful_again(network: Network, seen: Sights, model: Model, improve)
 def _count_agreeing(seen: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
     """The number of agreeing rays; and their share of those of every placed image that belong to
     known control or to points with two rays."""
-    checked = model.held | (_rays_of(seen, model) > 1)
+    checked = model.control | (_rays_of(seen, model) > 1)
     rays = model.placed[seen.image] & checked[seen.point]
     agree = rays & (misclosures(seen, model) < seen.tolerance[seen.image])
     number, good = (np.bincount(seen.image, r, seen.images) for r in (rays, agree))
@@ -271,95 +268,123 @@ def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
     return np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
 
 
-def _given_model(network: Network, seen: Sights) -> Model:
+def _start_from_given(network: Network, seen: Sights, settings: StartValueSettings) -> Model:
     """Images with all six start values, points with all three coordinates known."""
     model, images = Model.empty(seen), network.images
     there = _have_poses(network)
     if there.any():
         model.place(there, images.position[there], many.matrices(images.angles[there]))
-    return _with_control(network, model)
+    return _with_control(network, model, settings)
 
 
-def _with_control(network: Network, model: Model) -> Model:
-    held = are_held(network.points)
+def _with_control(network: Network, model: Model, settings: StartValueSettings) -> Model:
+    held = are_held(network.points, settings)
     X = np.where(held[:, None], network.points.position, model.X)
-    return dataclasses.replace(model, X=X, known=model.known | held, held=held)
+    return dataclasses.replace(model, X=X, known=model.known | held, control=held)
 
 
-def _with_approximate_points(network: Network, model: Model) -> Model:
+def _with_approximate_points(network: Network, model: Model, settings: StartValueSettings) -> Model:
     points = network.points
     given = np.isfinite(points.position).all(1) & ~points.has_role("check")
-    given &= are_held(points) | ~are_controlled(points)
+    given &= are_held(points, settings) | ~are_controlled(points)
     X = np.where(given[:, None], points.position, model.X)
     return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
 
 
-def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
+def _grow_from_a_pair(
+    seen: Sights, model: Model, improve: Improve | None, settings: StartValueSettings
+) -> Model | None:
     """The best of the models grown from a few good pairs of unoriented images; if some are
     oriented, from pairs with one of them, to a model that can be joined to theirs."""
     new, linked = ~model.placed, bool(model.placed.any())
-    old = _neighbours(seen, new) & model.placed
+    # Placed images that share enough points with unplaced ones.
+    of_new = np.zeros(seen.points, bool)
+    of_new[seen.point[new[seen.image]]] = True
+    shared = np.bincount(seen.image, of_new[seen.point], minlength=seen.images)
+    old = (shared >= settings.min_common_points) & model.placed
     best, most = None, 0
-    for image, other, first, second, b in _good_pairs(seen, new | old, old, linked):
+    for image, other, first, second, b in _good_pairs(seen, new | old, old, linked, settings):
         part = Model.empty(seen)
         part.place(image, np.zeros(3), first)
         part.place(other, b, second)
-        grow(seen, part, new | old, improve)
+        grow(seen, part, new | old, improve, settings)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
         if good > most and not (linked and join(seen, model, part) is None):
             best, most = part, good
-        if most >= SUFFICIENT_SHARE * rows.sum():
+        if most >= settings.sufficient_share * rows.sum():
             break
     return best
 
 
-def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.ndarray, " images"]:
-    """The images that share enough points with some of these."""
-    of_these = np.zeros(seen.points, bool)
-    of_these[seen.point[images[seen.image]]] = True
-    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= FEWEST_COMMON
-
-
-def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
+def _good_pairs(
+    seen: Sights,
+    candidates: Bool[np.ndarray, " images"],
+    old: Bool[np.ndarray, " images"],
+    linked: bool,
+    settings: StartValueSettings,
+) -> Iterator[
+    tuple[
+        Index,
+        Index,
+        Float[np.ndarray, "3 3"],
+        Float[np.ndarray, "3 3"],
+        Float[np.ndarray, "3"],
+    ]
+]:
     """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
     of an old image and another."""
-    pairs, common = _pairs_in_common(seen, among, old, linked)
+    pairs, common = _pairs_in_common(seen, candidates, old, linked, settings)
     if not len(pairs):
         return
     turned = [_common_points(seen, *pair) for pair in pairs]
-    enough = [len(xy) >= FEWEST_COMMON for *_, xy, _ in turned]
+    enough = [len(xy) >= settings.min_common_points for *_, xy, _ in turned]
     turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
     if not turned:
         return
     R, Q, xy, other_xy = zip(*turned)
     tolerance = seen.tolerance[pairs].mean(1)
     M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
-    worth = np.sqrt(common) * part * np.minimum(angle, WIDE_ANGLE)
-    usable = (part >= AGREEING_SHARE) & (angle > FOR_OTHERS.angle)
-    for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
+    # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
+    # `good_angle` images differ so much that many points are seen in one only.
+    worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
+    usable = (part >= settings.agreeing_share) & (angle > RESECTION_DEMANDS.angle)
+    for k in [k for k in np.argsort(-worth) if usable[k]][: settings.max_seeds]:
         yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
 
 
-def _pairs_in_common(seen: Sights, among, old, linked):
-    """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
+def _pairs_in_common(
+    seen: Sights,
+    candidates: Bool[np.ndarray, " images"],
+    old: Bool[np.ndarray, " images"],
+    linked: bool,
+    settings: StartValueSettings,
+) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
+    """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
-    pairs, number = _all_pairs(seen, among)
-    use = (number >= FEWEST_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
+    pairs, number = _all_pairs(seen, candidates)
+    use = (number >= settings.min_common_points) & (
+        (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
+    )
     pairs, number = pairs[use], number[use]
     order = np.argsort(-number, kind="stable")
+    # The pairs with the most points often have the shortest bases. So half of the pairs are spread
+    # over all that have 0.3 of the most points: with 60 % overlap along a strip, the next image but
+    # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
-    chosen = np.unique(
-        np.concatenate([order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]])
-    )
+    half = settings.max_pairs // 2
+    spread = many.spread(len(enough), settings.max_pairs - half)
+    chosen = np.unique(np.concatenate([order[:half], enough[spread]]))
     return pairs[chosen], number[chosen]
 
 
-def _all_pairs(seen: Sights, among):
+def _all_pairs(
+    seen: Sights, candidates: Bool[np.ndarray, " images"]
+) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Pairs of these images that share points [pairs, 2], and how many."""
     from scipy.sparse import coo_array, triu
 
-    rows = among[seen.image]
+    rows = candidates[seen.image]
     shape = (seen.images, seen.points)
     sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
     sees = sees.tocsr()
@@ -367,20 +392,34 @@ def _all_pairs(seen: Sights, among):
     return np.stack([common.row, common.col], 1), common.data
 
 
-def _common_points(seen: Sights, image: Index, other: Index):
+def _common_points(
+    seen: Sights, image: Index, other: Index
+) -> tuple[
+    Float[np.ndarray, "3 3"],
+    Float[np.ndarray, "3 3"],
+    Float[np.ndarray, "common 2"],
+    Float[np.ndarray, "common 2"],
+]:
     """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
-    one, two = seen.of(image), seen.of(other)
+    one, two = seen.rows_of(image), seen.rows_of(other)
     _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
     (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
     there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
     return R, Q, xy[there], other_xy[there]
 
 
-def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriented:
+def _result(
+    network: Network, seen: Sights, model: Model, frame: str, settings: StartValueSettings
+) -> Oriented:
     images, points = network.images, network.points
     position, angles = images.position.copy(), images.angles.copy()
     lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
-    model.placed[lacking & _disagrees(seen, model)] = False
+    # Images with too few consistent known points.
+    gross = _are_gross(seen, model, settings)
+    of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
+    wrong_share = 1 - settings.agreeing_share
+    disagrees = of_image(gross) > wrong_share * of_image(model.known[seen.point])
+    model.placed[lacking & disagrees] = False
     lacking &= model.placed
     position[lacking] = model.X0[lacking]
     if lacking.any():
@@ -388,10 +427,10 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = seen.row[_out_of_the_question(seen, model)]
+    wrong = seen.row[gross]
     keep = model.placed
     known = np.all(np.isfinite(X), axis=1)
-    reasons = explain_missing(network, seen, model, known)
+    reasons = explain_missing(network, seen, model, known, settings)
     rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
@@ -407,16 +446,13 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     return Oriented(network, frame, *reasons, names)
 
 
-CONTRADICTION = "that contradict the start values"
-
-
 def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
     """The network with notes that images or points were left out, by name with the reasons."""
     if not reasons:
         return network
     names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
     groups = {
-        why: tuple(id for id, one in reasons.items() if one == why)
+        why: tuple(id for id, reason in reasons.items() if reason == why)
         for why in dict.fromkeys(reasons.values())
     }
     network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
@@ -424,33 +460,35 @@ def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what:
     return network.replace(left_out=(*network.left_out, *notes))
 
 
-def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
+def _are_gross(
+    seen: Sights, model: Model, settings: StartValueSettings
+) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
-    return misclosures(seen, model) > EXCLUSION_RATIO * seen.tolerance[seen.image]
+    return misclosures(seen, model) > settings.gross_ratio * seen.tolerance[seen.image]
 
 
-def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
-    """The images with too few consistent known points."""
-    of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
-    known = of_image(model.known[seen.point])
-    return of_image(_out_of_the_question(seen, model)) > (1 - AGREEING_SHARE) * known
-
-
-def explain_missing(network: Network, seen: Sights, model: Model, known):
+def explain_missing(
+    network: Network,
+    seen: Sights,
+    model: Model,
+    known: Bool[np.ndarray, " points"],
+    settings: StartValueSettings = DEFAULTS,
+) -> tuple[dict[str, str], dict[str, str]]:
     """By id, why images are not placed, and why points are not `known`."""
     rays = np.bincount(seen.image, minlength=seen.images)
     of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
     images = {}
     for image in np.flatnonzero(~model.placed):
-        if of_known[image] < FEWEST_POINTS:
+        if of_known[image] < settings.min_points:
             why = (
                 f"it sees {of_known[image]} known points of {rays[image]}; "
-                f"{FEWEST_POINTS} are needed"
+                f"{settings.min_points} are needed"
             )
         else:
             why = (
-                f"fewer than {AGREEING_SHARE:.0%} of the {of_known[image]} known points it "
-                "sees agree on a pose: look for wrong point numbers, or a wrong principal distance"
+                f"fewer than {settings.agreeing_share:.0%} of the {of_known[image]} known "
+                "points it sees agree on a pose: look for wrong point numbers, or a wrong "
+                "principal distance"
             )
         images[network.images.id[image]] = why
     placed = model.placed[seen.image]
@@ -471,37 +509,30 @@ def explain_missing(network: Network, seen: Sights, model: Model, known):
     return images, points
 
 
-def _why_nothing(network: Network, seen: Sights) -> str:
+def _why_nothing(network: Network, seen: Sights, settings: StartValueSettings) -> str:
+    """What is lacking if no image could be oriented."""
+    fewest = settings.min_common_points
     known = are_controlled(network.points)
     control = np.bincount(seen.image, known[seen.point], minlength=seen.images)
     best = int(control.argmax())
     begin = (
-        f"no image sees {FEWEST_POINTS} control points that agree ({int(control[best])} in "
+        f"no image sees {settings.min_points} control points that agree ({int(control[best])} in "
         f"{network.images.id[best]!r} at most), and "
     )
-    one, other, most = _most_in_common(seen)
-    if most < FEWEST_COMMON:
+    one, other, most = 0, 0, 0
+    pairs, number = _all_pairs(seen, np.ones(seen.images, bool))
+    if len(number):
+        most = int(number.max())
+        one, other = pairs[number.argmax()]
+    if most < fewest:
         pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
         return (
-            f"{begin}no two images have the {FEWEST_COMMON} points in common that a relative "
+            f"{begin}no two images have the {fewest} points in common that a relative "
             f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
             "give start values"
         )
     return (
-        f"{begin}no two images share {FEWEST_COMMON} points whose rays meet at an angle ({most} "
+        f"{begin}no two images share {fewest} points whose rays meet at an angle ({most} "
         "points in common at most): take images from different positions, look for wrong point "
         "numbers, or give start values"
     )
-
-
-def _most_in_common(seen: Sights) -> tuple[int, int, int]:
-    """The two images with the most points in common, and how many."""
-    pairs, number = _all_pairs(seen, np.ones(seen.images, bool))
-    if not len(number):
-        return 0, 0, 0
-    best = int(number.argmax())
-    return int(pairs[best, 0]), int(pairs[best, 1]), int(number[best])
-
-
-def _names(network: Network) -> list[str]:
-    return [f"image {id}" for id in network.images.id]

@@ -10,17 +10,16 @@ reported.
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.sights import sights
+from jaxbundle.orientation.sights import Sights, sights
 
-FEWEST_COMMON = 5
-"""Minimum common points: a rotation has 3 parameters, the points 10 coordinates."""
-MOST_COMPARED = 200
-"""Number of images compared with the one that has the most image points."""
-NOISE = 3.0
-"""Misclosures up to this number of σ are explained by the measurements."""
+MAX_SIGMA_RATIO = 3.0
+"""Misclosures up to this number of σ are explained by the measurements. Medians of points are
+compared with it, which are 0.83 for good σ (Rayleigh distribution): σ of image points may be stated
+too small by a factor of 3.6."""
 
 
 def name_one_place(network: Network) -> str:
@@ -29,7 +28,9 @@ def name_one_place(network: Network) -> str:
     seen = sights(network)
     number = np.bincount(seen.image, minlength=seen.images)
     base = int(number.argmax())
-    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST_COMPARED]
+    # Two hundred images that differ from the first by a rotation only are from one place, however
+    # many follow; the message then names all images.
+    others = [image for image in np.flatnonzero(number).tolist() if image != base][:200]
     if not others or not all(_is_rotation(seen, base, image) for image in others):
         return ""
     names = [network.images.id[image] for image in sorted([base, *others])]
@@ -40,22 +41,22 @@ def name_one_place(network: Network) -> str:
     )
 
 
-def _is_rotation(seen, one: int, other: int) -> bool:
+def _is_rotation(seen: Sights, first: int, second: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
-    a, b = seen.of(one), seen.of(other)
+    a, b = seen.rows_of(first), seen.rows_of(second)
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
-    if len(k) < FEWEST_COMMON:
+    if len(k) < 5:  # a rotation has 3 parameters, five points 10 coordinates
         return False
     noise = np.sqrt(2 * (seen.sigma[a][k] ** 2 + seen.sigma[b][l] ** 2))
     rays = [seen.ray[a][k], seen.ray[b][l]]
-    if min(map(_field, rays)) ** 3 < NOISE * np.median(noise):
+    if min(map(_field, rays)) ** 3 < MAX_SIGMA_RATIO * np.median(noise):
         return False
     U, _, V = np.linalg.svd(rays[0].T @ rays[1])
     turn = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
     off = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
-    return bool(np.median(off / noise) < NOISE)
+    return bool(np.median(off / noise) < MAX_SIGMA_RATIO)
 
 
-def _field(rays) -> float:
+def _field(rays: Float[np.ndarray, "n 3"]) -> float:
     """The angle about the centre of the rays, radians: half of them are within it."""
     return float(np.median(np.linalg.norm(rays - np.median(rays, axis=0), axis=1)))

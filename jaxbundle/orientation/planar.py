@@ -17,6 +17,7 @@ Source: Ma, Soatto, Košecká and Sastry (2004), An Invitation to 3-D Vision, se
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.orientation.homography import homography
@@ -24,9 +25,6 @@ from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.pose import ray_of
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
-
-EQUAL_WITHIN = 1e-9
-"""Squares of singular values nearer than this are equal: there is no base."""
 
 
 class PlanarOrientations(eqx.Module):
@@ -54,16 +52,21 @@ def planar_orientations(
     H, status = homography(xy1, xy2, p)
     D = jnp.diag(jnp.array([1.0, 1.0, -1.0]))
     G = D @ H @ D
+    # H fixes G up to a factor: its size by the second singular value, which is 1 of M·(I − b·nᵀ/d);
+    # its sign by the points, which G maps to the same side.
     G = G / jnp.linalg.svd(G, compute_uv=False)[1]
     a1, a2 = jax.vmap(ray_of)(xy1), jax.vmap(ray_of)(xy2)
     G = G * jnp.where(jnp.sum(p * jnp.einsum("ni,ij,nj->n", a2, G, a1)) < 0, -1.0, 1.0)
     square, V = jnp.linalg.eigh(G.T @ G)
     v3, v2, v1 = V.T
     long, short = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
-    no_base = long + short < EQUAL_WITHIN
+    # λ₁ − λ₃ is about 2·|b|/d, the base by the distance of the plane: a base of 1e-9 of the
+    # distance moves no image point by what can be measured, and is far above rounding (1e-15).
+    no_base = long + short < 1e-9
     apart = jnp.sqrt(jnp.where(no_base, 1.0, long + short))
 
-    def solution(sign):
+    def solution(sign: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
+        """M, b, n, and whether the plane is in front of both cameras."""
         u = (jnp.sqrt(short) * v1 + sign * jnp.sqrt(long) * v3) / apart
         n = jnp.cross(v2, u)
         Gv, Gu = G @ v2, G @ u

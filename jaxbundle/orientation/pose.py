@@ -14,6 +14,7 @@ from jaxbundle.cameras.perspective import perspective
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.types import AnyArray
 
+# The collinearity equations of `cameras`, without a principal point.
 _ideal, _ = perspective((0,), up=True)
 
 

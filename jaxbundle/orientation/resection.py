@@ -13,18 +13,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.lax import stop_gradient
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import finish, minimise
-from jaxbundle.orientation.linear import extent, normalisation, ones_unless
+from jaxbundle.orientation.linear import are_collinear, normalisation, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray
-
-LINE = 1e-7
-"""Points whose second extent is below this part of the first lie on a line."""
 
 
 class Resection(eqx.Module):
@@ -61,11 +58,13 @@ def resection(
     poses, squares = jax.vmap(refine)(starts)
     behind = jax.vmap(lambda pose: jnp.sum(jnp.where(p > 0, _behind(pose, X), 0)))(poses)
     worst = jnp.where(jnp.isfinite(squares), behind, jnp.inf)
+    # First the fewest points behind the camera, then the least vᵀPv: a pose on the other side of a
+    # flat object fits the images as well.
     best = jnp.argmin(jnp.where(worst == jnp.min(worst), squares, jnp.inf))
     pose = jax.tree.map(lambda a: a[best], poses)
     fit = finish(_misclosures, retract_pose, pose, data, 6)
     status = first_of(
-        (extent(X, p)[1] < LINE, Status.COLLINEAR_POINTS),
+        (are_collinear(X, p), Status.COLLINEAR_POINTS),
         (~jnp.isfinite(worst[best]), Status.NO_SOLUTION),
         (~fit.determined, Status.DANGER_CYLINDER),
         (worst[best] > 0, Status.BEHIND_THE_CAMERA),
@@ -85,7 +84,7 @@ def refine_resection(
     pose, _ = minimise(_misclosures, retract_pose, pose, data, 6)
     fit = finish(_misclosures, retract_pose, pose, data, 6)
     status = first_of(
-        (extent(X, p)[1] < LINE, Status.COLLINEAR_POINTS),
+        (are_collinear(X, p), Status.COLLINEAR_POINTS),
         (~fit.determined, Status.DANGER_CYLINDER),
         (jnp.any(_behind(fit.estimate, X) & (p > 0)), Status.BEHIND_THE_CAMERA),
     )
@@ -104,10 +103,15 @@ def wide_triangle(xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]) ->
     return jnp.stack([i, j, k])
 
 
-def _misclosures(pose, xy, X, root):
+def _misclosures(
+    pose: Pose,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    sqrt_weight: Float[AnyArray, " n"],
+) -> Float[AnyArray, " 2n"]:
     computed = jax.vmap(image_of, (None, 0))(pose, X)
-    return (root[:, None] * (computed - xy)).ravel()
+    return (sqrt_weight[:, None] * (computed - xy)).ravel()
 
 
-def _behind(pose, X):
+def _behind(pose: Pose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
     return jax.vmap(to_camera, (None, 0))(pose, X)[:, 2] >= 0

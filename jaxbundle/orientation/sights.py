@@ -12,17 +12,22 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Float, Int
 
-from jaxbundle.cameras import default_parameters, get_model, image_ray
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Index
 
-LEAST_FORWARD = 0.15
-"""Least cosine of the angle between a ray and the axis of a camera (81°) for plane coordinates:
-beyond it they grow without limit, and with them the effect of noise."""
-PORTION = 4096
+MIN_COSINE = 0.15
+"""Of the angle between a ray and the axis of a camera (81°) for plane coordinates: beyond it they
+grow without limit, and with them the effect of noise: across the axis by 1/cos = 6.7, along the
+radius by its square."""
+TOLERANCE = 0.03
+"""Largest unknown lens distortion, relative to the image extent: that of wide-angle lenses of
+consumer cameras, whose parameters are not known before the adjustment. Smaller: such images are not
+oriented; larger: blunders of that size are accepted as start values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,14 +52,10 @@ class Sights:
     def images(self) -> int:
         return len(self.tolerance)
 
-    def of(self, image: Index) -> slice:
+    def rows_of(self, image: Index) -> slice:
         """The rows of an image."""
         first, last = np.searchsorted(self.image, [int(image), int(image) + 1])
         return slice(first, last)
-
-
-TOLERANCE = 0.03
-"""Largest unknown lens distortion, relative to the image extent."""
 
 
 def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
@@ -71,6 +72,7 @@ def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
             continue
         d[rows], sigma[rows] = rays_of(camera, rays.xy[rows], rays.sigma[rows])
         away = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
+        # The 95 % quantile: a few image points far outside are blunders, not the extent.
         if np.isfinite(away).any():
             extent[images.camera == c] = np.nanquantile(away, 0.95)
     rows = np.flatnonzero(np.isfinite(d).all(1))
@@ -94,9 +96,12 @@ def rays_of(
     model = get_model(camera.model)
     given = {**default_parameters(model), **camera.parameters}
     p = np.array([given[name] for name in model.parameters])
-    portions = -(-len(xy) // PORTION)
-    fill = lambda a: np.resize(a, (portions * PORTION, 2)).reshape(portions, PORTION, 2)
-    found = [_portion(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
+    # In batches of one size, so that one program serves all networks. Larger ones make small
+    # networks wait for rays they do not have, smaller ones cost calls; not critical.
+    batch = 4096
+    batches = -(-len(xy) // batch)
+    fill = lambda a: np.resize(a, (batches * batch, 2)).reshape(batches, batch, 2)
+    found = [_rays_of_batch(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
     d, noise = (np.concatenate([np.asarray(part[k]) for part in found]) for k in (0, 1))
     return d[: len(xy)], noise[: len(xy)]
 
@@ -114,7 +119,7 @@ def in_plane(
     """R and the coordinates x, y, with c = 1, of rays in the camera turned by R: the camera of the
     rays itself if they are all before it, else one whose axis is their mean. NaN for rays that are
     not before that one either."""
-    if (-rays[:, 2] > LEAST_FORWARD).all():
+    if (-rays[:, 2] > MIN_COSINE).all():
         return np.eye(3), _in_plane(rays)
     axis = -rays.mean(0)
     # The rotation that takes the axis to z; about x or y, whichever is farther from it.
@@ -126,19 +131,26 @@ def in_plane(
     return R, _in_plane(rays @ R.T)
 
 
-def _in_plane(ray):
-    there = -ray[:, 2] > LEAST_FORWARD
+def _in_plane(ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    there = -ray[:, 2] > MIN_COSINE
     return np.where(there[:, None], ray[:, :2] / np.where(there, -ray[:, 2], 1.0)[:, None], np.nan)
 
 
 @partial(compile_once, static=0)
-def _portion(model, p, xy, sigma):
+def _rays_of_batch(
+    model: CameraModel,
+    p: Float[Array, " parameters"],
+    xy: Float[Array, "batch 2"],
+    sigma: Float[Array, "batch 2"],
+) -> tuple[Float[Array, "batch 3"], Float[Array, " batch"]]:
     ray = lambda x, y: jnp.stack(image_ray(model, tuple(p), x, y))
 
-    def one(xy, sigma):
+    def ray_and_sigma(
+        xy: Float[Array, "2"], sigma: Float[Array, "2"]
+    ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         d = ray(*xy)
         # σ is small beside the image: the rays one σ away are as good as a derivative.
         moved = jnp.stack([ray(xy[0] + sigma[0], xy[1]), ray(xy[0], xy[1] + sigma[1])])
         return d, jnp.sqrt(jnp.sum((moved - d) ** 2) / 2)
 
-    return jax.vmap(one)(xy, sigma)
+    return jax.vmap(ray_and_sigma)(xy, sigma)

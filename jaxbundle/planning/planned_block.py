@@ -10,14 +10,6 @@ from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block
 from jaxbundle.planning.vertical_photographs import BlockDesign
 
-FEWEST_ROWS = 5
-"""Minimum rows and columns of tie points; odd, so that control points can be at the middles."""
-RELIEF = 0.02
-"""Heights of tie points vary by ± this fraction of the flying height."""
-MARGIN = 0.03
-"""Margin of points inside the area, relative to the footprint, so that relief does not move their
-images out."""
-
 
 def planned_network(
     design: BlockDesign,
@@ -28,6 +20,7 @@ def planned_network(
     control_sigma: float,
     control_every: int | None = None,
     seed: int = 0,
+    relief: float = 0.02,
 ) -> Network:
     """A simulated network of the block, datum by control.
 
@@ -36,16 +29,19 @@ def planned_network(
     with `control_every`, one per this number of bases along and strips across.
 
     **Arguments:** `camera` of a model in mm; `image_format` and `sigma_image` in mm; `area` as in
-    `design_block`; `control_sigma` object unit.
+    `design_block`; `control_sigma` object unit; `relief`: heights of tie points vary by ± this
+    fraction of the flying height.
     """
     counts = [_odd(length / step * 2) for length, step in zip(area, (design.base, design.spacing))]
     columns, rows = counts
+    # A margin of points inside the area of 3 % of the footprint: relief of 2 % of the flying height
+    # moves an image at the edge of the format, half a footprint from the nadir, by 1 % outwards.
     x, y = (
-        np.linspace(-0.5, 0.5, n) * (length - 2 * MARGIN * side)
+        np.linspace(-0.5, 0.5, n) * (length - 2 * 0.03 * side)
         for n, length, side in zip(counts, area, design.footprint)
     )
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * RELIEF * design.height
+    heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * relief * design.height
     targets = np.concatenate([grid, heights[:, None]], axis=1)
     along, across = (_control(n, control_every) for n in counts)
     control = [row * columns + column for row in across for column in along]
@@ -82,6 +78,7 @@ def _control(points: int, every: int | None) -> list[int]:
 
 
 def _odd(steps: float) -> int:
-    """An odd number of points for at least this many steps."""
-    n = max(FEWEST_ROWS, math.ceil(steps - 1e-9) + 1)
+    """An odd number of points for at least this many steps, so that control points can be at the
+    middles; at least five, so that a point is between those of control."""
+    n = max(5, math.ceil(steps - 1e-9) + 1)  # 3.0000000001 steps are three
     return n + (n + 1) % 2

@@ -12,27 +12,25 @@ sharp and without aliasing, and agrees with the true surface to far below 0.01 p
 """
 
 import dataclasses
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.arguments import at_least_zero, integer, numeric_array, vector
-from jaxbundle.cameras import default_parameters, get_model, image_ray
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
-from jaxbundle.planning.shapes import Shape
+from jaxbundle.planning.shapes import Shape, Tangent
 from jaxbundle.planning.texture import Texture
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import Scalar
 
-STRIP = 1 << 17
-"""Pixels that are rendered together."""
-RAYS = 1 << 16
-"""Batch size of rays: one program for all sizes of photographs."""
 NO_RAY = np.array([0.0, 0.0, 1.0])
 """Direction in place of a missing ray; what it meets is discarded."""
 
@@ -45,7 +43,7 @@ class Scene:
     shapes: tuple[Shape, ...]
     textures: tuple[Texture, ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.textures) == 1:
             object.__setattr__(self, "textures", self.textures * len(self.shapes))
         if not self.shapes or len(self.shapes) != len(self.textures):
@@ -67,7 +65,7 @@ class Sensor:
     fine: int = 2
     background: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         at_least_zero("sensor: noise", self.noise)
         integer("sensor: fine", self.fine, most=16)
 
@@ -121,10 +119,13 @@ def camera_rays(camera: Camera) -> Float[np.ndarray, "rows columns 3"]:
     v, u = np.indices((rows + 1, columns + 1)).reshape(2, -1)
     x, y = ((a - o) / s for a, o, s in zip((u, v), origin, step))
     out = np.empty((len(x), 3))
-    for first in range(0, len(x), RAYS):
-        chosen = np.minimum(np.arange(first, first + RAYS), len(x) - 1)
+    # In batches of one size: one program for all sizes of photographs. Larger ones make small
+    # photographs compute rays that are not used, smaller ones cost calls.
+    batch = 1 << 16
+    for first in range(0, len(x), batch):
+        chosen = np.minimum(np.arange(first, first + batch), len(x) - 1)
         ray = np.stack(_rays(model, parameters, x[chosen], y[chosen]), -1)
-        out[first : first + RAYS] = ray[: len(x) - first]
+        out[first : first + batch] = ray[: len(x) - first]
     return out.reshape(rows + 1, columns + 1, 3)
 
 
@@ -140,7 +141,9 @@ def render_rays(
     of a pixel.
     """
     rows, columns = (n - 1 for n in directions.shape[:2])
-    high = max(1, min(STRIP // (columns + 1), -(-rows // available_cores())))
+    # Strips of 2¹⁷ pixels, whose arrays (some twenty of 8 bytes a pixel, 20 MB) bound the memory of
+    # every core; of small photographs one strip a core.
+    high = max(1, min((1 << 17) // (columns + 1), -(-rows // available_cores())))
     starts = range(0, rows, high)
     strip = lambda r: _render_strip(
         scene, origins[r : r + high + 1], directions[r : r + high + 1], sensor
@@ -148,6 +151,7 @@ def render_rays(
     with ThreadPoolExecutor(available_cores()) as pool:
         parts = list(pool.map(strip, starts))
     grey, point, surface = (np.concatenate(p) for p in zip(*parts))
+    # Drawn for the whole photograph, so that the noise does not depend on the number of cores.
     rng = np.random.default_rng(sensor.seed)
     noise = sensor.noise * rng.standard_normal(grey.shape, dtype=np.float32)
     value = np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
@@ -181,15 +185,30 @@ def visible(
 
 
 @compile_once
-def _rays(model, parameters, x, y):
+def _rays(
+    model: CameraModel,
+    parameters: tuple[float, ...],
+    x: Float[np.ndarray, " batch"],
+    y: Float[np.ndarray, " batch"],
+) -> tuple[Scalar, Scalar, Scalar]:
     return image_ray(model, parameters, x, y)
 
 
-def _render_strip(scene, o, d, sensor):
+def _render_strip(
+    scene: Scene,
+    o: Float[np.ndarray, "high+1 columns+1 3"],
+    d: Float[np.ndarray, "high+1 columns+1 3"],
+    sensor: Sensor,
+) -> tuple[
+    Float[np.ndarray, "high columns"],
+    Float[np.ndarray, "high columns 3"],
+    Int[np.ndarray, "high columns"],
+]:
+    """Grey values without noise, points and surfaces of some rows."""
     along = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
     moved = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
     o, d = o[:-1, :-1], d[:-1, :-1]
-    ray = np.isfinite(d + along[0] + along[1]).all(-1)
+    ray = np.all(np.isfinite(d + along[0] + along[1]), axis=-1)
     t, surface = first_hits(scene, o, np.where(ray[..., None], d, NO_RAY))
     t, surface = np.where(ray, t, np.inf), np.where(ray, surface, -1)
     point = o + np.where(np.isfinite(t), t, np.nan)[..., None] * d
@@ -198,6 +217,8 @@ def _render_strip(scene, o, d, sensor):
         chosen = surface == k
         if chosen.any():
             length, X, ray = t[chosen], point[chosen], _first(d, chosen)
+            # Slopes by differences over 1e-6 of the distance, a thousandth of a pixel: below the
+            # root of rounding (1e-8 of the coordinates) they would be noise.
             tangent = shape.axes(X, 1e-6 * np.median(length))
             steps = [
                 _on_the_tangent_plane(tangent, length, ray, _first(b, chosen), _first(a, chosen))
@@ -208,24 +229,39 @@ def _render_strip(scene, o, d, sensor):
     return grey, point, surface
 
 
-def _first(a, chosen):
+def _first(
+    a: Float[np.ndarray, "rows columns 3"], chosen: Bool[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "3 n"]:
     """The chosen vectors, coordinates first."""
     return np.moveaxis(a[chosen], -1, 0).copy()
 
 
-def _on_the_tangent_plane(tangent, t, d, moved, turned):
+def _on_the_tangent_plane(
+    tangent: Tangent,
+    t: Float[np.ndarray, " n"],
+    d: Float[np.ndarray, "3 n"],
+    moved: Float[np.ndarray, "3 n"],
+    turned: Float[np.ndarray, "3 n"],
+) -> Float[np.ndarray, "2 n"]:
     """How the texture's coordinates change to the next pixel, two arrays [n]: the next ray, whose
     origin is moved and whose direction is turned, meets the tangent plane (Igehy, 1999, eq. 10)."""
     normal, axes = tangent
     shift = moved + t * turned
     d = d + turned
     across = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
-    across = np.where(np.abs(across) < 1e-9, 1e-9, across)
+    across = np.where(np.abs(across) < 1e-9, 1e-9, across)  # a ray along the surface
     back = (normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]) / across
     return axes @ (shift - back * d)
 
 
-def _mean_of_a_pixel(shape, texture, X, steps, fine):
+def _mean_of_a_pixel(
+    shape: Shape,
+    texture: Texture,
+    X: Float[np.ndarray, "n 3"],
+    steps: Sequence[Float[np.ndarray, "2 n"]],
+    fine: int,
+) -> Float[np.ndarray, " n"]:
+    """The mean of `fine` × `fine` samples over the parallelogram of a pixel; `steps`: its sides."""
     s, t = shape.coordinates(X)
     down, right = steps
     width = np.maximum(np.hypot(*down), np.hypot(*right)) / fine

@@ -13,28 +13,21 @@ Source: Hart (1996), Sphere tracing.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle.arguments import positive, vector
 from jaxbundle.errors import InputError
 from jaxbundle.types import present
 
-BLOCKS = (32, 8)
-"""Sides of the blocks of rays, rows and columns, before single rays."""
-STEPS, SECANTS = 400, 12
-NEAR_SURFACE = 1e-3
-"""A ray is traced to f below this fraction of the relief, then by secants."""
-GRAZING_TOLERANCE = 1e-9
-"""Like `NEAR_SURFACE`, if the secants diverge because the ray grazes a summit."""
-ON_SURFACE = 1e-9
-"""Tolerance of f for a point on the surface, relative to the length of the ray."""
-SAMPLES = 256
-"""Samples per side for bounds of height and slope if these are not given."""
-ALLOWANCE = 1.3
-"""Margin of slopes and heights between the samples."""
+SURFACE_TOLERANCE = 1e-9
+"""Of f for a point on the surface, relative to the length of the ray, or to the relief where the
+ray grazes a summit: 1 µm at 1 km, far below what a photograph shows, and a million roundings."""
+
+Tangent = tuple[Sequence[float | np.ndarray] | np.ndarray, Float[np.ndarray, "2 3"]]
+"""Normals of points, coordinates first, or one of all; directions of the texture's coordinates."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,35 +44,46 @@ class HeightField:
     bounds: tuple[float, float] | None = None
     steepest: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         west, south, east, north = vector("extent", self.extent, 4, "Xmin, Ymin, Xmax, Ymax")
         if not (west < east and south < north):
             raise InputError(f"extent {self.extent} is empty; expected: Xmin, Ymin, Xmax, Ymax")
         if self.bounds is None or self.steepest is None:
-            x, y = np.linspace(west, east, SAMPLES), np.linspace(south, north, SAMPLES)
+            # Half and double change no ray. Of hills of eleven waves across, 64 samples a side
+            # underestimate the steepest slope by 13 %, 256 by 1.5 %; 1.3 covers up to about fifty
+            # waves.
+            samples, allowance = 256, 1.3
+            x, y = np.linspace(west, east, samples), np.linspace(south, north, samples)
             Z = self.height(*np.meshgrid(x, y))
             slope = np.hypot(*np.gradient(Z, y, x)).max()
-            spare = (ALLOWANCE - 1) * np.ptp(Z) + 1e-6 * (east - west)
+            spare = (allowance - 1) * np.ptp(Z) + 1e-6 * (east - west)
             if self.bounds is None:
                 object.__setattr__(self, "bounds", (Z.min() - spare, Z.max() + spare))
             if self.steepest is None:
-                object.__setattr__(self, "steepest", ALLOWANCE * slope + 1e-3)
+                object.__setattr__(self, "steepest", allowance * slope + 1e-3)
 
-    def distances(self, o, d) -> Float[np.ndarray, "rows columns"]:
+    def distances(
+        self, o: Float[np.ndarray, "rows columns 3"], d: Float[np.ndarray, "rows columns 3"]
+    ) -> Float[np.ndarray, "rows columns"]:
         """Lengths of rays `o + t·d` [rows, columns, 3] to the surface; inf: it is missed."""
         rows, columns = d.shape[:2]
         start = np.zeros((rows, columns))
-        for side in BLOCKS:
+        # Blocks of 32 × 32 rays, then of 8 × 8, then single rays. In a flat view over hills single
+        # rays alone cost a quarter more time, twice the sides a fifth; half the sides, or 8 × 8
+        # alone, are as good.
+        for side in (32, 8):
             if min(rows, columns) >= 2 * side:
                 start = np.maximum(start, self._block_starts(o, d, side))
         t = self._follow(o.reshape(-1, 3), d.reshape(-1, 3), start.ravel(), 0.0, 0.0)
         return t.reshape(rows, columns)
 
-    def coordinates(self, X):
+    def coordinates(
+        self, X: Float[np.ndarray, "*n 3"]
+    ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
         """The two coordinates of the texture, those of the plane."""
         return X[..., 0], X[..., 1]
 
-    def axes(self, X, size):
+    def axes(self, X: Float[np.ndarray, "n 3"], size: float) -> Tangent:
         """Normals of points, coordinates first, and the directions of the texture's coordinates;
         slopes are taken over `size`."""
         x, y = X[..., 0], X[..., 1]
@@ -87,7 +91,12 @@ class HeightField:
         slopes = (self.height(x + size, y) - here) / size, (self.height(x, y + size) - here) / size
         return (-slopes[0], -slopes[1], 1.0), np.eye(3)[:2]
 
-    def _block_starts(self, o, d, side):
+    def _block_starts(
+        self,
+        o: Float[np.ndarray, "rows columns 3"],
+        d: Float[np.ndarray, "rows columns 3"],
+        side: int,
+    ) -> Float[np.ndarray, "rows columns"]:
         """Lengths within which no ray of a block meets the surface, spread over its rays."""
         rows, columns = d.shape[:2]
         r, c = (np.minimum(np.arange(n) // side * side + side // 2, n - 1) for n in (rows, columns))
@@ -98,6 +107,8 @@ class HeightField:
         )
         middle = lambda a: a[np.ix_(r[::side], c[::side])].reshape(-1, 3)
         spread = lambda a: np.nan_to_num(widest(away(a)), nan=np.inf).ravel()
+        # A ray at t is within |Δo| + |Δd|·t of the central one, which changes f by up to √(1 + L²)
+        # times that.
         slack = np.hypot(1.0, present(self.steepest))
         t = self._follow(
             middle(o),
@@ -110,7 +121,15 @@ class HeightField:
         t = np.where(np.isfinite(t), t, 0.0).reshape(len(r[::side]), len(c[::side]))
         return t[np.arange(rows)[:, None] // side, np.arange(columns)[None] // side]
 
-    def _follow(self, o, d, start, near, spread, last=True):
+    def _follow(
+        self,
+        o: Float[np.ndarray, "n 3"],
+        d: Float[np.ndarray, "n 3"],
+        start: Float[np.ndarray, " n"],
+        near: float | Float[np.ndarray, " n"],
+        spread: float | Float[np.ndarray, " n"],
+        last: bool = True,
+    ) -> Float[np.ndarray, " n"]:
         """Lengths to where f − near − spread·t is about 0 (`last`: exactly); inf where a ray
         leaves the bounds."""
         low, high = present(self.bounds)
@@ -125,22 +144,35 @@ class HeightField:
         near, spread = np.broadcast_to(near, len(d)), np.broadcast_to(spread, len(d))
         leave = leave + relief
         ends = (reach + spread, near, spread, leave)
-        t = self._march(o, d, t, np.flatnonzero(usable), ends, NEAR_SURFACE * relief)
+        # Then by secants, which need a start near the surface. Half, double and a tenth of 1e-3 of
+        # the relief change 0.03 % of the rays, those that graze summits, and no time.
+        t = self._march(o, d, t, np.flatnonzero(usable), ends, 1e-3 * relief)
         if not last:
             return t
         found = self._settle(o, d, t)
         lost = np.flatnonzero(np.isfinite(t) & ~np.isfinite(found))
-        if len(lost):  # a ray that grazes a summit goes on
-            t = self._march(o, d, t, lost, ends, GRAZING_TOLERANCE * relief)
+        if len(lost):  # a ray that grazes a summit, where secants diverge, goes on
+            t = self._march(o, d, t, lost, ends, SURFACE_TOLERANCE * relief)
             with np.errstate(invalid="ignore"):
-                on = self._above(o[lost], d[lost], t[lost]) <= GRAZING_TOLERANCE * relief
+                on = self._above(o[lost], d[lost], t[lost]) <= SURFACE_TOLERANCE * relief
             found[lost] = self._inside(o[lost], d[lost], np.where(on, t[lost], np.inf))
         return found
 
-    def _march(self, o, d, t, active, ends, close):
+    def _march(
+        self,
+        o: Float[np.ndarray, "n 3"],
+        d: Float[np.ndarray, "n 3"],
+        t: Float[np.ndarray, " n"],
+        active: Int[np.ndarray, " some"],
+        ends: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        close: float,
+    ) -> Float[np.ndarray, " n"]:
         """Lengths at which the rays that are active have come close; inf where they leave."""
         reach, near, spread, leave = ends
-        for _ in range(STEPS):
+        # Rays that skim over hills need many steps. Of 247 000 hits in a flat view 3.4 % were lost
+        # with 25 steps, 0.3 % with 100, 0.13 % with 200, 0.03 % with 400, compared with 800; all
+        # cost about the same, since few rays are left by then.
+        for _ in range(400):
             f = self._above(o[active], d[active], t[active])
             f = f - near[active] - spread[active] * t[active]
             on = f > close
@@ -153,33 +185,44 @@ class HeightField:
                 break
         return t
 
-    def _settle(self, o, d, t):
+    def _settle(
+        self, o: Float[np.ndarray, "n 3"], d: Float[np.ndarray, "n 3"], t: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
         """By secants onto the surface; inf outside the extent."""
         chosen = np.flatnonzero(np.isfinite(t))
         o, d, here = o[chosen], d[chosen], t[chosen]
         f = self._above(o, d, here)
         with np.errstate(invalid="ignore", divide="ignore"):
             step = np.where(f == 0, 0.0, f / (np.abs(d[:, 2]) + 1e-12))
-            for _ in range(SECANTS):
+            # With 3 of them 0.2 % of the rays do not settle, with 6 or 24 fewer than 0.01 % differ.
+            for _ in range(12):
                 other = here + step
                 g = self._above(o, d, other)
                 step = np.where(g == f, 0.0, -g * (other - here) / (g - f))
                 step = np.where(np.isfinite(step), step, 0.0)
                 here, f = other, g
-                if (np.abs(f) <= ON_SURFACE * here).all():
+                if (np.abs(f) <= SURFACE_TOLERANCE * here).all():
                     break
-        good = (np.abs(f) <= 1e3 * ON_SURFACE * here) & (here > 0)
+        # A thousand tolerances: secants that still creep are on the surface for any photograph;
+        # those that diverged are far off.
+        good = (np.abs(f) <= 1e3 * SURFACE_TOLERANCE * here) & (here > 0)
         t = np.full(len(t), np.inf)
         t[chosen] = self._inside(o, d, np.where(good, here, np.inf))
         return t
 
-    def _inside(self, o, d, t):
+    def _inside(
+        self, o: Float[np.ndarray, "n 3"], d: Float[np.ndarray, "n 3"], t: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """The lengths, inf outside the extent."""
         with np.errstate(invalid="ignore"):
             X, Y = (o[:, k] + t * d[:, k] for k in (0, 1))
             west, south, east, north = self.extent
             return np.where((X >= west) & (X <= east) & (Y >= south) & (Y <= north), t, np.inf)
 
-    def _above(self, o, d, t):
+    def _above(
+        self, o: Float[np.ndarray, "n 3"], d: Float[np.ndarray, "n 3"], t: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """f: heights of the rays' points above the field."""
         return o[:, 2] + t * d[:, 2] - self.height(o[:, 0] + t * d[:, 0], o[:, 1] + t * d[:, 1])
 
 
@@ -191,7 +234,7 @@ class Rectangle:
     along: tuple[float, float, float]
     across: tuple[float, float, float]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         a, b = (
             vector(name, getattr(self, name), 3, "coordinates X, Y, Z")
             for name in ("along", "across")
@@ -202,7 +245,9 @@ class Rectangle:
         if abs(a @ b) > 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
             raise InputError("a rectangle's edges must be at right angles")
 
-    def distances(self, o, d):
+    def distances(
+        self, o: Float[np.ndarray, "rows columns 3"], d: Float[np.ndarray, "rows columns 3"]
+    ) -> Float[np.ndarray, "rows columns"]:
         """Lengths of rays `o + t·d` [rows, columns, 3] to the rectangle; inf: it is missed."""
         normal, axes = self.axes(o, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -212,18 +257,22 @@ class Rectangle:
             inside = ((s >= 0) & (s <= length)).all(-1) & (t > 0)
         return np.where(inside, t, np.inf)
 
-    def coordinates(self, X):
+    def coordinates(
+        self, X: Float[np.ndarray, "*n 3"]
+    ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
         """The two coordinates of the texture, from the corner along the edges."""
         s = self._from_corner(X, self.axes(X, 0.0)[1])
         return s[..., 0], s[..., 1]
 
-    def axes(self, X, size):
-        """The normal, and the unit vectors of the texture's coordinates."""
+    def axes(self, X: Float[np.ndarray, "*n 3"], size: float) -> Tangent:  # noqa: ARG002
+        """The normal, and the unit vectors of the texture's coordinates; the same everywhere."""
         unit = lambda v: np.asarray(v, float) / np.linalg.norm(v)
         a, b = unit(self.along), unit(self.across)
         return np.cross(a, b), np.stack([a, b])
 
-    def _from_corner(self, X, axes):
+    def _from_corner(
+        self, X: Float[np.ndarray, "*n 3"], axes: Float[np.ndarray, "2 3"]
+    ) -> Float[np.ndarray, "*n 2"]:
         return (X - np.asarray(self.corner)) @ axes.T
 
 

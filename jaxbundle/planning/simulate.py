@@ -20,10 +20,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jaxbundle.arguments import integer, numeric_array, positive, show, text
-from jaxbundle.cameras import default_parameters, get_model, image_ray, project
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
@@ -43,14 +45,13 @@ from jaxbundle.network.tables import (
 )
 from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 RAYS_AT_ONCE = 2_000_000
-"""Rays projected in one call, so that memory does not grow with stations × targets."""
-LEAST_STATIONS, LEAST_TARGETS = 16, 128
-"""Smaller batches are padded to this size, so that small networks share one program."""
-
-SAME_DIRECTION = 1e-6
-"""Largest distance of two unit vectors taken for one direction (rounding gives 1e-12)."""
+"""Rays projected in one call, so that memory does not grow with stations × targets: some ten
+numbers of 8 bytes a ray, 160 MB."""
+Rays = tuple[Int[np.ndarray, " rays"], Int[np.ndarray, " rays"], Float[np.ndarray, "rays 2"]]
+"""Image, point and image coordinates of every ray."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +82,7 @@ def simulate(
     return simulate_with_truth(stations, targets, camera, noise=noise, seed=seed, **options).network
 
 
-def simulate_with_truth(
+def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but three by name)
     stations: Stations,
     targets: Float[np.ndarray, "points 3"],
     camera: Camera | Sequence[Camera],
@@ -163,18 +164,20 @@ def simulate_with_truth(
     begin = cameras if start is None else make_cameras(start, "start: ")
     if len(begin) != len(cameras):
         raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
+    # Before any drawing, so that faults of arguments are reported without computing.
     role = _roles(len(targets), control, control_sigma, check)
     sigma_xy = _not_negative(noise, 2, "noise")
 
     rng = np.random.default_rng(seed)
-    rays = _look(stations, targets, cameras, of_station, image_format)
-    kept = np.ones(len(rays[0]), bool)
+    rays = _project_all(stations, targets, cameras, of_station, image_format)
+    chosen = np.ones(len(rays[0]), bool)
     if max_incidence is not None:
-        kept = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
+        chosen = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
     if max_rays is not None:
-        kept[kept] = _at_most(rays[1][kept], max_rays, rng)
+        chosen[chosen] = _draw_rays(rays[1][chosen], max_rays, rng)
+    # A control point is known: one ray is information about its image. Others need two.
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    (image, point, xy), used = _select_imaged(rays, kept, need)
+    (image, point, xy), used = _select_imaged(rays, chosen, need)
     row = np.cumsum(used) - 1
     points = _points(targets, role, used, control_sigma)
     ends = _ends(distances, len(targets), used, row)
@@ -182,7 +185,7 @@ def simulate_with_truth(
         image,
         row[point],
         xy,
-        _sigma_of_images(sigma_xy, xy),
+        np.broadcast_to(np.where(sigma_xy > 0, sigma_xy, 1.0), xy.shape).copy(),
         Source("image points"),
         STATED if np.all(sigma_xy) else UNIT,
     )
@@ -203,21 +206,23 @@ def simulate_with_truth(
     return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
 
 
-def _select_imaged(rays, kept, need):
+def _select_imaged(
+    rays: Rays, chosen: Bool[np.ndarray, " rays"], need: Int[np.ndarray, " targets"]
+) -> tuple[list[np.ndarray], Bool[np.ndarray, " targets"]]:
     """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""
-    used = np.bincount(rays[1][kept], minlength=len(need)) >= need
-    kept = kept & used[rays[1]]
-    if not kept.any():
+    used = np.bincount(rays[1][chosen], minlength=len(need)) >= need
+    chosen = chosen & used[rays[1]]
+    if not chosen.any():
         raise InputError(
             "no target is imaged often enough; check the format, the units, and where the "
             "stations look"
         )
-    return [x[kept] for x in rays], used
+    return [x[chosen] for x in rays], used
 
 
-def _images(stations: Stations, of_station) -> Images:
+def _images(stations: Stations, of_station: Int[np.ndarray, " images"]) -> Images:
     return Images(
         id=tuple(str(i + 1) for i in range(len(stations))),
         camera=of_station,
@@ -228,7 +233,12 @@ def _images(stations: Stations, of_station) -> Images:
     )
 
 
-def _points(targets, role, used, control_sigma) -> Points:
+def _points(
+    targets: Float[np.ndarray, "targets 3"],
+    role: np.ndarray,
+    used: Bool[np.ndarray, " targets"],
+    control_sigma: float | Sequence[float],
+) -> Points:
     role, number = role[used], np.flatnonzero(used) + 1
     sigma = np.full((len(role), 3), np.nan)
     if "control" in role:
@@ -239,20 +249,24 @@ def _points(targets, role, used, control_sigma) -> Points:
     )
 
 
-def _distances(position, ends, sigma: float) -> Distances:
+def _distances(
+    position: Float[np.ndarray, "points 3"], ends: Int[np.ndarray, "n 2"], sigma: float
+) -> Distances:
     length = np.linalg.norm(position[ends[:, 0]] - position[ends[:, 1]], axis=1)
     return Distances(ends, length, np.full(len(ends), float(sigma)), Source("distances"))
 
 
-def _sigma_of_images(sigma, xy):
-    """1 of exact coordinates."""
-    return np.broadcast_to(np.where(sigma > 0, sigma, 1.0), xy.shape).copy()
-
-
-def _measure(truth: Network, begin, noise, disturb, rng) -> Network:
+def _measure(
+    truth: Network,
+    begin: Sequence[Camera],
+    noise: Float[np.ndarray, "2"],
+    disturb: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Network:
     """The network as observed: noise, errors of given coordinates, disturbed start values."""
     images, points, distances = truth.images, truth.points, truth.distances
     observations = truth.observations
+    # The order of the draws is part of what a seed means; all are drawn, also where σ is 0.
     xy = observations.xy + noise * rng.standard_normal(observations.xy.shape)
     value = distances.value + distances.sigma * rng.standard_normal(len(distances))
     error = rng.standard_normal(points.position.shape)
@@ -268,7 +282,9 @@ def _measure(truth: Network, begin, noise, disturb, rng) -> Network:
     )
 
 
-def _camera_of_station(cameras, given, stations: int) -> Int[np.ndarray, " images"]:
+def _camera_of_station(
+    cameras: Sequence[Camera], given: Sequence[int] | None, stations: int
+) -> Int[np.ndarray, " images"]:
     if given is None:
         if len(cameras) not in (1, stations):
             raise InputError(
@@ -276,15 +292,21 @@ def _camera_of_station(cameras, given, stations: int) -> Int[np.ndarray, " image
                 "index of the camera of every station"
             )
         return np.arange(stations) % len(cameras)
-    given = numeric_array("camera_of_station", given, "indices of cameras")
-    if given.shape != (stations,) or not np.isin(given, np.arange(len(cameras))).all():
+    indices = numeric_array("camera_of_station", given, "indices of cameras")
+    if indices.shape != (stations,) or not np.isin(indices, np.arange(len(cameras))).all():
         raise InputError(
             f"camera_of_station must be {stations} indices below {len(cameras)}, one a station"
         )
-    return given.astype(np.int64)
+    return indices.astype(np.int64)
 
 
-def _roles(points: int, control, control_sigma, check):
+def _roles(
+    points: int,
+    control: Sequence[int],
+    control_sigma: float | Sequence[float],
+    check: Sequence[int],
+) -> np.ndarray:
+    """The role of every target."""
     role = np.full(points, "tie", dtype=object)
     sigma = _not_negative(control_sigma, 3, "control_sigma")
     if (sigma == 0).any() and (sigma > 0).any():
@@ -304,7 +326,7 @@ def _roles(points: int, control, control_sigma, check):
     return role
 
 
-def _indices(name: str, values):
+def _indices(name: str, values: ArrayLike) -> np.ndarray:
     """Indices of targets; none may be given as []."""
     array = numeric_array(name, values, "indices of targets")
     if array.size and array.dtype.kind not in "iu":
@@ -314,7 +336,7 @@ def _indices(name: str, values):
     return array.astype(int)
 
 
-def _not_negative(value, size: int, name: str):
+def _not_negative(value: ArrayLike, size: int, name: str) -> Float[np.ndarray, " size"]:
     value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
     if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
         raise InputError(
@@ -323,15 +345,23 @@ def _not_negative(value, size: int, name: str):
     return np.broadcast_to(value, size)
 
 
-def _disturbance(disturb, rays):
+def _disturbance(
+    disturb: float | Sequence[float], rays: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, "3"]:
     """σ of the start values of positions, angles and points."""
-    if numeric_array("disturb", disturb, "a fraction, or three σ").ndim == 0:
+    sigma = numeric_array("disturb", disturb, "a fraction, or three σ")
+    if sigma.ndim == 0:
         length = float(np.linalg.norm(rays, axis=1).mean())
-        disturb = (disturb * length, disturb, disturb * length)
-    return _not_negative(disturb, 3, "disturb")
+        sigma = sigma * np.array([length, 1.0, length])
+    return _not_negative(sigma, 3, "disturb")
 
 
-def _ends(distances, targets: int, used, row):
+def _ends(
+    distances: Sequence[tuple[int, int]],
+    targets: int,
+    used: Bool[np.ndarray, " targets"],
+    row: Int[np.ndarray, " targets"],
+) -> Int[np.ndarray, "n 2"]:
     """The ends of the distances as rows of the points used."""
     ends = _indices("distances", distances)
     if ends.shape != (0,) and (
@@ -349,7 +379,13 @@ def _ends(distances, targets: int, used, row):
     return row[ends]
 
 
-def _facing(stations, targets, normals, image, point):
+def _facing(
+    stations: Stations,
+    targets: Float[np.ndarray, "targets 3"],
+    normals: Float[np.ndarray, "targets 3"] | None,
+    image: Int[np.ndarray, " rays"],
+    point: Int[np.ndarray, " rays"],
+) -> Float[np.ndarray, " rays"]:
     """Cosine of the angle between a target's normal and the direction to the camera."""
     if normals is None:
         raise InputError("max_incidence needs the normals of the targets; give normals [P, 3]")
@@ -357,7 +393,9 @@ def _facing(stations, targets, normals, image, point):
     return (ray * normals[point]).sum(1) / np.linalg.norm(ray, axis=1)
 
 
-def _normals(normals, targets):
+def _normals(
+    normals: ArrayLike, targets: Float[np.ndarray, "targets 3"]
+) -> Float[np.ndarray, "targets 3"]:
     """Unit vectors [P, 3]."""
     normals = numeric_array("normals", normals, "directions X, Y, Z").astype(float)
     if normals.shape not in ((3,), targets.shape):
@@ -370,7 +408,9 @@ def _normals(normals, targets):
     return np.broadcast_to(normals / length, targets.shape)
 
 
-def _at_most(point, max_rays: int, rng):
+def _draw_rays(
+    point: Int[np.ndarray, " rays"], max_rays: int, rng: np.random.Generator
+) -> Bool[np.ndarray, " rays"]:
     """A mask that keeps at most this number of rays per point, drawn at random."""
     order = np.lexsort((rng.random(len(point)), point))
     sorted_point = point[order]
@@ -380,10 +420,18 @@ def _at_most(point, max_rays: int, rng):
     return keep
 
 
-def _look(stations, targets, cameras, of_station, image_format):
+def _project_all(
+    stations: Stations,
+    targets: Float[np.ndarray, "targets 3"],
+    cameras: Sequence[Camera],
+    of_station: Int[np.ndarray, " images"],
+    image_format: tuple[float, float] | None,
+) -> Rays:
     """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
+    # Small networks are padded to 16 stations and 128 targets, larger ones to round numbers, so
+    # that they share programs: compiling takes longer than projecting a million rays.
     found, number = [], len(targets)
-    wide = max(LEAST_TARGETS, round_up(number))
+    wide = max(128, round_up(number))
     targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
     for c, camera in enumerate(cameras):
         model = get_model(camera.model)
@@ -391,7 +439,7 @@ def _look(stations, targets, cameras, of_station, image_format):
         p = tuple(float(values[name]) for name in model.parameters)
         low, high = _format(camera, image_format)
         index = np.flatnonzero(of_station == c)
-        some = max(LEAST_STATIONS, round_up(len(index)))
+        some = max(16, round_up(len(index)))
         at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
         for begin in range(0, len(index), at_once):
             # The last batch is padded, so that all have one shape and compile once.
@@ -410,23 +458,39 @@ def _look(stations, targets, cameras, of_station, image_format):
 
 
 @partial(compile_once, static=0)
-def _images_of(model, p, position, angles, targets):
+def _images_of(
+    model: CameraModel,
+    p: tuple[float, ...],
+    position: Float[np.ndarray, "i 3"],
+    angles: Float[np.ndarray, "i 3"],
+    targets: Float[np.ndarray, "P 3"],
+) -> tuple[Float[Array, "i P 2"], Bool[AnyArray, "i P"] | bool]:
     """Image coordinates [i, P, 2], and whether their rays lead back to the targets [i, P]."""
     matrices = jax.vmap(matrix_from_omega_phi_kappa)(angles)
 
-    def one(M, centre, X, Y, Z):
+    def image_of(
+        M: Float[Array, "3 3"],
+        centre: Float[AnyArray, "3"],
+        X: Float[Array, ""],
+        Y: Float[Array, ""],
+        Z: Float[Array, ""],
+    ) -> tuple[Float[Array, "2"], Bool[AnyArray, ""] | bool]:
         X, Y, Z = X - centre[0], Y - centre[1], Z - centre[2]
         ray = tuple(M[k, 0] * X + M[k, 1] * Y + M[k, 2] * Z for k in range(3))
         x, y = project(model, p, *ray)
         length = jnp.sqrt(sum(r * r for r in ray))
         square = sum((a - b / length) ** 2 for a, b in zip(image_ray(model, p, x, y), ray))
-        return jnp.stack([x, y]), square < SAME_DIRECTION**2
+        # Unit vectors nearer than 1e-6 are one direction: rounding gives 1e-12, a second solution
+        # of a distortion that is not one-to-one lies far away.
+        return jnp.stack([x, y]), square < 1e-6**2
 
-    points = jax.vmap(one, (None, None, 0, 0, 0))
+    points = jax.vmap(image_of, (None, None, 0, 0, 0))
     return jax.vmap(points, (0, 0, None, None, None))(matrices, position, *targets.T)
 
 
-def _format(camera: Camera, image_format):
+def _format(
+    camera: Camera, image_format: tuple[float, float] | None
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Lowest and highest image coordinates, in the unit and axes of the camera's model."""
     model = get_model(camera.model)
     size = image_format

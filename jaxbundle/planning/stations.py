@@ -9,6 +9,7 @@ import dataclasses
 import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxbundle.arguments import integer, number, numeric_array, positive, show, vector
 from jaxbundle.display import print_in_one_screen
@@ -19,6 +20,7 @@ from jaxbundle.types import Numbers
 
 COORDINATES = "finite coordinates X, Y, Z"
 LARGEST_SEED = 2**128
+"""`numpy.random.SeedSequence` mixes seeds into a pool of 128 bits."""
 
 
 @print_in_one_screen
@@ -32,7 +34,7 @@ class Stations:
     position: Float[np.ndarray, "images 3"]
     angles: Float[np.ndarray, "images 3"]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("position", "angles"):
             object.__setattr__(self, name, rows_of_three(getattr(self, name), f"stations: {name}"))
         if len(self.position) != len(self.angles):
@@ -51,7 +53,7 @@ class Stations:
         )
 
 
-def rows_of_three(values, name: str) -> Float[np.ndarray, "rows 3"]:
+def rows_of_three(values: ArrayLike, name: str) -> Float[np.ndarray, "rows 3"]:
     """Finite numbers [rows, 3], or an error that names them."""
     values = numeric_array(name, values, "numbers [rows, 3]").astype(float)
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
@@ -97,6 +99,8 @@ def stations_looking_at(
     for row in np.flatnonzero(length[:, 0] == 0)[:1]:
         raise InputError(f"stations: station {row + 1} is at the point it looks at")
     z = z / length
+    # Where the camera looks along `up`, x is that of the object space: the cross product is zero
+    # but for rounding.
     x = np.cross(above, z)
     along = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(above)
     first = np.array([1.0, 0.0, 0.0])
@@ -131,6 +135,7 @@ def ring_of_stations(
     offset = np.stack(
         [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
     )
+    # The n-th, 2n-th, … camera, so that the first one is upright.
     turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
     return stations_looking_at(middle + offset, middle, roll=np.pi / 2 * turned)
 
@@ -175,6 +180,7 @@ def aerial_block(
     below_one = lambda x: -np.inf < x < 1
     forward_overlap = number("forward_overlap", forward_overlap, "a fraction below 1", below_one)
     side_overlap = number("side_overlap", side_overlap, "a fraction below 1", below_one)
+    # Strips are flown to and fro: images of every other one are turned by 180° about the vertical.
     base, spacing = size[0] * (1 - forward_overlap), size[1] * (1 - side_overlap)
     strip, place = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
     back = strip % 2 == 1
@@ -189,10 +195,6 @@ def aerial_block(
     x = np.cos(tilt) * direction + np.sin(tilt) * up
     z = np.cos(tilt) * up - np.sin(tilt) * direction
     return Stations(middle + offset, _angles(np.stack([x, np.cross(z, x), z], 1)))
-
-
-def _a_length(x: float) -> bool:
-    return 0 <= x < np.inf
 
 
 def _angles(matrices: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
@@ -221,7 +223,7 @@ def grid_of_targets(
     dx, dy = vector("spacing", spacing, 2, "one positive length, or two along X and Y")
     if not min(dx, dy) > 0:
         raise InputError(f"spacing must be positive, but is {show(spacing)}")
-    relief = number("relief", relief, "0 or a positive length", _a_length)
+    relief = number("relief", relief, "0 or a positive length", lambda x: 0 <= x < np.inf)
     middle = vector("centre", centre, 3, COORDINATES)
     seed = integer("seed", seed, least=0, most=LARGEST_SEED)
     x = dx * (np.arange(columns) - (columns - 1) / 2)

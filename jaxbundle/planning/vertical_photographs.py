@@ -13,6 +13,7 @@ Kraus (2007), Photogrammetry, section 4.6.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 from jaxbundle.errors import InputError
 from jaxbundle.types import present
@@ -99,22 +100,18 @@ def design_block(
 
     **Raises:** `InputError` for what is not positive or no fraction, or not exactly one height.
     """
-    given = {"height": height, "scale_number": scale_number, "pixel_on_ground": pixel_on_ground}
-    if sum(value is not None for value in given.values()) != 1:
-        raise InputError(f"give one of {', '.join(given)}")
-    named = {
-        "c": c,
-        "width of the format": image_format[0],
-        "height of the format": image_format[1],
-        "length of the area": area[0],
-        "width of the area": area[1],
-        "sigma_image": sigma_image,
-        "pixel": pixel,
-        **given,
-    }
-    for name, value in named.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value}; it must be positive")
+    _check_lengths(
+        {"height": height, "scale_number": scale_number, "pixel_on_ground": pixel_on_ground},
+        {
+            "c": c,
+            "width of the format": image_format[0],
+            "height of the format": image_format[1],
+            "length of the area": area[0],
+            "width of the area": area[1],
+            "sigma_image": sigma_image,
+            "pixel": pixel,
+        },
+    )
     for name, overlap in (("forward_overlap", forward_overlap), ("side_overlap", side_overlap)):
         if not 0 <= overlap < 1:
             raise InputError(f"{name} is {overlap}; a fraction from 0, below 1 is expected")
@@ -124,6 +121,7 @@ def design_block(
         scale_number = pixel_on_ground / pixel * 1000
     if height is None:
         height = present(scale_number) * c / 1000
+    # Lengths of 1e-9 of a base more are rounding, and need no further photograph.
     ratio = height / c
     footprint = (image_format[0] * ratio, image_format[1] * ratio)
     base, spacing = footprint[0] * (1 - forward_overlap), footprint[1] * (1 - side_overlap)
@@ -145,3 +143,14 @@ def design_block(
         sigma_plan=sigma_plan(c, height, sigma_image),
         sigma_height=sigma_height(c, height, base, sigma_image),
     )
+
+
+def _check_lengths(heights: Mapping[str, float | None], others: Mapping[str, float | None]) -> None:
+    """Refuse lengths that are not positive, and another number of heights than one.
+
+    **Raises:** `InputError`."""
+    if sum(value is not None for value in heights.values()) != 1:
+        raise InputError(f"give one of {', '.join(heights)}")
+    for name, value in {**others, **heights}.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}; it must be positive")

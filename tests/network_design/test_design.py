@@ -17,12 +17,12 @@ import jaxbundle
 from jaxbundle.choices import DESIGNED
 from jaxbundle.errors import InputError
 from jaxbundle.network.sightings import keep_images
-from jaxbundle.network_design import design as design_module
 from jaxbundle.network_design.aims import Aim, measure, smallest_redundancy, task_of
 from jaxbundle.network_design.feasible import start_at
 from jaxbundle.network_design.pairs import make_pairs
 from jaxbundle.network_design.priors import use_prior_tables
 from jaxbundle.network_design.search import configuration, make_program
+from jaxbundle.network_design.settings import DesignSettings
 from jaxbundle.network_design.variables import choose_variables, turn_axis
 
 PAGE = (Path(__file__).parents[2] / "docs" / "design.md").read_text(encoding="utf-8")
@@ -190,11 +190,10 @@ def test_the_best_photographs_are_those_of_brute_force(page, designed, site):
 
 
 @pytest.mark.further
-def test_a_further_photograph(network, site, monkeypatch):
-    monkeypatch.setattr(design_module, "CANDIDATES", 6)
-    monkeypatch.setattr(design_module, "REFINED", 1)
+def test_a_further_photograph(network, site):
+    few = DesignSettings(candidates=6, refined=1)
     five = keep_images(network, np.arange(6) < 5)
-    found = jaxbundle.design(five, order="third", conditions=site, max_iterations=4)
+    found = jaxbundle.design(five, order="third", conditions=site, max_iterations=4, settings=few)
     assert found.gain > 1.3 and found.after.photographs == 6
     assert found.added == ("new 6",)
     kept = found.network.observations.take(found.network.observations.image < 5)

@@ -7,7 +7,7 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.network_design.proof import Proof
-from jaxbundle.network_design.result import Design, State
+from jaxbundle.network_design.result import Design, DesignState
 
 
 def design_dict(designed: Design, proof: Proof | None = None) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def design_text(designed: Design, proof: Proof | None = None) -> str:
     return json.dumps(without_nan(design_dict(designed, proof)), ensure_ascii=False) + "\n"
 
 
-def _state(state: State) -> dict[str, Any]:
+def _state(state: DesignState) -> dict[str, Any]:
     return {
         "aim": state.aim,
         "photographs": state.photographs,
