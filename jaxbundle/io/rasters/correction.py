@@ -11,10 +11,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
 from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
-from jaxbundle.pushbroom.correct import BLOCK, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.rectification import BLOCK, block_places
 from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain

@@ -10,9 +10,9 @@ from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.rectification import block_errors, block_places
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
+from jaxbundle.pushbroom.rectification import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 

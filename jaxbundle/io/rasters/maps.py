@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
-from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
+from jaxbundle.pushbroom.rectification import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.system.programs import compile_once
 
