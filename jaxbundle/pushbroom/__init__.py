@@ -57,6 +57,7 @@ from jaxbundle.pushbroom.scanner import AnglePolynomial as AnglePolynomial
 from jaxbundle.pushbroom.scanner import AngleTable as AngleTable
 from jaxbundle.pushbroom.scanner import FocalLine as FocalLine
 from jaxbundle.pushbroom.scanner import LineTimes as LineTimes
+from jaxbundle.pushbroom.search_settings import SearchSettings as SearchSettings
 from jaxbundle.pushbroom.simulate import Flight as Flight
 from jaxbundle.pushbroom.simulate import measured_image as measured_image
 from jaxbundle.pushbroom.simulate import true_image as true_image

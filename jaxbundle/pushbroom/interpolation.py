@@ -34,8 +34,6 @@ from jaxbundle.types import AnyArray, Scalar
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
-LEAST_DEGREE = 3
-"""Minimum degree of a piece, for the cubic methods."""
 
 
 class Table(eqx.Module):
@@ -61,10 +59,11 @@ def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     """The values at the time t, in seconds; NaN outside the table and in gaps."""
     i = interval(table, t)
     if table.pieces is not None:
-        return jnp.where(covers(table, i, t), _of_pieces(table, i, t), jnp.nan)
+        return jnp.where(covers(table, i, t), _evaluate_piece(table, i, t), jnp.nan)
     match table.method:
         case "linear":
-            value = _linear(table, i, t)
+            tau = fraction(table, i, t)
+            value = (1 - tau) * table.values[i] + tau * table.values[i + 1]
         case "lagrange":
             value = _lagrange(table, i, t)
         case "usgscsm":
@@ -84,7 +83,7 @@ def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]
     They are exact for the methods of a table; of another smooth function, such as `slerp`, to order
     + 1 powers of an interval.
     """
-    nodes = max(table.order, LEAST_DEGREE) + 1
+    nodes = max(table.order, 3) + 1  # 3 is the degree of splines and of Hermite's polynomials
     t = table.times[:-1, None] + jnp.diff(table.times)[:, None] * _chebyshev(nodes)
     pieces = jax.vmap(jax.vmap(value))(t)
     return Table(
@@ -137,13 +136,17 @@ def breaks(table: Table) -> Float[np.ndarray, " rows"]:
 def spline_rates(
     times: Float[AnyArray, " rows"], values: Float[AnyArray, "rows k"], gap: float = np.inf
 ) -> Float[Array, "rows k"]:
-    """The rates at the rows of the cubic spline with not-a-knot conditions at both ends.
+    """The rates at the rows of the cubic spline with not-a-knot conditions at both ends,
+
+        hᵢ·ẏᵢ₋₁ + 2(hᵢ₋₁ + hᵢ)·ẏᵢ + hᵢ₋₁·ẏᵢ₊₁ = 3(hᵢ·sᵢ₋₁ + hᵢ₋₁·sᵢ),    s = Δy/h.
 
     Splines on both sides of a step longer than `gap` are independent; with three rows it is a
     parabola, with two a straight line.
     """
     step = jnp.diff(times)
     slope = jnp.diff(values, axis=0) / step[:, None]
+    # One tridiagonal system for all splines of a table: its shape does not depend on the gaps, so
+    # that it can be differentiated and compiled.
     ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
     forward = _end_rows(step, slope, ends[:-1], ends[1:])
     # seen from behind, steps and slopes keep their signs
@@ -168,7 +171,12 @@ def spline_rates(
     )
 
 
-def _end_rows(step, slope, first, last):
+def _end_rows(
+    step: Float[Array, " intervals"],
+    slope: Float[Array, "intervals k"],
+    first: Bool[Array, " intervals"],
+    last: Bool[Array, " intervals"],
+) -> tuple[Array, Array, Array]:
     """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
     `first` and `last` tell where a spline begins and ends: not-a-knot needs four rows.
@@ -192,7 +200,8 @@ def _chebyshev(nodes: int) -> np.ndarray:
     return (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2
 
 
-def _of_pieces(table, i, t):
+def _evaluate_piece(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
     nodes = _chebyshev(table.pieces.shape[1])
     same = np.eye(len(nodes), dtype=bool)
     spans = nodes[:, None] - nodes + same
@@ -200,12 +209,8 @@ def _of_pieces(table, i, t):
     return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ table.pieces[i]
 
 
-def _linear(table, i, t):
-    tau = fraction(table, i, t)
-    return (1 - tau) * table.values[i] + tau * table.values[i + 1]
-
-
-def _lagrange(table, i, t):
+def _lagrange(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through order + 1 rows: half of them before t, except at the ends."""
     rows = table.order + 1
     first = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
     times = jax.lax.dynamic_slice_in_dim(table.times, first, rows)
@@ -215,7 +220,8 @@ def _lagrange(table, i, t):
     return jnp.prod(jnp.where(same, 1.0, (t - times) / spans), axis=1) @ values
 
 
-def _usgscsm(table, i, t):
+def _usgscsm(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through 2·half rows, with weights 0 for the rest of a fixed number."""
     most = (table.order + 1) // 2
     half = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), most)
     offset = jnp.arange(-most, most) + 1
@@ -228,7 +234,10 @@ def _usgscsm(table, i, t):
     return jnp.where(used, weights, 0.0) @ values
 
 
-def _hermite(table, rates, i, t):
+def _hermite(
+    table: Table, rates: Float[AnyArray, "rows k"], i: Int[AnyArray, ""], t: Scalar
+) -> Float[Array, " k"]:
+    """The cubic polynomial with the values and these rates at both ends of interval i."""
     tau, step = fraction(table, i, t), table.times[i + 1] - table.times[i]
     h01 = tau**2 * (3 - 2 * tau)
     h10, h11 = tau * (1 - tau) ** 2, -(tau**2) * (1 - tau)

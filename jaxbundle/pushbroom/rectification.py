@@ -23,14 +23,9 @@ from jaxbundle.geometry.vectors import Triple, difference, dot, length
 from jaxbundle.pushbroom.accuracy import east_north, horizontal
 from jaxbundle.pushbroom.image import Pose, PushbroomImage
 from jaxbundle.pushbroom.locate import ground_point
-from jaxbundle.pushbroom.passages import sample
-from jaxbundle.pushbroom.project import (
-    Scanner,
-    Search,
-    project_from,
-    project_points,
-    scanner_of,
-)
+from jaxbundle.pushbroom.pieces import sample
+from jaxbundle.pushbroom.project import project_from, project_points
+from jaxbundle.pushbroom.search import Scanner, Search, scanner_of
 from jaxbundle.pushbroom.surfaces import Ground, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once

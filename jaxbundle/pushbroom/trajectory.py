@@ -89,14 +89,11 @@ def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
 
 
 def trajectory_in_pieces(trajectory: Trajectory) -> Trajectory:
-    """The same trajectory with its tables in pieces (`interpolation.convert_to_pieces`), whatever
-    their methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
+    """A trajectory with its tables in pieces (`interpolation.convert_to_pieces`), whatever their
+    methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
     position, attitude = trajectory.position, trajectory.attitude
-    turned = (
-        (lambda t: _slerp(attitude.table, t))
-        if attitude.slerp
-        else (lambda t: interpolate(attitude.table, t))
-    )
+    method = _slerp if attitude.slerp else interpolate
+    turned = lambda t: method(attitude.table, t)
     return Trajectory(
         convert_to_pieces(position, lambda t: interpolate(position, t)),
         Attitude(convert_to_pieces(attitude.table, turned), False, attitude.reference),
@@ -116,7 +113,8 @@ def orbital_frame(P: Float[AnyArray, "3"], V: Float[AnyArray, "3"]) -> Float[Arr
     return jnp.stack([right, jnp.cross(up, right), up], axis=1)
 
 
-def _slerp(table, t):
+def _slerp(table: Table, t: Scalar) -> Float[Array, "4"]:
+    """qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)); NaN outside the table and in gaps."""
     i = interval(table, t)
     start, end = table.values[i], table.values[i + 1]
     turn = rotation_vector_from_quaternion(quaternion_multiply(quaternion_conjugate(start), end))
