@@ -11,8 +11,8 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.interpolation import METHODS, Table
-from jaxbundle.pushbroom.trajectory import Attitude
+from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
+from jaxbundle.pushbroom.trajectory import AttitudeTable
 from jaxbundle.types import Numbers
 
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
@@ -57,7 +57,7 @@ def position_table(
     gap: float | None = None,
     extrapolate: float = 0.0,
     source: Source = POSITIONS,
-) -> Table:
+) -> TimeTable:
     """Positions (metres) against time (seconds).
 
     **Arguments:** `velocities` in metres a second, needed by `"hermite"`; `order` of Lagrange's
@@ -86,7 +86,7 @@ def attitude_table(
     extrapolate: float = 0.0,
     reference: Literal["earth", "orbit"] = "earth",
     source: Source = ATTITUDE,
-) -> Attitude:
+) -> AttitudeTable:
     """Attitudes against time (seconds): quaternions (w, x, y, z), or pitch, roll, yaw in radians.
 
     Quaternions are normalised and sign changes corrected. Angles that jump by a full turn are made
@@ -110,7 +110,7 @@ def attitude_table(
     else:
         values = np.unwrap(values, axis=0)
     table = _table(times, values, None, method, order, gap, extrapolate, "attitude", source)
-    return Attitude(table, method == "slerp", reference)
+    return AttitudeTable(table, method == "slerp", reference)
 
 
 def normalise_quaternions(
@@ -215,7 +215,9 @@ def check_span(
         )
 
 
-def check_covered(table: Table, times: Numbers, source: Source, thing: str = "image line") -> None:
+def check_covered(
+    table: TimeTable, times: Numbers, source: Source, thing: str = "image line"
+) -> None:
     """Refuse a table that does not cover the times, or has a gap among them.
 
     `source` names the table and its rows, `thing` what the times belong to.
@@ -251,7 +253,7 @@ def _table(
     extrapolate: float,
     what: str,
     source: Source,
-) -> Table:
+) -> TimeTable:
     times, values = np.asarray(times, float), np.asarray(values, float)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
@@ -286,6 +288,6 @@ def _table(
     gap = 5.0 * float(np.median(np.diff(times))) if gap is None else float(gap)
     kind = "linear" if method == "slerp" else method
     rates = None if rates is None else jnp.asarray(rates)
-    return Table(
+    return TimeTable(
         jnp.asarray(times), jnp.asarray(values), rates, gap, kind, order, float(extrapolate)
     )

@@ -68,7 +68,7 @@ class PushbroomImage(eqx.Module):
         return self.times.time((self.lines - 1) / 2)
 
 
-class Pose(NamedTuple):
+class LinePose(NamedTuple):
     """Exterior orientation of a line: P in metres, R camera → object, rate V of P in m/s."""
 
     P: Float[AnyArray, "3"]
@@ -117,20 +117,24 @@ def check_size(lines: float, pixels: float, where: str) -> None:
             )
 
 
-def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
+def pose_at(image: PushbroomImage, t: Scalar) -> LinePose:
     """The pose at the time t, in seconds; NaN outside the tables."""
     return move_pose(recorded_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
-def recorded_pose(image: PushbroomImage, t: Scalar) -> Pose:
+def recorded_pose(image: PushbroomImage, t: Scalar) -> LinePose:
     """The pose of the platform from its tables, without offsets and mounting."""
     trajectory = image.trajectory
-    return Pose(position_at(trajectory, t), rotation_at(trajectory, t), velocity_at(trajectory, t))
+    return LinePose(
+        position_at(trajectory, t), rotation_at(trajectory, t), velocity_at(trajectory, t)
+    )
 
 
-def move_pose(platform: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]) -> Pose:
+def move_pose(
+    platform: LinePose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
+) -> LinePose:
     """The pose of the camera on this pose of its platform, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)
     R = platform.R @ turn @ matrix_from_pitch_roll_yaw(mounting)
     P = platform.P + offsets.position + dt * offsets.position_rate
-    return Pose(P, R, platform.V + offsets.position_rate)
+    return LinePose(P, R, platform.V + offsets.position_rate)

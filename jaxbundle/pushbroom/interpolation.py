@@ -36,7 +36,7 @@ Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
 
 
-class Table(eqx.Module):
+class TimeTable(eqx.Module):
     """Values against time, differentiable in all of them.
 
     `times` in seconds; `gap` the longest interpolated step between two rows, in seconds;
@@ -55,7 +55,7 @@ class Table(eqx.Module):
     pieces: Float[AnyArray, "intervals nodes k"] | None = None
 
 
-def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
+def interpolate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
     """The values at the time t, in seconds; NaN outside the table and in gaps."""
     i = interval(table, t)
     if table.pieces is not None:
@@ -77,7 +77,7 @@ def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     return jnp.where(covers(table, i, t), value, jnp.nan)
 
 
-def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]]) -> Table:
+def convert_to_pieces(table: TimeTable, value: Callable[[Scalar], Float[Array, " k"]]) -> TimeTable:
     """The table with `value(t)`, its interpolation, as polynomials (`pieces`).
 
     They are exact for the methods of a table; of another smooth function, such as `slerp`, to order
@@ -86,7 +86,7 @@ def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]
     nodes = max(table.order, 3) + 1  # 3 is the degree of splines and of Hermite's polynomials
     t = table.times[:-1, None] + jnp.diff(table.times)[:, None] * _chebyshev(nodes)
     pieces = jax.vmap(jax.vmap(value))(t)
-    return Table(
+    return TimeTable(
         table.times,
         table.values,
         None,
@@ -98,37 +98,37 @@ def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]
     )
 
 
-def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
+def rate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
     """The derivative of the interpolated values by time, per second."""
     return jax.jvp(lambda t: interpolate(table, t), (t,), (jnp.ones_like(t),))[1]
 
 
-def interval(table: Table, t: Scalar) -> Int[Array, "..."]:
+def interval(table: TimeTable, t: Scalar) -> Int[Array, "..."]:
     """The row i with tᵢ ≤ t < tᵢ₊₁; the first or last interval beyond the ends."""
     i = jnp.searchsorted(table.times, t, side="right") - 1
     return jnp.clip(i, 0, len(table.times) - 2)
 
 
-def fraction(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
+def fraction(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
     """τ, the elapsed fraction of interval i at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
-def covers(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
+def covers(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
     inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
     return inside & (times[i + 1] - times[i] <= table.gap)
 
 
-def span(table: Table) -> tuple[float, float]:
+def span(table: TimeTable) -> tuple[float, float]:
     """The first and the last time that the table covers."""
     times = np.asarray(table.times)
     return float(times[0]) - table.extrapolate, float(times[-1]) + table.extrapolate
 
 
-def breaks(table: Table) -> Float[np.ndarray, " rows"]:
+def breaks(table: TimeTable) -> Float[np.ndarray, " rows"]:
     """The times where one polynomial ends and the next begins."""
     return np.asarray(table.times)
 
@@ -148,9 +148,9 @@ def spline_rates(
     # One tridiagonal system for all splines of a table: its shape does not depend on the gaps, so
     # that it can be differentiated and compiled.
     ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
-    forward = _end_rows(step, slope, ends[:-1], ends[1:])
+    forward = _end_rows(step, slope, ends[1:])
     # seen from behind, steps and slopes keep their signs
-    back = _end_rows(step[::-1], slope[::-1], ends[:0:-1], ends[-2::-1])
+    back = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
     back = tuple(v[::-1] for v in back)
     zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
     before, after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
@@ -174,12 +174,11 @@ def spline_rates(
 def _end_rows(
     step: Float[Array, " intervals"],
     slope: Float[Array, "intervals k"],
-    first: Bool[Array, " intervals"],
     last: Bool[Array, " intervals"],
 ) -> tuple[Array, Array, Array]:
     """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
-    `first` and `last` tell where a spline begins and ends: not-a-knot needs four rows.
+    `last` tells where a spline ends: not-a-knot needs four rows.
     """
     pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
     h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
@@ -200,7 +199,7 @@ def _chebyshev(nodes: int) -> np.ndarray:
     return (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2
 
 
-def _evaluate_piece(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
     nodes = _chebyshev(table.pieces.shape[1])
     same = np.eye(len(nodes), dtype=bool)
@@ -209,7 +208,7 @@ def _evaluate_piece(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Arra
     return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ table.pieces[i]
 
 
-def _lagrange(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through order + 1 rows: half of them before t, except at the ends."""
     rows = table.order + 1
     first = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
@@ -220,7 +219,7 @@ def _lagrange(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k
     return jnp.prod(jnp.where(same, 1.0, (t - times) / spans), axis=1) @ values
 
 
-def _usgscsm(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+def _usgscsm(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through 2·half rows, with weights 0 for the rest of a fixed number."""
     most = (table.order + 1) // 2
     half = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), most)
@@ -235,7 +234,7 @@ def _usgscsm(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"
 
 
 def _hermite(
-    table: Table, rates: Float[AnyArray, "rows k"], i: Int[AnyArray, ""], t: Scalar
+    table: TimeTable, rates: Float[AnyArray, "rows k"], i: Int[AnyArray, ""], t: Scalar
 ) -> Float[Array, " k"]:
     """The cubic polynomial with the values and these rates at both ends of interval i."""
     tau, step = fraction(table, i, t), table.times[i + 1] - table.times[i]

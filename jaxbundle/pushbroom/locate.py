@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.vectors import Triple, along, difference, length, rotate
 from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
-from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.scanner import Pair, slopes_of
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
@@ -26,7 +26,9 @@ def locate_point(image: PushbroomImage, surface: Surface, line: Scalar, pixel: S
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
-def ground_point(pose: Pose, slopes: Pair, surface: Surface, corrections: Corrections) -> Triple:
+def ground_point(
+    pose: LinePose, slopes: Pair, surface: Surface, corrections: Corrections
+) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
     o, d = P, rotate(R, (*slopes, -1.0))

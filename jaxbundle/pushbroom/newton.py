@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxbundle.geometry.vectors import Triple, Vector, difference
 from jaxbundle.pushbroom.pieces import motion
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
-from jaxbundle.pushbroom.search import Scanner, Search
+from jaxbundle.pushbroom.search import ScannerGeometry, Search
 from jaxbundle.system.devices import batch_size
 from jaxbundle.types import AnyArray, Scalar
 
@@ -28,7 +28,11 @@ RefinementState = tuple[Array, Array, Array, Array]
 
 
 def refine(
-    image: Scanner, search: Search, X: Vector, t: Float[AnyArray, " n"], u: Float[AnyArray, " n"]
+    image: ScannerGeometry,
+    search: Search,
+    X: Vector,
+    t: Float[AnyArray, " n"],
+    u: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     ends, settings = search.pieces.ends, search.settings
@@ -84,7 +88,11 @@ def replace_chosen(
 
 
 def _make_round(
-    image: Scanner, search: Search, X: Vector, t: Float[AnyArray, " n"], u: Float[AnyArray, " n"]
+    image: ScannerGeometry,
+    search: Search,
+    X: Vector,
+    t: Float[AnyArray, " n"],
+    u: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
     """Steps in the pieces where the points are at the beginning, with
 

@@ -53,7 +53,7 @@ def state_orbit(
         if not len(when):
             continue
         found = solve_ivp(
-            lambda t, y: np.r_[y[3:], acceleration(y[:3], j2)],
+            lambda _, y: np.r_[y[3:], acceleration(y[:3], j2)],
             (at, when[-1]),
             start,
             "DOP853",
@@ -83,7 +83,7 @@ def acceleration(r: Float[np.ndarray, "3"], j2: bool = True) -> Float[np.ndarray
     return central - 1.5 * J2 * GM * RADIUS**2 / distance**5 * r * (np.array([1, 1, 3.0]) - polar)
 
 
-def _ground(t: float, y: Float[np.ndarray, "6"]) -> float:
+def _ground(_: float, y: Float[np.ndarray, "6"]) -> float:
     return np.linalg.norm(y[:3]) - RADIUS
 
 

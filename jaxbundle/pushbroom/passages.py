@@ -16,7 +16,7 @@ from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import Vector, difference, dot
 from jaxbundle.pushbroom.detector_line import slope_ahead
 from jaxbundle.pushbroom.pieces import sample
-from jaxbundle.pushbroom.search import Scanner, Search
+from jaxbundle.pushbroom.search import ScannerGeometry, Search
 
 Passages = tuple[Array, Array, Array, Array, Array]
 """Start times [most, n]; their number, and whether the point is ahead of the last line, behind the
@@ -29,7 +29,7 @@ SearchStep = tuple[Array, Array, Array, Array, tuple[Vector, Vector]]
 
 
 def find_passages(
-    image: Scanner, search: Search, X: Vector, most: int, margin: float | Array
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
 ) -> Passages:
     """Approximate times of passages over the points, and their number; whether points are
     ahead of the last line, behind the first, or never above the horizon.

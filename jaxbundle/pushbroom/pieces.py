@@ -21,7 +21,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Triple, rotate
 from jaxbundle.leastsquares.indexing.indices import round_up
-from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
 from jaxbundle.pushbroom.polynomial import value_and_rate
 from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
@@ -173,7 +173,7 @@ def motion(
 
 
 @partial(compile_once, static=())
-def _middle(image: PushbroomImage) -> tuple[Pose, Triple, Scalar]:
+def _middle(image: PushbroomImage) -> tuple[LinePose, Triple, Scalar]:
     pose = pose_at(image, image.middle_time)
     u = (image.pixels - 1) / 2
     slopes, per_pixel = jax.jvp(image.optics.slopes, (u,), (1.0,))

@@ -30,12 +30,12 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import Corrections, apparent_point
 from jaxbundle.pushbroom.detector_line import fit_line
 from jaxbundle.pushbroom.footprint import make_footprint
-from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.newton import first_of, gather, refine, replace_chosen
 from jaxbundle.pushbroom.passages import find_passages
 from jaxbundle.pushbroom.pieces import make_pieces, sample, sample_times
 from jaxbundle.pushbroom.scanner import Pair
-from jaxbundle.pushbroom.search import Scanner, Search, scanner_of
+from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
 from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
 from jaxbundle.system.devices import batch_size
 from jaxbundle.system.programs import compile_once
@@ -116,7 +116,7 @@ def project_points(
 
 @partial(jax.jit, static_argnames="most")
 def _project_points(
-    image: Scanner, search: Search, X: Float[AnyArray, "3 n"], most: int, margin: Scalar
+    image: ScannerGeometry, search: Search, X: Float[AnyArray, "3 n"], most: int, margin: Scalar
 ) -> Projected:
     """One program for all margins: an omitted default would be compiled in."""
     find = lambda X: _find_positions(image, search, X, most, margin)
@@ -124,7 +124,7 @@ def _project_points(
 
 
 def project_from(
-    image: PushbroomImage | Scanner, search: Search, X: Vector, line: Scalar, pixel: Scalar
+    image: PushbroomImage | ScannerGeometry, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
     """Line and pixel of points near the given positions, without search; arrays of one shape.
 
@@ -135,7 +135,7 @@ def project_from(
 
 @partial(compile_once, static=())
 def _project_from(
-    image: Scanner, search: Search, X: Vector, line: Scalar, pixel: Scalar
+    image: ScannerGeometry, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
     refine_chunk = lambda args: refine(image, search, args[:3], *args[3:])
@@ -192,7 +192,7 @@ def misclosure(
 
 
 def misclosure_of(
-    pose: Pose,
+    pose: LinePose,
     slopes: Pair,
     X: Float[AnyArray, "3"],
     corrections: Corrections,
@@ -220,7 +220,7 @@ def _map_chunks(
 
 
 def _find_positions(
-    image: Scanner, search: Search, X: Vector, most: int, margin: Scalar
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: Scalar
 ) -> Projected:
     """The positions of a chunk of points, a triple of arrays.
 
@@ -248,7 +248,9 @@ def _find_positions(
     return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
 
 
-def _search(image: Scanner, search: Search, X: Vector, most: int, margin: Scalar) -> Projected:
+def _search(
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: Scalar
+) -> Projected:
     """The positions of arbitrary points."""
     starts, count, ahead, behind, hidden = find_passages(image, search, X, most, margin)
     there = count > jnp.arange(most)[:, None]
@@ -290,7 +292,7 @@ def _search(image: Scanner, search: Search, X: Vector, most: int, margin: Scalar
 
 
 def _inside(
-    image: Scanner, t: Float[AnyArray, " n"], u: Float[AnyArray, " n"], margin: Scalar
+    image: ScannerGeometry, t: Float[AnyArray, " n"], u: Float[AnyArray, " n"], margin: Scalar
 ) -> Bool[Array, "..."]:
     """Whether positions are in the image, or outside by up to `margin` lines and pixels."""
     edge = 0.5 + margin

@@ -21,11 +21,11 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 from jaxbundle.geometry.vectors import Triple, difference, dot, length
 from jaxbundle.pushbroom.accuracy import east_north, horizontal
-from jaxbundle.pushbroom.image import Pose, PushbroomImage
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage
 from jaxbundle.pushbroom.locate import ground_point
 from jaxbundle.pushbroom.pieces import sample
 from jaxbundle.pushbroom.project import project_from, project_points
-from jaxbundle.pushbroom.search import Scanner, Search, scanner_of
+from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
 from jaxbundle.pushbroom.surfaces import Ground, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
@@ -39,7 +39,7 @@ STEP = 16
 between nodes, (16·10 m)²/8R = 0.5 mm for pixels of 10 m, grows with the square of both."""
 
 
-class Nodes(NamedTuple):
+class MapNodes(NamedTuple):
     """Ground points at the nodes of a block: on the ellipsoid (Z = 0), and the vertical there."""
 
     X: Float[AnyArray, "3 n n"]
@@ -53,10 +53,10 @@ class Places(NamedTuple):
     pixel: Float[AnyArray, "rows columns"]
 
 
-def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> Nodes:
+def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> MapNodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
-    return Nodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
+    return MapNodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
 
 
 _ground_and_up = compile_once(
@@ -64,17 +64,17 @@ _ground_and_up = compile_once(
 )
 
 
-def local_nodes(x: np.ndarray, y: np.ndarray) -> Nodes:
+def local_nodes(x: np.ndarray, y: np.ndarray) -> MapNodes:
     """Nodes at X and Y of a local frame, metres."""
     zero = np.zeros_like(x)
-    return Nodes(np.stack([x, y, zero]), np.stack([zero, zero, zero + 1]))
+    return MapNodes(np.stack([x, y, zero]), np.stack([zero, zero, zero + 1]))
 
 
 def block_places(
     image: PushbroomImage,
     search: Search,
     surface: Surface,
-    nodes: Nodes,
+    nodes: MapNodes,
     occlusion: bool = False,
 ) -> Places | None:
     """Image positions of the pixels of a block; None if none of them is near the image.
@@ -119,7 +119,7 @@ def _search(
 
 
 def block_errors(
-    truth: PushbroomImage, search: Search, surface: Surface, nodes: Nodes, places: Places
+    truth: PushbroomImage, search: Search, surface: Surface, nodes: MapNodes, places: Places
 ) -> Float[np.ndarray, "2 rows columns"]:
     """East and north map errors of the pixels of a block, metres.
 
@@ -132,7 +132,7 @@ def block_errors(
 
 @partial(compile_once, static=())
 def _errors(
-    truth: Scanner, search: Search, surface: Surface, nodes: Nodes, places: Places
+    truth: ScannerGeometry, search: Search, surface: Surface, nodes: MapNodes, places: Places
 ) -> Float[Array, "2 rows columns"]:
     ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
 
@@ -146,17 +146,17 @@ def _errors(
 
 
 def _locate(
-    image: Scanner, search: Search, surface: Surface, line: Scalar, pixel: Scalar
+    image: ScannerGeometry, search: Search, surface: Surface, line: Scalar, pixel: Scalar
 ) -> Triple:
     """The point seen at an image position, by the pieces of the search."""
     numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
-    pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
+    pose = LinePose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
 @partial(compile_once, static=())
 def _are_occluded(
-    image: Scanner,
+    image: ScannerGeometry,
     search: Search,
     surface: Surface,
     line: Float[AnyArray, "rows columns"],
@@ -202,13 +202,17 @@ def _level(surface: Surface) -> Scalar:
 
 @partial(compile_once, static=())
 def _places(
-    image: Scanner, search: Search, surface: Surface, nodes: Nodes, starts: Float[AnyArray, "2 n n"]
+    image: ScannerGeometry,
+    search: Search,
+    surface: Surface,
+    nodes: MapNodes,
+    starts: Float[AnyArray, "2 n n"],
 ) -> tuple[Array, Array, Array]:
     ground = _ground(surface, nodes)
     return *project_from(image, search, tuple(ground), *_spread(starts)), ground
 
 
-def _ground(surface: Surface, nodes: Nodes) -> Float[Array, "3 rows columns"]:
+def _ground(surface: Surface, nodes: MapNodes) -> Float[Array, "3 rows columns"]:
     """The points of all pixels, [3, BLOCK, BLOCK]."""
     X, vertical = _spread(nodes.X), _spread(nodes.up)
     if isinstance(surface, Terrain):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.locate import ground_point
 from jaxbundle.pushbroom.rpc import Rpc, project
 from jaxbundle.pushbroom.scanner import slopes_of
@@ -82,5 +82,5 @@ def compare_with_rpc(
 
 
 @jax.jit
-def _poses(image: PushbroomImage, lines: Float[AnyArray, " n"]) -> Pose:
+def _poses(image: PushbroomImage, lines: Float[AnyArray, " n"]) -> LinePose:
     return jax.vmap(lambda line: pose_at(image, image.times.time(line)))(lines)

@@ -37,7 +37,7 @@ MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
 CONTROL = Source("control points")
 
 
-class Bias(eqx.Module):
+class RpcBias(eqx.Module):
     """a₀, a₁, a₂ and b₀, b₁, b₂, in pixels."""
 
     line: Float[AnyArray, "3"]
@@ -49,7 +49,7 @@ class BiasFit(eqx.Module):
     point residuals (pixels), redundancy numbers, w (σ a priori). σ0 is NaN without redundancy.
     """
 
-    bias: Bias
+    bias: RpcBias
     cofactor: Float[np.ndarray, "u u"]
     sigma0: float
     redundancy: int
@@ -64,7 +64,7 @@ class BiasFit(eqx.Module):
 
 
 def project_compensated(
-    rpc: Rpc, bias: Bias, longitude: Scalar, latitude: Scalar, height: Scalar
+    rpc: Rpc, bias: RpcBias, longitude: Scalar, latitude: Scalar, height: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, radians and metres, with the bias."""
     line, sample = project(rpc, longitude, latitude, height)
@@ -115,20 +115,34 @@ def fit_bias(
     # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
     if singular[-1] < 1e-6 * singular[0]:
         raise InputError(f"{source.name}: all points on one line; give others, or use 'shift'")
+    ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
+    cofactors = np.einsum("nij,nj,nkj->nik", G, ground**2, G)
+    cofactors = cofactors + sigma[:, :, None] ** 2 * np.eye(2)
+    return _adjust(terms, np.stack([control.line, control.sample], 1) - computed, cofactors)
+
+
+def _adjust(
+    terms: Float[np.ndarray, "n k"],
+    difference: Float[np.ndarray, "n 2"],
+    cofactors: Float[np.ndarray, "n 2 2"],
+) -> BiasFit:
+    """Least squares of measured minus computed positions with P⁻¹ of each, `cofactors`.
+
+    Lines and samples of a point are correlated by its ground coordinates, so that all of it is
+    dense: a few control points.
+    """
+    n, k = terms.shape
     # rows in the order line, sample of the first point, of the second, …
     A = np.zeros((n, 2, 2 * k))
     A[:, 0, :k] = A[:, 1, k:] = terms
     A = A.reshape(2 * n, 2 * k)
     inverse_weights = np.zeros((n, 2, n, 2))
-    ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
-    each = np.einsum("nij,nj,nkj->nik", G, ground**2, G) + sigma[:, :, None] ** 2 * np.eye(2)
-    inverse_weights[np.arange(n), :, np.arange(n), :] = each
+    inverse_weights[np.arange(n), :, np.arange(n), :] = cofactors
     inverse_weights = inverse_weights.reshape(2 * n, 2 * n)
     P = np.linalg.inv(inverse_weights)
-    observed = np.stack([control.line, control.sample], 1)
     Q = np.linalg.inv(A.T @ P @ A)
-    x = Q @ A.T @ P @ (observed - computed).ravel()
-    v = (A @ x).reshape(n, 2) - (observed - computed)
+    x = Q @ A.T @ P @ difference.ravel()
+    v = (A @ x).reshape(n, 2) - difference
     Qv = inverse_weights - A @ Q @ A.T
     r = np.clip(np.diag(Qv @ P), 0.0, 1.0)
     test = np.diag(P @ Qv @ P)
@@ -139,11 +153,17 @@ def fit_bias(
     sigma0 = float(np.sqrt(vtpv / redundancy)) if redundancy else np.nan
     full = lambda a: jnp.asarray(np.r_[a, np.zeros(3 - k)])
     return BiasFit(
-        Bias(full(x[:k]), full(x[k:])), Q, sigma0, redundancy, v, r.reshape(n, 2), w.reshape(n, 2)
+        RpcBias(full(x[:k]), full(x[k:])),
+        Q,
+        sigma0,
+        redundancy,
+        v,
+        r.reshape(n, 2),
+        w.reshape(n, 2),
     )
 
 
-def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
+def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
     exact).
 

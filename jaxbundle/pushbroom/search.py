@@ -26,7 +26,7 @@ class Search(eqx.Module):
     settings: SearchSettings = eqx.field(static=True, default=DEFAULTS)
 
 
-class Scanner(eqx.Module):
+class ScannerGeometry(eqx.Module):
     """An image with pieces in place of its trajectory: images of one scanner share compiled
     programs."""
 
@@ -48,12 +48,12 @@ class Scanner(eqx.Module):
         return apparent_point(self.corrections, earth, *motion, X) if self.corrections.any else X
 
 
-def scanner_of(image: PushbroomImage | Scanner) -> Scanner:
+def scanner_of(image: PushbroomImage | ScannerGeometry) -> ScannerGeometry:
     """The image without its trajectory.
 
     Its size becomes data, so that images of different size share programs too.
     """
-    if isinstance(image, Scanner):
+    if isinstance(image, ScannerGeometry):
         return image
     lines, pixels = np.asarray(float(image.lines)), np.asarray(float(image.pixels))
-    return Scanner(image.times, image.optics, lines, pixels, image.corrections)
+    return ScannerGeometry(image.times, image.optics, lines, pixels, image.corrections)

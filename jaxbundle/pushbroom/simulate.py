@@ -20,7 +20,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import PushbroomImage, make_image
-from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.interpolation import TimeTable
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.noise import Errors, Noise, add_errors, draw, sigmas
 from jaxbundle.pushbroom.orbit import state_orbit
@@ -28,7 +28,7 @@ from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -87,7 +87,7 @@ def with_errors_in_rows(image: PushbroomImage, errors: Errors) -> PushbroomImage
     t0 = image.middle_time
 
     def rows(
-        table: Table,
+        table: TimeTable,
         bias: Float[AnyArray, "3"],
         drift: Float[AnyArray, "3"],
         white: Float[AnyArray, "rows 3"],
@@ -133,7 +133,7 @@ _ground = compile_once(locate_lines, ())
 _resample = compile_once(resample, 3)
 
 
-def _image(flight: Flight, position: Table, attitude: Attitude) -> PushbroomImage:
+def _image(flight: Flight, position: TimeTable, attitude: AttitudeTable) -> PushbroomImage:
     times = LineTimes(jnp.zeros(()), jnp.asarray(float(flight.period)))
     return make_image(
         Trajectory(position, attitude),
@@ -155,7 +155,7 @@ def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
     return np.arange(-margin, np.ceil(last * rate) + margin + 1) / rate
 
 
-def _position(flight: Flight, rate: float, method: str) -> Table:
+def _position(flight: Flight, rate: float, method: str) -> TimeTable:
     t, track = _samples(flight, rate), dict(flight.track)
     if "start" in track:
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
@@ -171,7 +171,7 @@ def _position(flight: Flight, rate: float, method: str) -> Table:
     return position_table(t, P, V, method=method)
 
 
-def _attitude(flight: Flight, rate: float, method: str) -> Attitude:
+def _attitude(flight: Flight, rate: float, method: str) -> AttitudeTable:
     """The table of angles, sums of signals, each with random numbers of its own."""
     t, angles = _samples(flight, rate), []
     for axis, name in enumerate(("pitch", "roll", "yaw")):

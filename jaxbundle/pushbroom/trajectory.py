@@ -33,7 +33,7 @@ from jaxbundle.geometry import (
     rotation_vector_from_quaternion,
 )
 from jaxbundle.pushbroom.interpolation import (
-    Table,
+    TimeTable,
     convert_to_pieces,
     covers,
     fraction,
@@ -44,13 +44,13 @@ from jaxbundle.pushbroom.interpolation import (
 from jaxbundle.types import AnyArray, Scalar
 
 
-class Attitude(eqx.Module):
+class AttitudeTable(eqx.Module):
     """Quaternions or angles against time; `slerp` overrides the method of the table.
 
     `reference`: `"earth"`, R leads to the frame of the positions; `"orbit"`, to the orbital frame.
     """
 
-    table: Table
+    table: TimeTable
     slerp: bool = eqx.field(static=True, default=False)
     reference: Literal["earth", "orbit"] = eqx.field(static=True, default="earth")
 
@@ -58,8 +58,8 @@ class Attitude(eqx.Module):
 class Trajectory(eqx.Module):
     """Positions in metres and attitudes."""
 
-    position: Table
-    attitude: Attitude
+    position: TimeTable
+    attitude: AttitudeTable
 
 
 def position_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
@@ -80,7 +80,7 @@ def rotation_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3 3"]:
     return orbital_frame(position_at(trajectory, t), velocity_at(trajectory, t)) @ R
 
 
-def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
+def attitude_at(attitude: AttitudeTable, t: Scalar) -> Float[Array, "3 3"]:
     """R from the camera frame to the frame the attitudes refer to."""
     table = attitude.table
     if table.values.shape[1] == 3:
@@ -96,7 +96,7 @@ def trajectory_in_pieces(trajectory: Trajectory) -> Trajectory:
     turned = lambda t: method(attitude.table, t)
     return Trajectory(
         convert_to_pieces(position, lambda t: interpolate(position, t)),
-        Attitude(convert_to_pieces(attitude.table, turned), False, attitude.reference),
+        AttitudeTable(convert_to_pieces(attitude.table, turned), False, attitude.reference),
     )
 
 
@@ -113,7 +113,7 @@ def orbital_frame(P: Float[AnyArray, "3"], V: Float[AnyArray, "3"]) -> Float[Arr
     return jnp.stack([right, jnp.cross(up, right), up], axis=1)
 
 
-def _slerp(table: Table, t: Scalar) -> Float[Array, "4"]:
+def _slerp(table: TimeTable, t: Scalar) -> Float[Array, "4"]:
     """qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)); NaN outside the table and in gaps."""
     i = interval(table, t)
     start, end = table.values[i], table.values[i + 1]

@@ -1,6 +1,7 @@
 """The solution of a refinement, and its statistics in the order of its unknowns and rays."""
 
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,19 +11,18 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, with_data
+from jaxbundle.leastsquares.quality.snooping import Removed as EngineRemoved
 from jaxbundle.leastsquares.quality.snooping import snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.refinement.declare import Declared
+from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
-
-ROUNDS, SAME = 10, 1e-9
-"""Largest number of solutions, each with the S of the previous one; tolerance of S."""
 
 
 class Shared(eqx.Module):
@@ -34,6 +34,7 @@ class Shared(eqx.Module):
     spaces: tuple[tuple[str, Space], ...] = eqx.field(static=True)
 
     def __call__(self, values: Values) -> Float[Array, " m"]:
+        """The changes of the shared unknowns from the start to these tables."""
         spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.at.values()))
         for t, (k, row, direction) in self.at.items():
             change = jax.vmap(spaces[t].difference)(values[t], self.start[t])
@@ -53,15 +54,22 @@ class Shared(eqx.Module):
 _estimate = compile_once(lambda shared, values: shared(values))
 
 
-class Inspection:
+class RefinementInspection:
     """Statistics at a solution of the engine; cofactors are to be multiplied by σ0²."""
 
-    def __init__(self, declared: Declared, solution: Solution, steps: int, removed=()):
+    def __init__(
+        self,
+        declared: DeclaredRefinement,
+        solution: Solution,
+        steps: int,
+        removed: Sequence[EngineRemoved] = (),
+    ):
         self.declared, self.solution, self.steps = declared, solution, steps
-        self.removed = tuple(_name(declared, one) for one in removed)
+        self.removed = tuple(_describe_removed(declared, blunder) for blunder in removed)
 
     @property
     def redundancy(self) -> int:
+        """Observations and priors minus unknowns."""
         return self.solution.problem.counts.redundancy
 
     @property
@@ -108,7 +116,7 @@ class Inspection:
     @property
     def positions(self) -> Float[np.ndarray, "points 3"]:
         """Adjusted coordinates of the points."""
-        return np.asarray(self.solution.values["point"].position) + self.declared.given.origin
+        return np.asarray(self.solution.values["point"].position) + self.declared.inputs.origin
 
     @functools.cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
@@ -131,32 +139,39 @@ class Inspection:
         return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
 
 
-def adjust(declared: Declared, snooping: str, significance: float) -> Inspection:
+def adjust(
+    declared: DeclaredRefinement, snooping: str, significance: float
+) -> RefinementInspection:
     """Solve, optionally remove blunders, and inspect the solution.
 
     **Raises:** `NotSolvedError` with the undetermined unknowns."""
     steps = 0
 
-    def again(problem: Problem, values: Values) -> Solution:
+    def adjust_from(problem: Problem, values: Values) -> Solution:
         nonlocal steps
         problem, _ = declared.rescale(problem, values)
-        for _ in range(ROUNDS):
+        # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution, as its derivatives would be those
+        # of a Jacobian; v and their weights are right when it is that of the solution. The second
+        # solution starts at the first; ten are out of reach.
+        for _ in range(10):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
             problem, change = declared.rescale(problem, values)
-            if not (change > SAME and converged(minimum.termination)):
+            if not (change > 1e-9 and converged(minimum.termination)):
                 break
         found = Solution(problem, values)
         _require_solved(declared, found, minimum, steps)
         return found
 
-    found, removed = again(declared.problem, declared.problem.data.start), []
+    found, removed = adjust_from(declared.problem, declared.problem.data.start), []
     if snooping != "none":
-        found, removed = snoop(found, again, test=snooping, significance=significance)
-    return Inspection(declared, found, steps, removed)
+        found, removed = snoop(found, adjust_from, test=snooping, significance=significance)
+    return RefinementInspection(declared, found, steps, removed)
 
 
-def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
+def _require_solved(
+    declared: DeclaredRefinement, found: Solution, minimum: Minimum, steps: int
+) -> None:
     settled = bool(converged(minimum.termination))
     if settled and found.determined and found.problem.counts.redundancy >= 0:
         return
@@ -174,27 +189,27 @@ def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
     )
 
 
-def _name(declared: Declared, one) -> Removed:
+def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
-    given, chosen = declared.given, declared.rays.points
+    inputs, chosen = declared.inputs, declared.rays.points
     names = [part.set for part in declared.parts]
-    points, set = given.points, declared.problem.observations_of(one.set)
-    if one.set in names:
-        number = names.index(one.set)
+    points, set = inputs.points, declared.problem.observations_of(blunder.set)
+    if blunder.set in names:
+        number = names.index(blunder.set)
         part = declared.parts[number]
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
         told = [
-            f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
-            for r in one.rows
+            f"point {points.id[chosen[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
+            for r in blunder.rows
         ]
         name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
-        rows = [int(place[before + r]) for r in one.rows]
-        return Removed("image", rows[0], name, one.test, tuple(rows[1:]))
+        rows = [int(place[before + r]) for r in blunder.rows]
+        return Removed("image", rows[0], name, blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
-        p = declared.control[one.row]
-        name = f"{points.axis_names[one.residual]} of control point {points.id[chosen[p]]}"
-        return Removed("control", 3 * int(p) + one.residual, name, one.test)
-    a, b = (points.id[chosen[r[one.row]]] for r in set.rows)
-    return Removed("distance", one.row, f"distance {a}–{b}", one.test)
+        p = declared.control[blunder.row]
+        name = f"{points.axis_names[blunder.residual]} of control point {points.id[chosen[p]]}"
+        return Removed("control", 3 * int(p) + blunder.residual, name, blunder.test)
+    a, b = (points.id[chosen[r[blunder.row]]] for r in set.rows)
+    return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)

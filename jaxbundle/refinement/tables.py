@@ -1,6 +1,7 @@
 """The input of a refinement: scanner images, ground points, measurements."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,10 +53,10 @@ class GroundPoints:
 
 
 def local_points(
-    id,
-    role,
-    X,
-    sigma=None,
+    id: Sequence[str],
+    role: Sequence[str],
+    X: Float[np.ndarray, "points 3"],
+    sigma: float | Float[np.ndarray, "#points 3"] | None = None,
     source: Source = Source("points"),  # noqa: B008
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
@@ -133,14 +134,9 @@ def check_observations(
     for i, one in enumerate(images):
         rows = np.flatnonzero(observations.image == i)
         t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
-        tables = (
-            ("positions", one.image.trajectory.position),
-            (
-                "attitude",
-                one.image.trajectory.attitude.table,
-            ),
-        )
-        for what, table in tables:
+        trajectory = one.image.trajectory
+        tables = {"positions": trajectory.position, "attitude": trajectory.attitude.table}
+        for what, table in tables.items():
             out = ~np.asarray(covers(table, interval(table, t), t))
             if out.any():
                 row, at = rows[out.argmax()], float(t[out.argmax()])

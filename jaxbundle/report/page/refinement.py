@@ -60,7 +60,7 @@ def _words(values) -> np.ndarray:
 
 def _image_points(result) -> list[dict]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
-    declared, given = result.inspection.declared, result.inspection.declared.given
+    declared, given = result.inspection.declared, result.inspection.declared.inputs
     xy = lambda of_scanner: np.asarray(
         given.observations.xy if of_scanner else given.frames.observations.xy
     )
@@ -111,14 +111,14 @@ def _unknowns(result) -> Section:
 
 def _images(result, used) -> Columns:
     camera, rms = [], []
-    for id in result.inspection.declared.given.ids:
+    for id in result.inspection.declared.inputs.ids:
         v = np.array([row["v"] for row in used if row["image"] == id]).reshape(-1, 2)
         rms.append(np.sqrt((v**2).sum(1).mean()) if len(v) else np.nan)
     scanners = [one.id for one in result.images]
     if result.frames is not None:
         camera = [result.frames.cameras[c].id for c in result.frames.images.camera]
     return {
-        "id": Column(_words(result.inspection.declared.given.ids), "image"),
+        "id": Column(_words(result.inspection.declared.inputs.ids), "image"),
         "camera": Column(_words([*(f"scanner {id}" for id in scanners), *camera]), "camera"),
         "rms": Column(np.array(rms), "RMS |v|"),
     }
