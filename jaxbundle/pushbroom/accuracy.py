@@ -157,6 +157,7 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
     # λ₂ = 0 leaves directions without extent; r²/1e-300 does not overflow and its exponential is 0
     stretch = np.maximum(stretch, 1e-300)
+    # ten times the largest σ is outside any fraction that double precision tells from 1
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 

@@ -153,6 +153,7 @@ def apparent_point(
     if not corrections.any:
         x, y, z = X
         return x, y, z
+    # the corrections of `ground_point` in the opposite order: here the point is known
     o, distance = P, length(difference(X, P))
     if corrections.light_time:
         # the distance changes by 1e-6 of itself in the first round, by 1e-12 in the second

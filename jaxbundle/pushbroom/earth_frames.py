@@ -73,10 +73,12 @@ def to_earth(
         ut1 = erfa.utcut1(day, part, orientation.ut1_utc)
         tt = erfa.taitt(*erfa.utctai(day, part))
     pole = orientation.x_pole * ARCSECOND, orientation.y_pole * ARCSECOND
+    # TEME: the equinox of GMST82; the same sidereal time that the elements were made with
     if frame == "TEME":
         return erfa.pom00(*pole, 0.0) @ _about("z", -erfa.gmst82(*ut1)).as_matrix()
     matrices = erfa.c2t06a(*tt, *ut1, *pole)
     if frame == "J2000":
+        # at the epoch J2000.0, as the frame is fixed
         bias, _, _ = erfa.bp06(2451545.0, 0.0)
         matrices = matrices @ bias.T
     return matrices

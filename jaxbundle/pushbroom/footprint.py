@@ -84,6 +84,7 @@ def make_footprint(
     levels = np.linspace(heights[0], heights[1], layers)
     speeds = partial(_speeds_at, pieces, levels, line, earth, settings.times_at_once)
     D, _ = speeds(k, tau, xi, eta)
+    # a sight that misses the ground at some height: the footprint has no edge there
     if not np.isfinite(D).all():
         return None
     footprint, errors = _fit(D, times, u, heights)
@@ -93,6 +94,7 @@ def make_footprint(
     reach = _slope_range(pieces, np.asarray(samples), D.reshape(-1, 3), settings.slope_margin)
     if reach is None:
         return None
+    # slopes of points of the footprint at all times, not only when they are seen
     xi = np.linspace(*reach, across)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
     k, within = np.indices((len(pieces.ends) - 1, len(TESTED_POSITIONS))).reshape(2, -1)

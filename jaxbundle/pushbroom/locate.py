@@ -31,6 +31,8 @@ def ground_point(
 ) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
+    # Backwards along the way of the light: aberration happens in the camera; the Earth has turned
+    # since the light left; refraction is last, as it needs the height of the point.
     o, d = P, rotate(R, (*slopes, -1.0))
     if corrections.aberration:
         d = without_aberration(d, inertial_velocity(o, V))

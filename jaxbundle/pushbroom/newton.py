@@ -23,8 +23,8 @@ from jaxbundle.pushbroom.search import ScannerGeometry, Search
 from jaxbundle.system.devices import batch_size
 from jaxbundle.types import AnyArray, Scalar
 
+# of points [n]: time, pixel, whether they have settled, rounds made
 RefinementState = tuple[Array, Array, Array, Array]
-"""Of points [n]: time, pixel, whether they have settled, rounds made."""
 
 
 def refine(

@@ -67,7 +67,9 @@ def state_orbit(
                 f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "
                 "velocity, its unit and frame"
             )
+        # times need not be sorted, but those of the integration are
         states[part] = found.y.T[np.searchsorted(order * when, order * times[part])]
+    # from the axes at the epoch to those that have turned since
     back = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
     P = back.apply(states[:, :3])
     return P, back.apply(states[:, 3:]) - np.cross(spin, P)

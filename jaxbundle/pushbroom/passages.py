@@ -18,14 +18,14 @@ from jaxbundle.pushbroom.detector_line import slope_ahead
 from jaxbundle.pushbroom.pieces import sample
 from jaxbundle.pushbroom.search import ScannerGeometry, Search
 
+# start times [most, n]; their number, and whether the point is ahead of the last line, behind the
+# first, never above the horizon [n]
 Passages = tuple[Array, Array, Array, Array, Array]
-"""Start times [most, n]; their number, and whether the point is ahead of the last line, behind the
-first, never above the horizon [n]."""
+# F, its rate and the time of the previous step; the number of passages and their start times; F of
+# the first step; whether the camera has been above the horizon
 PassagesState = tuple[Array, Array, Array, Array, tuple[Array, ...], Array, Array]
-"""F, its rate and the time of the previous step; the number of passages and their start times; F of
-the first step; whether the camera has been above the horizon."""
+# number and time of a step, twelve numbers and their rates there, (P, V)
 SearchStep = tuple[Array, Array, Array, Array, tuple[Vector, Vector]]
-"""Number and time of a step, twelve numbers and their rates there, (P, V)."""
 
 
 def find_passages(

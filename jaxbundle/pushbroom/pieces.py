@@ -47,10 +47,10 @@ TO_HALVES = np.array(
 """From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 
+# start, end, coefficients
 Piece = tuple[float, float, Float[np.ndarray, "4 12"]]
-"""Start, end, coefficients."""
+# M (rows first) and m
 TwelveNumbers = Sequence[Scalar] | Float[AnyArray, "12 ..."]
-"""M (rows first) and m."""
 
 
 class Pieces(eqx.Module):
@@ -90,6 +90,7 @@ def make_pieces(
         error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
         good = error <= settings.piece_tolerance
         found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
+        # a rough trajectory, or a wrong row, would be halved for ever
         left, right = left[~good], right[~good]
         if len(left) and (right - left).min() < settings.min_piece * line:
             raise InputError(

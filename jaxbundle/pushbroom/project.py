@@ -268,6 +268,7 @@ def _search(
     t, u, settled = jax.lax.map(refine_passage, (starts, there))
     seen = there & settled & _inside(image, t, u, margin)
     lost = jnp.any(there & ~settled, axis=0)
+    # places inside the image first, in order of time
     order = jnp.argsort(~seen, axis=0, stable=True)
     sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
     # passages beyond the first `most` were not refined: they may be outside the image

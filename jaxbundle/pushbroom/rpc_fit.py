@@ -292,6 +292,7 @@ def _fit_axis(
     for k in range(settings.max_steps):
         v, J = map(np.asarray, _value_and_jacobian(c, T, y))
         U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
+        # Solved for the new c, not for the step: the ridge pulls the coefficients towards zero.
         target = J @ c - v
         if ridge is None and k < settings.ridge_steps:
             tau = _choose_ridge(U, s, target, scale, settings)
@@ -303,9 +304,11 @@ def _fit_axis(
             break
     v, J = map(np.asarray, _value_and_jacobian(c, T, y))
     U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
+    # n − Σh, the effective number of unknowns of a ridge regression
     redundancy = len(y) - float(np.sum(s**2 / (s**2 + tau**2)))
     if sigma is None:
         sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
+    # (N + τ²D²)⁻¹·Jᵀ = D⁻¹·V·diag(s/(s² + τ²))·Uᵀ, and UᵀU = I
     half = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
     return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
 
@@ -364,6 +367,7 @@ def _choose_ridge(
     for tau in s[0] * CANDIDATE_RIDGES:
         filter_factors = s**2 / (s**2 + tau**2)
         h = (U**2) @ filter_factors
+        # vᵢ/(1 − hᵢ) is the residual of a point that took no part
         press.append(np.sqrt(np.mean(((y - U @ (filter_factors * part)) / (1 - h)) ** 2)))
     press = np.array(press)
     limit = settings.relative_press * press.min() + settings.sufficient_residual / scale

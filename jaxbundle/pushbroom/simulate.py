@@ -158,6 +158,7 @@ def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
 def _position(flight: Flight, rate: float, method: str) -> TimeTable:
     t, track = _samples(flight, rate), dict(flight.track)
     if "start" in track:
+        # a straight line is interpolated exactly
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
         return position_table(
             t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)), method="linear"

@@ -38,10 +38,10 @@ from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Numbers
 
+# column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁
 Cell = tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]
-"""Column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁."""
+# the coefficients of one coordinate in τ, from the constant upwards
 Parabola = Triple
-"""The coefficients of one coordinate in τ, from the constant upwards."""
 Path = tuple[Parabola, Parabola, Parabola]
 
 
@@ -78,6 +78,7 @@ class Terrain(Surface):
         x, y, h = X if self.earth is None else geodetic(self.earth, X)
         dx = x - self.origin[0]
         if self.earth is not None:
+            # a turn more or less: the grid may cross the date line
             middle = self.step[0] * (self.heights.shape[1] - 1) / 2
             dx = dx - 2 * np.pi * jnp.round((dx - middle) / (2 * np.pi))
         return dx / self.step[0], (y - self.origin[1]) / self.step[1], h
@@ -201,6 +202,7 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)
+        # a corner without height makes all of the cell NaN, so that the middle decides
         void = jnp.isnan(f[1])
         found = (part <= 1) & ~under
         done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)

@@ -50,6 +50,7 @@ def adjusted_photographs(result: Refinement) -> Network | None:
     kept = np.zeros(len(network.observations), bool)
     for part in declared.parts:
         if not part.of_scanner:
+            # a point whose two coordinates were both removed by snooping is left out
             kept[part.rows] = found.used[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))
     points = network.points

@@ -70,8 +70,9 @@ def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     here = Solution(problem, start)
     A = _slopes(*here.given, found.shared, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
+    # A·Q·Aᵀ of every ray
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
-    weight = problem.data.weight
+    weight = problem.data.weight  # 1/σ
     of_rays = lambda by_set: checks.image_by_image([np.asarray(x) for x in by_set])
     return RefinementCheckPoints(
         tuple(inputs.points.id[k] for k in rays.points),

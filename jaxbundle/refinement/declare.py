@@ -169,6 +169,7 @@ class DeclaredRefinement:
             if part.of_scanner:
                 lines, _ = _lines(self.inputs, values, X, part.rows, part.image, part.point)
                 before, measured[part.set] = np.asarray(measured[part.set].scale), lines
+                # relative to the largest element: those off the diagonal are nearly zero
                 size = np.abs(before).max((1, 2), keepdims=True)
                 change = max(change, float((np.abs(lines.scale - before) / size).max()))
         data = dataclasses.replace(problem.data, measured=measured)
@@ -205,17 +206,19 @@ def declare(
     **Raises:** `InputError` for points far from their measurement."""
     points, chosen, n = inputs.points, rays.points, len(rays.points)
     checking = values is not None
-    index = np.full(len(points), -1)
+    index = np.full(len(points), -1)  # of every point among those used
     index[chosen] = np.arange(n)
     X = X - inputs.origin
     corrections, columns = _corrections(inputs)
     tables = [table for table, _ in corrections]
+    # S of the scanner points is evaluated here, at the start, and again in `rescale`
     values = values or {t.name: t.value for t in tables}
     observed, parts = _scanner_points(inputs, rays, values, X, index)
     of_cameras = {}
     if inputs.frames is not None:
         network = _network_of(inputs, rays, index, X + inputs.origin, checking)
         photographs = declare_network(network, inputs.origin)
+        # the network has a set of image points for every camera model
         for s in photographs.layout.sets:
             if s.field == "image":
                 rows = np.arange(len(rays.frame)) if s.rows is None else s.rows
@@ -242,6 +245,8 @@ def declare(
                 'refine: every unknown is held; free some, such as attitude = "free" in [unknowns]'
             )
     tables = [dataclasses.replace(t, value=values.get(t.name, t.value)) for t in tables]
+    # A point is touched by few observations, so that its 3 × 3 block is eliminated before the
+    # unknowns that points share are solved for.
     eliminate = "point" if table.free.any() else None
     problem = make_problem([*tables, table], observed, eliminate)
     return DeclaredRefinement(inputs, rays, problem, tuple(parts), tuple(columns), at, of_cameras)
@@ -290,6 +295,8 @@ def _corrections(
         of_sensor[row, absent] = sigma[i, own:][absent]
     named = [names(f.sizes, one.id, sensor_of(one)) for f, one in zip(inputs.forms, images)]
     tables, columns = [], [[] for _ in images]
+    # The vector of an image is its own unknowns, then those of its sensor: two tables, so that
+    # images of one sensor touch the same row. Columns that are held in all rows leave the space.
     own_part = (IMAGE, sigma[:, :own], range(len(images)), 0)
     for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
         sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
@@ -319,6 +326,7 @@ def _points(
     sigma = np.nan_to_num(points.sigma[chosen], nan=0.0, posinf=np.inf)
     control = (role == "control")[:, None]
     free = ~(control & (sigma == 0))
+    # one ray gives no height: such a check point moves along its first two axes only
     free[(role == "check") & (seen < 2), 2] = False
     placed = kinds.Placed(X, points.axes[chosen])
     labels = [points.id[k] for k in chosen]
@@ -341,6 +349,7 @@ def _network_of(
 ) -> Network:
     """The photographs with the points and rays used; control is declared here (`_points`)."""
     frames, n = present(inputs.frames), len(X)
+    # a camera without photographs would be undetermined
     used = list(dict.fromkeys(frames.images.camera.tolist()))
     camera = np.array([used.index(c) for c in frames.images.camera], int)
     seen, d = frames.observations.take(rays.frame), frames.distances
@@ -350,6 +359,8 @@ def _network_of(
     return frames.replace(
         cameras=tuple(frames.cameras[c] for c in used),
         images=dataclasses.replace(frames.images, camera=camera),
+        # all of them tie points here: control is along the axes of each point, which the network
+        # does not know
         points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
         observations=dataclasses.replace(seen, point=index[inputs.frame_point[seen.point]]),
         distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),
@@ -369,7 +380,7 @@ def _columns_of_photographs(
             columns.append(SharedUnknown(name, math.inf, "image", i, k))
         c = network.images.camera[i]
         camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
-        if c in network.images.camera[:i]:
+        if c in network.images.camera[:i]:  # named with its first image
             continue
         for d in np.flatnonzero(called[title].free[row]).tolist():
             word = called[title].parameters[d]

@@ -121,6 +121,7 @@ class RefinementInspection:
     @functools.cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
         """v of every set of observations in its unit, including removed ones."""
+        # with the weights before snooping: what a removed observation disagrees by is of interest
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
         found = Solution(with_data(problem, data), self.solution.values).residuals
@@ -175,6 +176,7 @@ def _require_solved(
     settled = bool(converged(minimum.termination))
     if settled and found.determined and found.problem.counts.redundancy >= 0:
         return
+    # A singular system often does not converge either: the cause is reported, not the symptom.
     reasons = [w.sentence for w in weaknesses(declared, found)] if not found.determined else []
     if reasons or settled:
         told = reasons[0] if reasons else "more unknowns than observations"
@@ -198,12 +200,14 @@ def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> R
     if blunder.set in names:
         number = names.index(blunder.set)
         part = declared.parts[number]
+        # the rank of a row, set by set, in the order of the images
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
         told = [
             f"point {points.id[chosen[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
             for r in blunder.rows
         ]
+        # observations of a point that cannot be told apart were removed together
         name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
         rows = [int(place[before + r]) for r in blunder.rows]
         return Removed("image", rows[0], name, blunder.test, tuple(rows[1:]))

@@ -62,8 +62,8 @@ class Placed(NamedTuple):
     axes: Float[AnyArray, "*rows 3 3"]
 
 
+# X and the axes as scalars (`leastsquares.spaces`)
 PlacedBlock = tuple[Triple, tuple[Triple, Triple, Triple]]
-"""X and the axes as scalars (`leastsquares.spaces`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +83,7 @@ class AlongAxes:
     def retract(self, value: Placed, change: Float[AnyArray, "3"]) -> Placed:
         return value._replace(position=value.position + change @ value.axes)
 
+    # the axes of the origin: `retract` moves along them, and they do not change
     def difference(self, value: Placed, origin: Placed) -> Float[Array, "3"]:
         return origin.axes @ (value.position - origin.position)
 
@@ -218,6 +219,7 @@ def _lines_of(
         def misclosure(place: Float[Array, "2"]) -> tuple[Array, tuple[Array, MeasuredLine]]:
             line = line_of(image, form, origin, place)
             g = kind.misclosure(own, sensor, X, line)
+            # ∂g/∂(l, u) needs the trajectory's own derivative by time; g and the line come with it
             return g, (g, line)
 
         slope, (g, line) = jax.jacfwd(misclosure, has_aux=True)(place)

@@ -31,6 +31,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
+    # without the jitter, which has no middle: the attitude is computed time by time below
     moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)),
@@ -91,6 +92,7 @@ def _attitude(image: PushbroomImage, form: Form, change: Change) -> AttitudeTabl
         # 1e-9 rad is a millimetre from 1000 km. The error of slerp is largest in the middle; each
         # halving leaves a quarter of it.
         wrong = np.linalg.norm(_turns(half, there), axis=1) > 1e-9
+        # a gap has no values to be followed
         wrong &= ~np.isin(times[left + 1], gaps)
         # both halves of a split interval are checked again
         order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
@@ -105,6 +107,7 @@ def _attitude(image: PushbroomImage, form: Form, change: Change) -> AttitudeTabl
                 "table is too rough between its rows"
             )
     quaternions = _pad(_quaternions, rotations)
+    # 1 % more than the longest step, or times rounded in a file would make a gap of it
     longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
     return attitude_table(
         times, quaternions, method="slerp", reference=old.reference, gap=1.01 * longest
@@ -162,6 +165,7 @@ def _sum(base: AnglePolynomial, e: Scalar, added: AnglePolynomial) -> AnglePolyn
     """base/(1 + e) + added as one polynomial about the middle of `base`."""
     total = []
     for own, more in ((base.across, added.across), (base.along, added.along)):
+        # û of `added` as a polynomial of û of `base`, (û·half + middle − middle′)/half′
         line = np.array([float(base.middle - added.middle), float(base.half)]) / float(added.half)
         moved = np.polynomial.Polynomial(np.asarray(more))(np.polynomial.Polynomial(line)).coef
         total.append(

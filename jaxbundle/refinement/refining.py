@@ -91,6 +91,7 @@ class Refinement:
         inputs, r = self.inspection.declared.inputs, self.redundancy
         frames = [] if inputs.frames is None else [inputs.frames.observations]
         sets = [inputs.observations, *frames]
+        # one set of unstated σ makes vᵀPv a number without scale
         origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
         return chi_squared_test(r * self.sigma0**2, r, origin)
 

@@ -38,7 +38,18 @@ def to_json(result: Refinement) -> dict:
             )
         ],
         "correlation": result.correlation.tolist(),
-        "points": _points(result),
+        "points": [
+            {
+                "id": result.points.id[k],
+                "role": result.points.role[k],
+                "X": X,
+                "sigma": s,
+                "axes": list(result.points.axis_names),
+            }
+            for k, X, s in zip(
+                found.declared.rays.points, result.positions.tolist(), found.point_sigma.tolist()
+            )
+        ],
         "image_points": [
             {**row, "v": row["v"].tolist(), "r": row["r"].tolist(), "w": row["w"].tolist()}
             for row in result.image_points()
@@ -55,20 +66,6 @@ def to_json(result: Refinement) -> dict:
         ]
         document["check_rms"] = c.rms.tolist()
     return document
-
-
-def _points(result: Refinement) -> list[dict]:
-    chosen, sigma = result.inspection.declared.rays.points, result.inspection.point_sigma.tolist()
-    return [
-        {
-            "id": result.points.id[k],
-            "role": result.points.role[k],
-            "X": X,
-            "sigma": s,
-            "axes": list(result.points.axis_names),
-        }
-        for k, X, s in zip(chosen, result.positions.tolist(), sigma)
-    ]
 
 
 def report(
@@ -106,9 +103,12 @@ def report(
     if result.warnings:
         lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
     lines += ["", "Unknowns", *_unknowns(result)]
-    strong = _correlations(result, min_correlation, most)
-    if strong:
-        lines += ["", f"Correlations above {min_correlation:g}", *strong]
+    C, names = result.correlation, result.names
+    i, j = np.nonzero(np.triu(np.abs(C) > min_correlation, 1))
+    if len(i):
+        lines += ["", f"Correlations above {min_correlation:g}"]
+        order = np.argsort(-np.abs(C[i, j]), kind="stable")[:most]
+        lines += [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
     lines += ["", "Image points with the largest tests", *_tests(used, most)]
     if result.removed:
         lines += ["", "Removed as blunders"]
@@ -127,13 +127,6 @@ def _unknowns(result: Refinement) -> Iterator[str]:
             f"  {str(name):46s} {value * name.factor:13.5f} {s * name.factor:11.5f} {prior:>10s} "
             f"{name.unit}"
         )
-
-
-def _correlations(result: Refinement, smallest: float, most: int) -> list[str]:
-    C, names = result.correlation, result.names
-    i, j = np.nonzero(np.triu(np.abs(C) > smallest, 1))
-    order = np.argsort(-np.abs(C[i, j]), kind="stable")[:most]
-    return [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
 
 
 def _tests(rows: list[dict], most: int) -> Iterator[str]:

@@ -62,6 +62,7 @@ class JitterSpline:
         if not self.intervals:
             return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)
+        # All coefficients, as b is 0 beyond 2: they are few, and no index depends on the time.
         near = 2 / 3 - x**2 + x**3 / 2
         far = jnp.maximum(2 - x, 0.0) ** 3 / 6
         return jnp.asarray(self.basis.T) @ jnp.where(x < 1, near, far)

@@ -73,6 +73,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
     X = points.X.copy()
     for k, id in enumerate(theirs.id):
+        # coordinates of a network may be approximate: they only fill gaps
         if id in known and np.isnan(X[known[id]]).any():
             X[known[id]] = theirs.position[k]
     new = [k for k, id in enumerate(theirs.id) if id not in known]
@@ -119,6 +120,7 @@ def check_observations(
         where = f"{observations.source(row)}: point {points.id[p]!r} in image {one.id!r}"
         sizes = (one.image.lines, one.image.pixels)
         for name, value, size in zip(("line", "pixel"), observations.xy[row], sizes):
+            # pixels are areas about integers, so that the image ends half a pixel beyond the last
             if not -0.5 <= value <= size - 0.5:
                 raise InputError(
                     f"{where}: {name} {value:g} is off the image, which has {size}; -0.5 to "

@@ -59,6 +59,7 @@ def weaknesses(
     """All weak directions, the weakest first; jitter is one per axis."""
     S, names = _observe(declared, found)
     if not np.isfinite(S).all():
+        # a point that its own observations leave open, so that it could not be eliminated
         vague = undetermined(found.problem, found.values)
         sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
         return [WeakDirection(0.0, tuple(vague), sentence)]
@@ -102,6 +103,7 @@ def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[t
     total = {}
     for part, name in zip(vector, names):
         word = f"{name.group} of {name.owner}"
+        # of eigenvector components, whose squares add up: all coefficients of a spline as one
         total[word] = total.get(word, 0.0) + part**2
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
