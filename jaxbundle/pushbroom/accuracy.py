@@ -51,6 +51,7 @@ def spread_positions(
     rows, columns = cells
     n = -(-least // (rows * columns))
     draw = np.random.default_rng(0)
+    # each row of cells deals its parts of the lines to its columns at random
     turns = draw.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
     part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
     down = (part + draw.random(part.shape)) / (columns * n)

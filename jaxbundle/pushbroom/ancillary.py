@@ -224,6 +224,7 @@ def check_covered(
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
     check_span(rows, table.extrapolate, times, source, thing)
+    # as in `interpolation.interval`, which decides for the image
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
     if wide.any():

@@ -183,6 +183,8 @@ def _end_rows(
     pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
     h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
     both = h0 + h1
+    # Not-a-knot: the third derivative is continuous at the second row, which combined with its own
+    # equation leaves h₁·ẏ₀ + (h₀ + h₁)·ẏ₁ = knot (de Boor, 1978, chapter IV).
     knot = (((h0 + 2 * both) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both[:, None]
     parabola = s0 - (h0 / both)[:, None] * (s1 - s0)
     ending = lambda by: jnp.concatenate([last[by:], jnp.ones(by, bool)])

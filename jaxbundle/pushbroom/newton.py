@@ -3,11 +3,11 @@
     f = r + ξ(u)·q = 0,    g = s + η(u)·q = 0,        [r, s, q] = M(τ)·D + m(τ).
 
 D is the sight from the origin of the pieces. A round starts with the piece that contains t and
-makes a few steps with the derivatives at its start (the chord method: one matrix, linear
-convergence, but gathering the coefficients costs more than a step), the slopes of the pixel by
-their chord over one pixel; it has settled if the steps decrease fast enough. A root beyond the end
-of the piece is searched again in the next one. Few points need more than one round from a good
-start; they are gathered, so that the others need no further round. `SearchSettings` has the limits.
+makes a few steps with the derivatives at its start (the chord method: one matrix for all steps of
+a round), the slopes of the pixel by their chord over one pixel; it has settled if the steps
+decrease fast enough. A root beyond the end of the piece is searched again in the next one. Few
+points need more than one round from a good start; they are gathered, so that the others need no
+further round. `SearchSettings` has the limits.
 """
 
 from collections.abc import Sequence
@@ -40,34 +40,34 @@ def refine(
     n = t.size
     few = min(n, batch_size(*settings.gathered_at_once))
 
-    def open_(state: RefinementState) -> Bool[Array, " n"]:
+    def is_open(state: RefinementState) -> Bool[Array, " n"]:
         t, _, settled, rounds = state
         near = (t >= ends[0] - far) & (t <= ends[-1] + far)
         return ~settled & near & (rounds < settings.max_rounds)
 
-    def all_again(state: RefinementState) -> RefinementState:
-        wanted, (*place, settled, rounds) = open_(state), state
+    def advance_all(state: RefinementState) -> RefinementState:
+        wanted, (*place, settled, rounds) = is_open(state), state
         found = _make_round(image, search, X, *place)
         chosen = tuple(jnp.where(wanted, a, b) for a, b in zip(found, (*place, settled)))
         return *chosen, rounds + wanted
 
-    def few_again(state: RefinementState) -> RefinementState:
+    def advance_few(state: RefinementState) -> RefinementState:
         *place, settled, rounds = state
-        chosen = first_of(open_(state), few)
+        chosen = first_of(is_open(state), few)
         found = _make_round(image, search, *gather((X, *place), chosen))
         changed = replace_chosen((*place, settled), found, chosen)
         return *changed, rounds.at[chosen].add(1, mode="drop")
 
-    def again(state: RefinementState) -> RefinementState:
+    def advance(state: RefinementState) -> RefinementState:
         if n == few:
-            return all_again(state)
-        # gathering and scattering beats a round of all points only for few of them; half and double
-        # of this eighth are both in order
-        many = jnp.sum(open_(state)) > n // 8
-        return jax.lax.cond(many, all_again, few_again, state)
+            return advance_all(state)
+        # Gathering and scattering beats a round of all points only for few of them: a larger part
+        # would be gathered batch by batch, a smaller one recomputes settled points. Not critical.
+        many = jnp.sum(is_open(state)) > n // 8
+        return jax.lax.cond(many, advance_all, advance_few, state)
 
     state = t, u, jnp.zeros(n, bool), jnp.zeros(n, int)
-    return jax.lax.while_loop(lambda s: jnp.any(open_(s)), again, state)[:3]
+    return jax.lax.while_loop(lambda s: jnp.any(is_open(s)), advance, state)[:3]
 
 
 def first_of(wanted: Bool[Array, " n"], few: int) -> Int[Array, " few"]:
@@ -94,9 +94,11 @@ def _make_round(
     t: Float[AnyArray, " n"],
     u: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
-    """Steps in the pieces where the points are at the beginning, with
+    """Steps in the pieces where the points are at the beginning.
 
-    [δτ, δu]ᵀ = (∂(f, g)/∂(τ, u))⁻¹·[f, g]ᵀ.
+        [δτ, δu]ᵀ = (∂(f, g)/∂(τ, u))⁻¹·[f, g]ᵀ,
+
+    the inverse of 2 × 2 written out.
     """
     pieces, settings = search.pieces, search.settings
     last = len(pieces.ends) - 2

@@ -83,6 +83,7 @@ def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     them."""
     attitude, position = image.trajectory.attitude.table, image.trajectory.position
     for table, white in ((attitude, errors.attitude_white), (position, errors.position_white)):
+        # `pieces` replace the rows (`interpolation`): errors of these would have no effect
         if len(white) and table.pieces is not None:
             raise ValueError("a table in pieces has no rows that errors could be added to")
     rotate_quaternion = lambda q, error: quaternion_multiply(

@@ -81,6 +81,7 @@ def find_passages(
     (final, _, _, count, starts, first, risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
+    # NaN at an end, where the point is behind the camera, is neither ahead nor behind
     return jnp.stack(starts), count, final > 0, first < 0, ~risen
 
 

@@ -101,6 +101,7 @@ def make_pieces(
         left, right = np.r_[left, middle], np.r_[middle, right]
     shared = len(found) <= settings.max_shared_pieces
     more = round_up(len(found)) - len(found) if shared else 0
+    # a half has the same polynomial: pieces that only fill up move no position
     found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(

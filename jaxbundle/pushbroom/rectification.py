@@ -81,6 +81,7 @@ def block_places(
 
     With `occlusion` pixels hidden by other terrain have none.
     """
+    # start values only: between the heights of terrain an image position moves by pixels
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
     # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
@@ -113,6 +114,7 @@ def _search(
         few = X[:, k : k + portion]
         n = few.shape[1]
         full = np.pad(few, ((0, 0), (0, portion - n)), mode="edge")
+        # of one shape, so that one program serves any number of points
         found = project_points(image, search, full, margin=0.0)
         places[:, k : k + n] = np.asarray(found.line)[0, :n], np.asarray(found.pixel)[0, :n]
     return places

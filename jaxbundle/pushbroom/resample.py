@@ -25,6 +25,7 @@ def resample(
     inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
     match kind:
         case "nearest":
+            # half to even: on the border of two pixels either serves
             i, j = jnp.round(row).astype(int), jnp.round(column).astype(int)
             value = bands[:, jnp.clip(i, 0, rows - 1), jnp.clip(j, 0, columns - 1)]
         case "bilinear":

@@ -238,7 +238,7 @@ def locate_points_on(
 def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     """The 20 terms in the order of RPC00B."""
     return (
-        1.0 + 0 * L,
+        1.0 + 0 * L,  # of the shape of L
         L,
         P,
         H,

@@ -184,6 +184,7 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     line, sample, _ = (np.asarray(a) for a in project_points(rpc, *place))
     terms = np.asarray(_terms(rpc, line, sample))
     reach = 1 + DOMAIN_MARGIN
+    # corners of the box of ground coordinates may be outside the image
     inside = (np.abs(terms[1]) <= reach) & (np.abs(terms[2]) <= reach)
     columns = (*place, line + bias.line @ terms, sample + bias.sample @ terms)
     table = RpcTable(*(np.asarray(column)[inside] for column in columns))

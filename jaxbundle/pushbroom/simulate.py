@@ -84,6 +84,8 @@ def measured_image(flight: Flight) -> PushbroomImage:
 def with_errors_in_rows(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     """Like `add_errors`, with bias and drift in the rows of the tables, as written by
     instruments."""
+    # The rows of `add_errors` can hold all of it: bias and drift are linear in time. The difference
+    # is what the interpolation makes of them, which acts on written rows.
     t0 = image.middle_time
 
     def rows(

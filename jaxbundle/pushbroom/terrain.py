@@ -123,6 +123,7 @@ def make_terrain(
     if not np.isfinite(heights).any():
         raise InputError("terrain: no valid height; give a model that covers the image")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
+    # infinite heights, as some files mark voids, would pass for terrain
     heights = np.where(np.isfinite(heights), heights, np.nan)
     (x, y), (dx, dy) = origin, step
     return Terrain(

@@ -263,6 +263,7 @@ def _scanner_points(
     and what their rows are. `index`: of the points among those used."""
     observed, parts = [], []
     measured, sigma = inputs.observations, inputs.observations.sigma
+    # images differ in their equations by corrections and ellipsoid; their sizes were padded alike
     kind_of_image = [inputs.kind(i) for i in range(len(inputs.images))]
     for kind in dict.fromkeys(kind_of_image):
         mine = np.array([other == kind for other in kind_of_image])

@@ -83,6 +83,7 @@ class RefinementInspection:
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
+        # columns, as index arrays of the tables
         at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
         start = {t: jax.device_get(problem.data.start[t]) for t in at}
         return Shared(at, start, problem.declared.named_spaces)
