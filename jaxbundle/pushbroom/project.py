@@ -162,8 +162,8 @@ def project_near(
         return tu - jnp.linalg.solve(J, _misclosure_near(tu, earth, fixed))
 
     start = stop_gradient(jnp.stack([fixed[0].times.time(line), pixel * 1.0]))
-    # Digits double with each step: from ten lines away, where the relative error is 1e-2 or less,
-    # four reach rounding; three more serve rough trajectories.
+    # Measured on a restless satellite: from 10 lines away two steps reach rounding, from 290 three
+    # (errors 8, 9e-5, 4e-12 lines). The others are a reserve for rough trajectories.
     tu = jax.lax.fori_loop(0, 7, newton, start)
     # Derivatives go around the iteration: at the root F = 0, dx = −(∂F/∂x)⁻¹·dF.
     t, u = implicit_root(_misclosure_near, solve_dense, tu, earth, (image, X))

@@ -113,8 +113,8 @@ def locate(rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar) -> tuple[Arra
         return place - step, jnp.max(jnp.abs(step))
 
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
-    # Digits double with each step: seven from the middle of the domain, where a start is off by 1,
-    # leave one to spare for coefficients that are far from linear.
+    # From the middle of the domain four steps reach rounding (largest steps 0.9, 1e-2, 2e-6, 3e-14 of
+    # coefficients with all terms); three more are a reserve for images that are far from linear.
     place, last = jax.lax.fori_loop(0, 7, newton, start)
     L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
     # in units of the scales; the error after a step is about its square, below rounding

@@ -55,17 +55,26 @@ TABLE = Source("table")
 class RpcFitSettings:
     """How coefficients are fitted.
 
+    Measured by the RMS at other points than the fitted ones: of a smooth satellite image (7e-6
+    pixels, a table without noise), and of a table of 720 points with a noise of 0.3 pixels (0.07
+    and 0.05 pixels of lines and samples).
+
     - `linear_damping`: D of the constant and linear terms of the numerator, 1 for all others: they
-      carry the image, and no ridge shall shrink them.
-    - `relative_press`, `sufficient_residual`: a larger ridge is taken if its RMS of predicted
-      residuals is at most this multiple of the least, or within so many pixels of it. Larger:
-      smoother polynomials between the points, larger residuals; smaller: the reverse.
-    - `start_ridge`: of the linear start, in units of the largest singular value.
+      carry the image, and no ridge shall shrink them. With noise half costs 0.04 pixels of the
+      lines, double 0.02.
+    - `relative_press`: a larger ridge is taken if its RMS of predicted residuals is at most this
+      multiple of the least: half of the excess changes nothing, double costs 0.05 pixels of the
+      samples.
+    - `sufficient_residual`: or if it is within so many pixels of the least; this is the accuracy of
+      a fit without noise, half and double of it too.
+    - `start_ridge`: of the linear start, in units of the largest singular value. Not critical.
     - `ridge_steps`: Gauss–Newton steps in which the ridge is chosen anew; then it stays, so that
-      the sum that is minimised stays the same. `max_steps`: of all.
-    - `max_halvings`: of a step; 30 leave a billionth of it.
+      the sum that is minimised stays the same. Two or six change nothing in these cases.
+    - `max_steps`: of all. An image whose oscillations polynomials cannot follow needs up to 60;
+      that it does not converge tells so.
+    - `max_halvings`: of a step; 30 leave a billionth of it. Not critical.
     - `relative_change`, `absolute_change`: converged if the last full step moves no point by more
-      than this fraction of the RMS residual plus so many pixels.
+      than this fraction of the RMS residual plus so many pixels. Not critical.
     """
 
     linear_damping: float = 1e-3
