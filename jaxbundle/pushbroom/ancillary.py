@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
+from jaxbundle.pushbroom.interpolation import METHODS, Method, TimeTable
 from jaxbundle.pushbroom.trajectory import AttitudeTable
 from jaxbundle.types import Numbers
 
@@ -287,8 +287,13 @@ def _table(
     # Up to four missing rows are interpolated. Larger: gaps are bridged unseen; smaller: uneven
     # tables are refused. Not critical: the user can state `gap`.
     gap = 5.0 * float(np.median(np.diff(times))) if gap is None else float(gap)
-    kind = "linear" if method == "slerp" else method
-    rates = None if rates is None else jnp.asarray(rates)
+    kind = cast(Method, "linear" if method == "slerp" else method)
     return TimeTable(
-        jnp.asarray(times), jnp.asarray(values), rates, gap, kind, order, float(extrapolate)
+        jnp.asarray(times),
+        jnp.asarray(values),
+        None if rates is None else jnp.asarray(rates),
+        gap,
+        kind,
+        order,
+        float(extrapolate),
     )

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
-from jaxbundle.geometry.vectors import Vector, along, difference
+from jaxbundle.geometry.vectors import Vector, along, difference, unpack
 from jaxbundle.pushbroom.detector_line import slope_ahead, slopes
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.pieces import Pieces, motion
@@ -49,12 +49,12 @@ class Footprint(eqx.Module):
     frame: Float[AnyArray, "3 4"]
     coefficients: Float[AnyArray, "2 20"]
 
-    def start(self, D: Vector) -> tuple[Scalar, Scalar]:
+    def start(self, D: Vector) -> tuple[AnyArray, AnyArray]:
         """Time and pixel, about, of sights D."""
         x, y, z = (row[0] * D[0] + row[1] * D[1] + row[2] * D[2] + row[3] for row in self.frame)
         return _cubic(self.coefficients[0], x, y, z), _cubic(self.coefficients[1], x, y, z)
 
-    def contains_height(self, earth: Ellipsoid | None, X: Vector) -> Bool[Array, "..."]:
+    def contains_height(self, earth: Ellipsoid | None, X: Vector) -> bool | Bool[AnyArray, "..."]:
         """Whether points are between the heights."""
         low, high = self.heights
         if earth is None:
@@ -162,13 +162,13 @@ def _speeds(
     heights: Float[np.ndarray, " heights"],
     line: Float[AnyArray, "6"],
     earth: Ellipsoid | None,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Scalar]:
     def speed_at(
-        c: Float[Array, "4 12"], tau: Scalar, half: Scalar, xi: Scalar, eta: Scalar, h: Scalar
+        c: Float[AnyArray, "4 12"], tau: Scalar, half: Scalar, xi: Scalar, eta: Scalar, h: Scalar
     ) -> tuple[Array, Scalar]:
         numbers, rates = value_and_rate(c, tau)
         P, _ = motion(numbers, rates, origin)
-        d = tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3))
+        d = unpack(tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3)))
         surface = Plane(level=h) if earth is None else Ground(at_height(earth, h))
         D = difference(along(P, d, surface.distance(P, d)), origin)
         speed = jax.jvp(lambda n: slope_ahead(n, D, line)[0], (numbers,), (rates / half,))[1]
@@ -223,8 +223,11 @@ def _slope_range(
     return middle - margin * half, middle + margin * half
 
 
-def _cubic(c: Float[AnyArray, "20"], x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+def _cubic(c: Float[AnyArray, "20"], x: Scalar, y: Scalar, z: Scalar) -> AnyArray:
     """The cubic polynomial with coefficients in the order of `POWERS`, Horner in all three."""
-    c = iter(c)
-    rows = [[value([next(c) for _ in range(4 - i - j)], z) for j in range(4 - i)] for i in range(4)]
+    following = iter(c)
+    rows = [
+        [value([next(following) for _ in range(4 - i - j)], z) for j in range(4 - i)]
+        for i in range(4)
+    ]
     return value([value(row, y) for row in rows], x)

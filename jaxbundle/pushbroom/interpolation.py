@@ -30,7 +30,7 @@ import numpy as np
 from jax.lax.linalg import tridiagonal_solve
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.types import AnyArray, Scalar
+from jaxbundle.types import AnyArray, Scalar, present
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -69,7 +69,7 @@ def interpolate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
         case "usgscsm":
             value = _usgscsm(table, i, t)
         case "hermite":
-            value = _hermite(table, table.rates, i, t)
+            value = _hermite(table, present(table.rates), i, t)
         case "spline":
             value = _hermite(table, spline_rates(table.times, table.values, table.gap), i, t)
         case _:
@@ -203,11 +203,12 @@ def _chebyshev(nodes: int) -> np.ndarray:
 
 def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
-    nodes = _chebyshev(table.pieces.shape[1])
+    pieces = present(table.pieces)
+    nodes = _chebyshev(pieces.shape[1])
     same = np.eye(len(nodes), dtype=bool)
     spans = nodes[:, None] - nodes + same
     tau = fraction(table, i, t)
-    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ table.pieces[i]
+    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
 
 
 def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
@@ -237,7 +238,7 @@ def _usgscsm(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, 
 
 def _hermite(
     table: TimeTable, rates: Float[AnyArray, "rows k"], i: Int[AnyArray, ""], t: Scalar
-) -> Float[Array, " k"]:
+) -> Float[AnyArray, " k"]:
     """The cubic polynomial with the values and these rates at both ends of interval i."""
     tau, step = fraction(table, i, t), table.times[i + 1] - table.times[i]
     h01 = tau**2 * (3 - 2 * tau)

@@ -24,7 +24,7 @@ from jaxbundle.system.devices import batch_size
 from jaxbundle.types import AnyArray, Scalar
 
 # of points [n]: time, pixel, whether they have settled, rounds made
-RefinementState = tuple[Array, Array, Array, Array]
+RefinementState = tuple[AnyArray, AnyArray, Array, Array]
 
 
 def refine(
@@ -33,7 +33,7 @@ def refine(
     X: Vector,
     t: Float[AnyArray, " n"],
     u: Float[AnyArray, " n"],
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, Array]:
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     ends, settings = search.pieces.ends, search.settings
     far = settings.max_distance * image.line_period
@@ -48,8 +48,8 @@ def refine(
     def advance_all(state: RefinementState) -> RefinementState:
         wanted, (*place, settled, rounds) = is_open(state), state
         found = _make_round(image, search, X, *place)
-        chosen = tuple(jnp.where(wanted, a, b) for a, b in zip(found, (*place, settled)))
-        return *chosen, rounds + wanted
+        t, u, settled = (jnp.where(wanted, a, b) for a, b in zip(found, (*place, settled)))
+        return t, u, settled, rounds + wanted
 
     def advance_few(state: RefinementState) -> RefinementState:
         *place, settled, rounds = state
@@ -93,7 +93,7 @@ def _make_round(
     X: Vector,
     t: Float[AnyArray, " n"],
     u: Float[AnyArray, " n"],
-) -> tuple[Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, Array]:
     """Steps in the pieces where the points are at the beginning.
 
         [δτ, δu]ᵀ = (∂(f, g)/∂(τ, u))⁻¹·[f, g]ᵀ,

@@ -86,7 +86,7 @@ def acceleration(r: Float[np.ndarray, "3"], j2: bool = True) -> Float[np.ndarray
 
 
 def _ground(_: float, y: Float[np.ndarray, "6"]) -> float:
-    return np.linalg.norm(y[:3]) - RADIUS
+    return float(np.linalg.norm(y[:3])) - RADIUS
 
 
 _ground.terminal = True

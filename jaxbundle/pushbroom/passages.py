@@ -37,7 +37,7 @@ def find_passages(
     The search begins and ends one line outside the image, to include its edges.
     """
     step = (1 + margin) * image.line_period
-    samples = search.samples.at[0].add(-step).at[-1].add(step)
+    samples = jnp.asarray(search.samples).at[0].add(-step).at[-1].add(step)
     numbers, rates, motions = jax.vmap(partial(sample, search.pieces))(samples)
     up = None if search.earth is None else normal(search.earth, X)
 

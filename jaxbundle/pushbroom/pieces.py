@@ -188,11 +188,12 @@ def _middle_sight(
     """A point on the ground in the middle, its distance, and pixels a radian (the finer of two)."""
     (P, _, V), d, per_pixel = jax.tree.map(np.asarray, _middle(image))
     if earth is None:
-        s = -P[2] / d[2] if d[2] else 0.0
+        s = float(-P[2] / d[2]) if d[2] else 0.0
     else:
         s = float(ray_to_ellipsoid(earth, P, d))
     # Looking at the sky or into the ground: a kilometre serves to weigh turns against shifts.
     reach = s if np.isfinite(s) and s > 0 else 1e3
     period = float(image.times.time(1.0) - image.times.time(0.0))
-    advance = max(np.linalg.norm(V) * period / reach, 1e-12)  # a camera that does not move
+    # not zero: a camera may stand still
+    advance = max(float(np.linalg.norm(V)) * period / reach, 1e-12)
     return P + reach * np.array(d), reach, max(1 / float(per_pixel), 1 / advance)

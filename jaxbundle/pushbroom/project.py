@@ -116,7 +116,11 @@ def project_points(
 
 @partial(jax.jit, static_argnames="most")
 def _project_points(
-    image: ScannerGeometry, search: Search, X: Float[AnyArray, "3 n"], most: int, margin: Scalar
+    image: ScannerGeometry,
+    search: Search,
+    X: Float[AnyArray, "3 n"],
+    most: int,
+    margin: float | Array,
 ) -> Projected:
     """One program for all margins: an omitted default would be compiled in."""
     find = lambda X: _find_positions(image, search, X, most, margin)
@@ -220,7 +224,7 @@ def _map_chunks(
 
 
 def _find_positions(
-    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: Scalar
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
 ) -> Projected:
     """The positions of a chunk of points, a triple of arrays.
 
@@ -249,7 +253,7 @@ def _find_positions(
 
 
 def _search(
-    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: Scalar
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
 ) -> Projected:
     """The positions of arbitrary points."""
     starts, count, ahead, behind, hidden = find_passages(image, search, X, most, margin)
@@ -293,17 +297,20 @@ def _search(
 
 
 def _inside(
-    image: ScannerGeometry, t: Float[AnyArray, " n"], u: Float[AnyArray, " n"], margin: Scalar
-) -> Bool[Array, "..."]:
+    image: ScannerGeometry,
+    t: Float[AnyArray, " n"],
+    u: Float[AnyArray, " n"],
+    margin: float | Array,
+) -> Bool[AnyArray, "..."]:
     """Whether positions are in the image, or outside by up to `margin` lines and pixels."""
     edge = 0.5 + margin
     first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
     return (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
 
 
-def _above(search: Search, X: Vector) -> Bool[Array, " n"]:
+def _above(search: Search, X: Vector) -> bool | Bool[AnyArray, " n"]:
     """Whether the camera is above the horizon of the points at the middle of the image."""
     if search.earth is None:
-        return jnp.ones(X[0].shape, bool)
+        return jnp.ones(jnp.shape(X[0]), bool)
     _, _, (P, _) = sample(search.pieces, search.samples[len(search.samples) // 2])
     return dot(normal(search.earth, X), difference(P, X)) > 0

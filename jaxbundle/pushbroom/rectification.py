@@ -26,7 +26,7 @@ from jaxbundle.pushbroom.locate import ground_point
 from jaxbundle.pushbroom.pieces import sample
 from jaxbundle.pushbroom.project import project_from, project_points
 from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
-from jaxbundle.pushbroom.surfaces import Ground, Surface
+from jaxbundle.pushbroom.surfaces import Height, Plane, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
@@ -172,7 +172,7 @@ def _are_occluded(
     """
     half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
-    def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> Bool[Array, ""]:
+    def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> bool | Bool[AnyArray, ""]:
         _, _, (P, _) = sample(search.pieces, image.times.time(line))
         gap = difference(X, _locate(image, search, surface, line, pixel))
         return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
@@ -199,7 +199,7 @@ def _level(surface: Surface) -> Scalar:
     """A representative height of the surface."""
     if isinstance(surface, Terrain):
         return (surface.lowest + surface.highest) / 2
-    return 0.0 if isinstance(surface, Ground) else surface.level
+    return surface.level if isinstance(surface, Height | Plane) else 0.0
 
 
 @partial(compile_once, static=())

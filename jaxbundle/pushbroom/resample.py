@@ -43,7 +43,7 @@ def _convolve(
     column: Float[AnyArray, "*shape"],
     weights: Callable[[Scalar], tuple[Scalar, ...]],
     before: int,
-) -> Float[Array, "bands *shape"]:
+) -> Scalar:
     """Products of one-dimensional weights of the pixels starting `before` the position."""
     rows, columns = bands.shape[1:]
     i, j = jnp.floor(row), jnp.floor(column)

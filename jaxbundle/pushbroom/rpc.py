@@ -107,14 +107,14 @@ def locate(rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar) -> tuple[Arra
     fixed = stop_gradient((rpc, H, target))
 
     def newton(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        place, _ = state
+        place = state[0]
         J, v = jax.jacfwd(_twice_misclosure, has_aux=True)(place, fixed)
         step = _solve(J, v)
         return place - step, jnp.max(jnp.abs(step))
 
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
-    # From the middle of the domain four steps reach rounding (largest steps 0.9, 1e-2, 2e-6, 3e-14 of
-    # coefficients with all terms); three more are a reserve for images that are far from linear.
+    # From the middle of the domain four steps reach rounding (of coefficients with all terms the
+    # largest are 0.9, 1e-2, 2e-6, 3e-14); three more are a reserve for images far from linear.
     place, last = jax.lax.fori_loop(0, 7, newton, start)
     L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
     # in units of the scales; the error after a step is about its square, below rounding
@@ -168,9 +168,9 @@ def locate_on(
     top, d = sight(rpc, line, sample, earth)
 
     def shift(
-        state: tuple[Vector, tuple[Array, ...]], _: None
-    ) -> tuple[tuple[Vector, tuple[Array, ...]], None]:
-        o, _ = state
+        state: tuple[Vector, tuple[Array, Array, Scalar, Array]], _: None
+    ) -> tuple[tuple[Vector, tuple[Array, Array, Scalar, Array]], None]:
+        o = state[0]
         X = along(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h)

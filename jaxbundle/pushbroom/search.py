@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.geometry.vectors import Vector
@@ -12,7 +12,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.pieces import Pieces
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 
 class Search(eqx.Module):
@@ -37,7 +37,7 @@ class ScannerGeometry(eqx.Module):
     corrections: Corrections = eqx.field(static=True)
 
     @property
-    def line_period(self) -> Float[Array, ""]:
+    def line_period(self) -> Scalar:
         """Seconds from line 0 to line 1."""
         return self.times.time(1.0) - self.times.time(0.0)
 

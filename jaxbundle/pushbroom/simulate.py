@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
@@ -93,7 +93,7 @@ def with_errors_in_rows(image: PushbroomImage, errors: Errors) -> PushbroomImage
         bias: Float[AnyArray, "3"],
         drift: Float[AnyArray, "3"],
         white: Float[AnyArray, "rows 3"],
-    ) -> Float[Array, "rows 3"]:
+    ) -> Float[AnyArray, "rows 3"]:
         return white + bias + (table.times[:, None] - t0) * drift
 
     zero = jax.tree.map(jnp.zeros_like, errors)

@@ -39,10 +39,12 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Numbers
 
 # column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁
-Cell = tuple[Scalar, Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]
+Cell = tuple[AnyArray, AnyArray, tuple[Array, ...]]
 # the coefficients of one coordinate in τ, from the constant upwards
 Parabola = Triple
 Path = tuple[Parabola, Parabola, Parabola]
+# τ, that of the hit (NaN: none), whether the last cell had no heights, whether the traversal ends
+TraversalState = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
 
 
 class Terrain(Surface):
@@ -100,7 +102,8 @@ class Terrain(Surface):
     def _path(self, o: Vector, d: Vector, top: Scalar, bottom: Scalar) -> Path:
         """Coefficients of (x, y, h) as parabolas in τ, from the top (0) to the bottom (1)."""
         ends = [self.grid(along(o, d, top + tau * (bottom - top))) for tau in (0.0, 0.5, 1.0)]
-        return tuple((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
+        x, y, h = ((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
+        return x, y, h
 
 
 def make_terrain(
@@ -150,7 +153,7 @@ def bilinear(heights: Float[AnyArray, "rows columns"], x: Scalar, y: Scalar) -> 
     return _in_cell(cell, x, y)
 
 
-def _cell(heights: Float[AnyArray, "rows columns"], x: Scalar, y: Scalar) -> Cell:
+def _cell(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) -> Cell:
     """The heights at the corners of the cell that begins at column x, row y; NaN off the grid."""
     rows, columns = heights.shape
     i, j = y.astype(int), x.astype(int)
@@ -193,7 +196,7 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
         step = (target - x) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
-    def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def step(state: TraversalState) -> TraversalState:
         tau, hit, void, _ = state
         out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
         middle = (tau + out) / 2

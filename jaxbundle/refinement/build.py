@@ -125,8 +125,8 @@ def _sights(inputs: RefinementInput, rays: Rays) -> Iterator[tuple[np.ndarray, .
 @compile_once
 def _scanner_sights(
     image: PushbroomImage, places: Float[AnyArray, "n 2"]
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    def sight(place: Float[Array, "2"]) -> tuple[Array, Array]:
+) -> tuple[Float[AnyArray, "n 3"], Float[Array, "n 3"]]:
+    def sight(place: Float[AnyArray, "2"]) -> tuple[AnyArray, Array]:
         pose = pose_at(image, image.times.time(place[0]))
         return pose.P, jnp.stack(rotate(pose.R, (*image.optics.slopes(place[1]), -1.0)))
 

@@ -22,7 +22,7 @@ from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 
 class Shared(eqx.Module):
@@ -213,8 +213,8 @@ def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> R
         rows = [int(place[before + r]) for r in blunder.rows]
         return Removed("image", rows[0], name, blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
-        p = declared.control[blunder.row]
-        name = f"{points.axis_names[blunder.residual]} of control point {points.id[chosen[p]]}"
-        return Removed("control", 3 * int(p) + blunder.residual, name, blunder.test)
+        p, axis = int(declared.control[blunder.row]), present(blunder.residual)
+        name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
+        return Removed("control", 3 * p + axis, name, blunder.test)
     a, b = (points.id[chosen[r[blunder.row]]] for r in set.rows)
     return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)

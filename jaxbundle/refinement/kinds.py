@@ -35,8 +35,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
-from jaxbundle.geometry.vectors import Triple
-from jaxbundle.geometry.vectors import Vector as Vector3
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.spaces import Change, Vector
@@ -63,7 +61,7 @@ class Placed(NamedTuple):
 
 
 # X and the axes as scalars (`leastsquares.spaces`)
-PlacedBlock = tuple[Triple, tuple[Triple, Triple, Triple]]
+PlacedBlock = tuple[tuple[Scalar, ...], tuple[tuple[Scalar, ...], ...]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +73,7 @@ class AlongAxes:
     def prepare(self, value: Placed) -> PlacedBlock:
         return tuple(value.position), tuple(map(tuple, value.axes))
 
-    def move(self, block: PlacedBlock, change: Change) -> Triple:
+    def move(self, block: PlacedBlock, change: Change) -> tuple[Scalar, ...]:
         X, axes = block
         steps = [tuple(d * x for x in axis) for d, axis in zip(change, axes)]
         return tuple(sum(parts) for parts in zip(X, *steps))
@@ -85,7 +83,7 @@ class AlongAxes:
 
     # the axes of the origin: `retract` moves along them, and they do not change
     def difference(self, value: Placed, origin: Placed) -> Float[Array, "3"]:
-        return origin.axes @ (value.position - origin.position)
+        return jnp.matmul(origin.axes, value.position - origin.position)
 
     def hold(self, value: Placed, given: Placed, free: Float[AnyArray, "3"]) -> Placed:
         return self.retract(given, free * self.difference(value, given))
@@ -134,9 +132,9 @@ class ScannerPoint:
         self,
         own: Float[AnyArray, " p"],
         sensor: Float[AnyArray, " q"],
-        X: Vector3,
+        X: Float[AnyArray, "3"],
         line: MeasuredLine,
-    ) -> Float[Array, "2"]:
+    ) -> Float[AnyArray, "2"]:
         """v = S·g, in lines and pixels."""
         return line.scale @ self.misclosure(own, sensor, X, line)
 
@@ -144,7 +142,7 @@ class ScannerPoint:
         self,
         own: Float[AnyArray, " p"],
         sensor: Float[AnyArray, " q"],
-        X: Vector3,
+        X: Float[AnyArray, "3"],
         line: MeasuredLine,
     ) -> Float[Array, "2"]:
         """g: the slopes of the point minus those of the pixel."""
@@ -153,7 +151,8 @@ class ScannerPoint:
         offsets = change_offsets(line.offsets, line.axes, change, jitter)
         pose = move_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
         added = line.across @ change.look_across, line.along @ change.look_along
-        slopes = change_slopes(line.slopes, change.focal_length, added)
+        xi, eta = line.slopes
+        slopes = change_slopes((xi, eta), change.focal_length, added)
         return misclosure_of(pose, slopes, X, self.corrections, self.earth)
 
 
@@ -212,10 +211,10 @@ def _lines_of(
     sensor: Float[AnyArray, " q"],
     X: Float[AnyArray, "n 3"],
     places: Float[AnyArray, "n 2"],
-) -> tuple[MeasuredLine, Float[Array, "n 2"]]:
+) -> tuple[MeasuredLine, Float[AnyArray, "n 2"]]:
     def line_and_residual(
-        X: Float[Array, "3"], place: Float[Array, "2"]
-    ) -> tuple[MeasuredLine, Float[Array, "2"]]:
+        X: Float[AnyArray, "3"], place: Float[AnyArray, "2"]
+    ) -> tuple[MeasuredLine, Float[AnyArray, "2"]]:
         def misclosure(place: Float[Array, "2"]) -> tuple[Array, tuple[Array, MeasuredLine]]:
             line = line_of(image, form, origin, place)
             g = kind.misclosure(own, sensor, X, line)
@@ -231,7 +230,7 @@ def _lines_of(
 
 # Kinds are compared by their functions, as keys of compiled programs: a lambda in `control` or
 # `priors` would be another one, and compiled again, for every refinement.
-def _along_axes(X: Vector3, given: Placed) -> Float[Array, "3"]:
+def _along_axes(X: Float[AnyArray, "3"], given: Placed) -> Float[Array, "3"]:
     return given.axes @ (X - given.position)
 
 

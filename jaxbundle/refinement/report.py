@@ -7,6 +7,7 @@ import numpy as np
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement
 from jaxbundle.statistics.global_test import describe_test
+from jaxbundle.types import present
 
 
 def to_json(result: Refinement) -> dict:
@@ -144,7 +145,7 @@ def _tests(rows: list[dict], most: int) -> Iterator[str]:
 
 
 def _checks(result: Refinement) -> Iterator[str]:
-    c = result.check
+    c = present(result.check)
     earth = result.images[0].earth is not None
     names = ("east", "north", "up") if earth else ("X", "Y", "Z")
     yield f"Check points, computed − given ({', '.join(names)}; m)"
