@@ -31,7 +31,7 @@ def fit_line(optics: Optics, pixels: int) -> Float[Array, "6"]:
 
 
 def slope_ahead(
-    numbers: Float[AnyArray, "12 ..."], D: Vector, along: Float[AnyArray, "6"]
+    numbers: Float[AnyArray, "12 ..."], D: Vector, line: Float[AnyArray, "6"]
 ) -> tuple[Scalar, Scalar]:
     """(F, ξ) of a sight D from the origin of the pieces; NaN behind the camera."""
     r, s, q = (sum(numbers[3 * i + k] * D[k] for k in range(3)) + numbers[9 + i] for i in range(3))
@@ -39,4 +39,4 @@ def slope_ahead(
     # a divisor for the branch that is not chosen: NaN there would spread to derivatives
     q = jnp.where(front, q, -1.0)
     xi = -r / q
-    return jnp.where(front, -s / q - value(along, xi), jnp.nan), xi
+    return jnp.where(front, -s / q - value(line, xi), jnp.nan), xi

@@ -45,7 +45,7 @@ def find_passages(
         before, rate_before, t_before, count, starts, first, risen = state
         k, t, numbers, rates, motion = sample
         D = difference(image.apparent_position(search.earth, motion, X), search.pieces.origin)
-        ahead = lambda numbers: slope_ahead(numbers, D, search.along)[0]
+        ahead = lambda numbers: slope_ahead(numbers, D, search.detector_line)[0]
         value, rate = jax.jvp(ahead, (numbers,), (rates,))
         if up is not None:
             above = dot(up, difference(motion[0], X)) > 0

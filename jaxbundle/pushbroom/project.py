@@ -91,11 +91,11 @@ def make_search(
     """
     pieces = make_pieces(image, earth, settings)
     samples = sample_times(pieces, settings.search_times)
-    along = fit_line(image.optics, image.pixels)
-    footprint = make_footprint(image, pieces, samples, along, earth, settings)
+    line = fit_line(image.optics, image.pixels)
+    footprint = make_footprint(image, pieces, samples, line, earth, settings)
     if footprint is None:
         samples = sample_times(pieces, settings.fine_search_times)
-    return Search(pieces, footprint, samples, along, earth, settings)
+    return Search(pieces, footprint, samples, line, earth, settings)
 
 
 def project_points(

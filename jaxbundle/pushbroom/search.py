@@ -16,12 +16,13 @@ from jaxbundle.types import AnyArray, Scalar
 
 
 class Search(eqx.Module):
-    """Search data of an image: pieces, footprint, start times, approximate η of ξ."""
+    """Search data of an image: pieces, footprint, start times, coefficients of η as a polynomial of ξ
+    (`detector_line.fit_line`)."""
 
     pieces: Pieces
     footprint: Footprint | None
     samples: Float[AnyArray, " k"]
-    along: Float[AnyArray, " 6"]
+    detector_line: Float[AnyArray, " 6"]
     earth: Ellipsoid | None = eqx.field(static=True)
     settings: SearchSettings = eqx.field(static=True, default=DEFAULTS)
 

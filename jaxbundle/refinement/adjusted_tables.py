@@ -51,7 +51,7 @@ def adjusted_photographs(result: Refinement) -> Network | None:
     for part in declared.parts:
         if not part.of_scanner:
             # a point whose two coordinates were both removed by snooping is left out
-            kept[part.rows] = found.used[part.set].any(1)
+            kept[part.rows] = found.has_weight[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))
     points = network.points
     X = np.array([adjusted.get(id, X) for id, X in zip(points.id, points.position)]).reshape(-1, 3)

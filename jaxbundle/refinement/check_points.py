@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
-from jaxbundle.refinement.inspection import RefinementInspection, Shared
+from jaxbundle.refinement.inspection import RefinementInspection, SharedUnknowns
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -68,7 +68,7 @@ def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     # residuals at the given coordinates, not at those that the rays determine
     here = Solution(problem, start)
-    A = _slopes(*here.given, found.shared, found.estimate)
+    A = _slopes(*here.given, found.shared_unknowns, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
     # A·Q·Aᵀ of every ray
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
@@ -90,7 +90,7 @@ def _slopes(
     plan: Plan,
     values: Values,
     data: Data,
-    shared: Shared,
+    shared: SharedUnknowns,
     estimate: Float[AnyArray, " m"],
 ) -> dict[str, Float[Array, "n r m"]]:
     """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""

@@ -103,11 +103,11 @@ class ChangedOptics(Optics):
     """(ξ, η) of `base` divided by 1 + e, and polynomials added."""
 
     base: Optics
-    relative: Float[AnyArray, ""]
-    added: AnglePolynomial
+    relative_change: Float[AnyArray, ""]
+    polynomials: AnglePolynomial
 
     def slopes(self, u: Scalar) -> Pair:
-        return change_slopes(self.base.slopes(u), self.relative, self.added.slopes(u))
+        return change_slopes(self.base.slopes(u), self.relative_change, self.polynomials.slopes(u))
 
 
 def change_slopes(slopes: Pair, relative: Scalar, added: Pair) -> Pair:

@@ -25,18 +25,18 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
 
-class Shared(eqx.Module):
-    """The changes of the shared unknowns, as a function of the tables. `at`: by table,
+class SharedUnknowns(eqx.Module):
+    """The changes of the shared unknowns, as a function of the tables. `places`: by table,
     their numbers, rows and directions; `start`: of these tables."""
 
-    at: dict[str, tuple[np.ndarray, ...]]
+    places: dict[str, tuple[np.ndarray, ...]]
     start: Values
     spaces: tuple[tuple[str, Space], ...] = eqx.field(static=True)
 
     def __call__(self, values: Values) -> Float[Array, " m"]:
         """The changes of the shared unknowns from the start to these tables."""
-        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.at.values()))
-        for t, (k, row, direction) in self.at.items():
+        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.places.values()))
+        for t, (k, row, direction) in self.places.items():
             change = jax.vmap(spaces[t].difference)(values[t], self.start[t])
             found = found.at[k].set(change[row, direction])
         return found
@@ -44,7 +44,7 @@ class Shared(eqx.Module):
     def tables(self, changes: Float[AnyArray, " m"]) -> Values:
         """The tables after these changes."""
         spaces, moved = dict(self.spaces), {}
-        for t, (k, row, direction) in self.at.items():
+        for t, (k, row, direction) in self.places.items():
             rows = jax.tree.leaves(self.start[t])[0].shape[0]
             change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(changes[k])
             moved[t] = jax.vmap(spaces[t].retract)(self.start[t], change)
@@ -78,7 +78,7 @@ class RefinementInspection:
         return self.solution.sigma0 if self.redundancy > 0 else 1.0
 
     @functools.cached_property
-    def shared(self) -> Shared:
+    def shared_unknowns(self) -> SharedUnknowns:
         """The location of the shared unknowns."""
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
@@ -86,17 +86,17 @@ class RefinementInspection:
         # columns, as index arrays of the tables
         at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
         start = {t: jax.device_get(problem.data.start[t]) for t in at}
-        return Shared(at, start, problem.declared.named_spaces)
+        return SharedUnknowns(at, start, problem.declared.named_spaces)
 
     @functools.cached_property
     def estimate(self) -> Float[np.ndarray, " m"]:
         """The changes of the shared unknowns."""
-        return np.asarray(_estimate(self.shared, self.solution.values))
+        return np.asarray(_estimate(self.shared_unknowns, self.solution.values))
 
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        return self.solution.propagate(self.shared)
+        return self.solution.propagate(self.shared_unknowns)
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
@@ -130,13 +130,13 @@ class RefinementInspection:
         return {o: v / unit(o) for o, v in found.items()}
 
     @property
-    def used(self) -> dict[str, np.ndarray]:
+    def has_weight(self) -> dict[str, np.ndarray]:
         """Which residuals of every set carry weight."""
         return {o: np.asarray(w) > 0 for o, w in self.solution.problem.data.weight.items()}
 
     def rows(self, o: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """v, r, w of a set of observations, NaN if missing, and the removed ones."""
-        used, found = self.used[o], self.solution.reliability
+        used, found = self.has_weight[o], self.solution.reliability
         tell = lambda x: np.where(used, x[o], np.nan)
         return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
 

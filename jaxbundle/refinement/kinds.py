@@ -230,7 +230,7 @@ def _lines_of(
 
 # Kinds are compared by their functions, as keys of compiled programs: a lambda in `control` or
 # `priors` would be another one, and compiled again, for every refinement.
-def _along_axes(X: Float[AnyArray, "3"], given: Placed) -> Float[Array, "3"]:
+def _along_axes(X: Float[AnyArray, "3"], given: Placed) -> Float[AnyArray, "3"]:
     return given.axes @ (X - given.position)
 
 

@@ -145,7 +145,7 @@ def _optics(image: PushbroomImage, change: Change) -> Optics:
         # a longer principal distance is the same only without distortion
         candidate = dataclasses.replace(base, parameters=jnp.asarray(parameters).at[0].mul(1 + e))
     elif isinstance(base, AnglePolynomial):
-        candidate = _sum(base, e, wanted.added)
+        candidate = _sum(base, e, wanted.polynomials)
     else:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
