@@ -16,8 +16,8 @@ from jaxbundle.types import AnyArray, Scalar
 
 
 class Search(eqx.Module):
-    """Search data of an image: pieces, footprint, start times, coefficients of η as a polynomial of ξ
-    (`detector_line.fit_line`)."""
+    """Search data of an image: pieces, footprint, start times, and the coefficients of η as a
+    polynomial of ξ (`detector_line.fit_line`)."""
 
     pieces: Pieces
     footprint: Footprint | None
