@@ -23,7 +23,8 @@ class SearchSettings:
       uneven.
     - `times_at_once`: batch of times at which poses are computed: one shape to compile.
 
-    Footprint (`footprint`; none of these is critical: images either advance steadily or turn back):
+    Footprint (`footprint`; lattice, speed, margin and error are not critical: images either advance
+    steadily or turn back):
 
     - `footprint_heights`: lowest and highest height of points, metres, if the camera is more than
       twice as high: the Earth from the Dead Sea to Mount Everest.
@@ -41,20 +42,26 @@ class SearchSettings:
 
     Newton's method (`newton`):
 
-    - `steps_per_round`: steps with one matrix of derivatives; `max_rounds`: rounds after which a
-      point is given up.
+    - `steps_per_round`: steps with one matrix of derivatives; at least 2, as the decrease from one
+      to the next tells whether a point has settled. More: steps that most points do not need.
+    - `max_rounds`: rounds after which a point is given up. More: points without a position take
+      longer; fewer: starts many pieces away are lost.
     - `position_tolerance`: error of settled positions, in lines and pixels: that of the pieces, as
       a better root of their polynomials is no better position.
     - `sight_tolerance`: largest movement, in lines, of a position since its corrections were
       computed: they change by less than 1e-4 of it.
-    - `max_distance`: a position so many lines outside the image is given up.
-    - `piece_overlap`: a root at most so many lines beyond the end of its piece stays with it.
+    - `max_distance`: a position so many lines outside the image is given up. Larger: diverging
+      points take longer; smaller: a start outside is not led back.
+    - `piece_overlap`: a root at most so many lines beyond the end of its piece stays with it: many
+      times the position tolerance, so that such a root settles in one of both pieces, and so little
+      that the polynomials hold there.
 
     Points at once, on a processor and on an accelerator (`system.devices.batch_size`):
 
     - `points_at_once`: of Newton's method, 0.1 MB and 15 MB a step: the former stay in the cache.
-    - `searched_at_once`: points that are searched for outside the footprint.
-    - `gathered_at_once`: points gathered for another round.
+    - `searched_at_once`: points that are searched for outside the footprint; `gathered_at_once`:
+      points gathered for another round. Larger: batches are filled up with points that need
+      neither; smaller: more batches.
     """
 
     piece_tolerance: float = 1e-7
