@@ -152,9 +152,9 @@ def adjust(
     def adjust_from(problem: Problem, values: Values) -> Solution:
         nonlocal steps
         problem, _ = declared.rescale(problem, values)
-        # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution: its own derivatives are second ones
-        # of the trajectory, and v needs them nowhere. It is right when it is that of the solution,
-        # within 1e-9 of itself; the second solution starts at the first and is nearly it.
+        # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution: its own derivatives are second
+        # ones of the trajectory, and v needs them nowhere. It is right when it is that of the
+        # solution, within 1e-9 of itself; the second solution starts at the first, and is near it.
         for _ in range(10):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
