@@ -63,13 +63,13 @@ from jaxbundle.pushbroom.accuracy import (
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
-from jaxbundle.pushbroom.interpolation import METHODS, Table
+from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.noise import Noise, Sigma, zero_errors
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
-from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, trajectory_in_pieces
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory, trajectory_in_pieces
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
@@ -521,7 +521,7 @@ def _in_pieces(chosen: Chosen) -> Chosen:
     return chosen._replace(image=image, truth=truth)
 
 
-def _table_with(table: Table, method: str) -> Table:
+def _table_with(table: TimeTable, method: str) -> TimeTable:
     """Positions with another interpolation."""
     if method == table.method:
         return table
@@ -536,7 +536,7 @@ def _table_with(table: Table, method: str) -> Table:
     )
 
 
-def _attitude_with(attitude: Attitude, method: str) -> Attitude:
+def _attitude_with(attitude: AttitudeTable, method: str) -> AttitudeTable:
     """Attitudes with another interpolation."""
     table = attitude.table
     if method == ("slerp" if attitude.slerp else table.method):

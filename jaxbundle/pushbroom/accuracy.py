@@ -24,39 +24,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 from scipy.optimize import brentq
 
 from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import Vector, difference
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_point
-from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas, zero_errors
+from jaxbundle.pushbroom.noise import Errors, Noise, add_errors, draw, sigmas, zero_errors
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
-
-SMALLEST_DENOMINATOR = 1e-300
-"""Replaces zero in a denominator."""
-POSITIONS = 1000
-"""Positions of `spread_positions`: an RMS with that many independent errors has a standard
-deviation of 2 %; with one line in each of a thousandth parts of the image it is smaller."""
-POSITIONS_AT_ONCE = 128
-"""Positions whose derivatives are computed together: each has a copy of the tables."""
+from jaxbundle.types import AnyArray, Scalar
 
 
 def spread_positions(
-    lines: int, pixels: int, cells: tuple[int, int] = (1, 1), least: int = POSITIONS
+    lines: int, pixels: int, cells: tuple[int, int] = (1, 1), least: int = 1000
 ) -> tuple[Float[np.ndarray, "rows columns n"], Float[np.ndarray, "rows columns n"]]:
     """Irregular lines and pixels, the same number in each of rows × columns cells of an image.
 
-    At least this many in all. In every row of cells each of equal parts of the lines holds one
-    position, at random within it; across a cell they follow multiples of the golden ratio (a
-    low-discrepancy sequence; Niederreiter, 1992, chapter 3).
+    At least `least` in all: an RMS of a thousand independent errors has a standard deviation of
+    1/√(2·1000) = 2 %, and less with one line in each thousandth part of the image. In every row of
+    cells each of equal parts of the lines holds one position, at random within it; across a cell
+    they follow multiples of the golden ratio (a low-discrepancy sequence; Niederreiter, 1992,
+    chapter 3).
     """
     rows, columns = cells
     n = -(-least // (rows * columns))
     draw = np.random.default_rng(0)
+    # each row of cells deals its parts of the lines to its columns at random
     turns = draw.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
     part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
     down = (part + draw.random(part.shape)) / (columns * n)
@@ -155,24 +150,37 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     large = variances.max()
     if not large > 0:
         return 0.0 if large == 0 else np.nan
-    # the mean over angles of what is outside the circle in this direction
+    # P(outside) in polar coordinates is the mean over all directions of exp(−r²/2σ²), σ along the
+    # direction in axes of unit variance: a smooth periodic function, whose mean over equal steps
+    # converges faster than any power of their number (2000 also serve λ₁ ≫ λ₂)
     angle = (np.arange(2000) + 0.5) * np.pi / 2000
-    # in axes of unit variance the circle has the radius r/√(λ₁cos² + λ₂sin²)
     small, great = variances.swapaxes(0, 1) / large
     stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
-    stretch = np.maximum(stretch, SMALLEST_DENOMINATOR)
+    # λ₂ = 0 leaves directions without extent; r²/1e-300 does not overflow and its exponential is 0
+    stretch = np.maximum(stretch, 1e-300)
+    # ten times the largest σ is outside any fraction that double precision tells from 1
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 
 
 @partial(compile_once, static=())
-def _covariances(image, surface, lines, pixels, sigma):
-    """`sigma` by the kinds of errors that there are."""
+def _covariances(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[AnyArray, " n"],
+    pixels: Float[AnyArray, " n"],
+    sigma: dict[str, AnyArray],
+) -> Float[Array, "n 2 2"]:
+    """Σ = Σₖ (Jₖ·σₖ)·(Jₖ·σₖ)ᵀ over the kinds k of errors in `sigma`.
+
+    Kinds without errors are left out by the caller: the rows of a table are thousands of columns of
+    J. J has two rows and many columns, hence reverse mode.
+    """
     no_rows = jnp.zeros((0, 3))
     nothing = zero_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
     zero = jax.tree.map(jnp.zeros_like, sigma)
 
-    def of_place(line, pixel):
+    def covariance_at(line: Scalar, pixel: Scalar) -> Float[Array, "2 2"]:
         X0 = locate_point(image, surface, line, pixel)
         axes = east_north(surface, X0)
         move = lambda errors: horizontal(
@@ -185,26 +193,41 @@ def _covariances(image, surface, lines, pixels, sigma):
         return sum((part @ part.T for part in parts), jnp.zeros((2, 2)))
 
     places = jnp.asarray(lines), jnp.asarray(pixels)
-    return jax.lax.map(lambda at: of_place(*at), places, batch_size=POSITIONS_AT_ONCE)
+    # each position of a batch needs its own copy of the tables and of their derivatives
+    return jax.lax.map(lambda place: covariance_at(*place), places, batch_size=128)
 
 
 @partial(compile_once, static=())
-def _draws(image, surface, lines, pixels, sigma, keys):
-    def one(key):
+def _draws(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[AnyArray, " n"],
+    pixels: Float[AnyArray, " n"],
+    sigma: Errors,
+    keys: Shaped[AnyArray, " draws"],
+) -> Float[Array, "draws n 2"]:
+    def errors_of_draw(key: Shaped[AnyArray, ""]) -> Float[Array, "n 2"]:
         wrong = add_errors(image, draw(sigma, key))
         return _differences(wrong, image, surface, lines, pixels)
 
-    return jax.lax.map(one, keys)
+    # one draw after the other: a batch of draws would be as many copies of image and positions
+    return jax.lax.map(errors_of_draw, keys)
 
 
 @partial(compile_once, static=())
-def _differences(image, truth, surface, lines, pixels):
-    def of_place(line, pixel):
+def _differences(
+    image: PushbroomImage,
+    truth: PushbroomImage,
+    surface: Surface,
+    lines: Float[AnyArray, " n"],
+    pixels: Float[AnyArray, " n"],
+) -> Float[Array, "n 2"]:
+    def difference_at(line: Scalar, pixel: Scalar) -> Float[Array, "2"]:
         X0 = locate_point(truth, surface, line, pixel)
         X = locate_point(image, surface, line, pixel)
         return horizontal(east_north(surface, X0), X0, X)
 
-    return jax.vmap(of_place)(lines, pixels)
+    return jax.vmap(difference_at)(lines, pixels)
 
 
 def east_north(surface: Surface, X: Vector) -> Float[Array, "2 3"]:

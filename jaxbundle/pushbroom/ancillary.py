@@ -1,6 +1,8 @@
 """Tables of ancillary data, checked before use; errors are reported with the row."""
 
-from typing import Literal
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,30 +11,40 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.interpolation import METHODS, Table
-from jaxbundle.pushbroom.trajectory import Attitude
+from jaxbundle.pushbroom.interpolation import METHODS, Method, TimeTable
+from jaxbundle.pushbroom.trajectory import AttitudeTable
 from jaxbundle.types import Numbers
 
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
 
-ROUNDED = 1e-4
-"""Deviation of the length of a quaternion from 1 that rounding explains, with four decimals."""
-NO_QUATERNION = 0.1
-"""Deviation of the length from 1 of what is no rotation but four other numbers: a column too many,
-angles, zeros. Solutions of other programs, whose components were adjusted, deviate by 1e-3."""
+MIN_ROWS = {"linear": 2, "hermite": 2, "slerp": 2, "spline": 4, "usgscsm": 2}
 
-GAP = 5.0
-"""A step longer than this many median steps is a gap."""
 
-FEWEST = {"linear": 2, "hermite": 2, "slerp": 2, "spline": 4, "usgscsm": 2}
+@dataclasses.dataclass(frozen=True)
+class AncillarySettings:
+    """Limits of the checks of ancillary tables.
 
-STEPS, SHORTEST, LONGEST = 2.0, 0.05, 0.5
-"""Product tables may end this many steps before the image, bounded by the shortest and longest of
-these times, in seconds: the rotation and fall of a satellite ignored by linear extrapolation cause
-centimetres to decimetres on the ground in this time."""
+    - `rounded_length`: a quaternion whose length deviates from 1 by more is mentioned; components
+      with four decimals explain as much.
+    - `max_length_error`: four numbers whose length deviates by more are no quaternion but a column
+      too many, angles or zeros. Components adjusted by other programs deviate by 1e-3.
+    - `extrapolated_steps`, `min_extrapolation`, `max_extrapolation`: product tables may end so many
+      of their steps before the image, but at least and at most these times in seconds. In these a
+      satellite falls ½·9 m/s²·t² = 1 cm and 1 m, mostly along the line of sight: what an
+      extrapolation may miss.
+    - `time_rounding`: seconds by which times of products are rounded: those since J2000, 8e8 s, to
+      1e-7 s in double precision, written dates to microseconds.
+    """
 
-ROUNDING = 1e-6
-"""Times of products are rounded: seconds since J2000 to 6e-8 s, dates to microseconds."""
+    rounded_length: float = 1e-4
+    max_length_error: float = 0.1
+    extrapolated_steps: float = 2.0
+    min_extrapolation: float = 0.05
+    max_extrapolation: float = 0.5
+    time_rounding: float = 1e-6
+
+
+DEFAULTS = AncillarySettings()
 
 
 def position_table(
@@ -45,7 +57,7 @@ def position_table(
     gap: float | None = None,
     extrapolate: float = 0.0,
     source: Source = POSITIONS,
-) -> Table:
+) -> TimeTable:
     """Positions (metres) against time (seconds).
 
     **Arguments:** `velocities` in metres a second, needed by `"hermite"`; `order` of Lagrange's
@@ -74,7 +86,7 @@ def attitude_table(
     extrapolate: float = 0.0,
     reference: Literal["earth", "orbit"] = "earth",
     source: Source = ATTITUDE,
-) -> Attitude:
+) -> AttitudeTable:
     """Attitudes against time (seconds): quaternions (w, x, y, z), or pitch, roll, yaw in radians.
 
     Quaternions are normalised and sign changes corrected. Angles that jump by a full turn are made
@@ -98,32 +110,37 @@ def attitude_table(
     else:
         values = np.unwrap(values, axis=0)
     table = _table(times, values, None, method, order, gap, extrapolate, "attitude", source)
-    return Attitude(table, method == "slerp", reference)
+    return AttitudeTable(table, method == "slerp", reference)
 
 
 def normalise_quaternions(
-    values: Float[np.ndarray, "rows 4"], source: Source = ATTITUDE
+    values: Float[np.ndarray, "rows 4"],
+    source: Source = ATTITUDE,
+    settings: AncillarySettings = DEFAULTS,
 ) -> tuple[Float[np.ndarray, "rows 4"], tuple[str, ...]]:
-    """Quaternions of length 1, and a message if some deviate by more than `ROUNDED`.
+    """Quaternions of length 1, and a message if some deviate by more than rounding.
 
-    **Raises:** `InputError` naming the row of one that deviates by `NO_QUATERNION`."""
+    **Raises:** `InputError` naming the row of one that is no quaternion (`AncillarySettings`)."""
     length = np.linalg.norm(values, axis=1)
-    if (bad := ~(np.abs(length - 1) < NO_QUATERNION)).any():
+    if (bad := ~(np.abs(length - 1) < settings.max_length_error)).any():
         row = int(bad.argmax())
         raise InputError(
             f"{source(row)}: expected a quaternion, of length 1, got four numbers of length "
             f"{length[row]:.6g}; check the columns (in tables of scanner files w, x, y, z)"
         )
-    off = np.abs(length - 1)
     message = (
         f"{source.name}: lengths of quaternions from {length.min():.6f} to {length.max():.6f}; "
         "they are normalised"
     )
-    return values / length[:, None], (message,) * bool(len(off) and off.max() > ROUNDED)
+    rounded = np.abs(length - 1) <= settings.rounded_length
+    return values / length[:, None], () if rounded.all() else (message,)
 
 
 def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:
-    """The same rotations with signs such that neighbours are close."""
+    """The rotations by quaternions of such signs that neighbours are close.
+
+    q and −q are one rotation, but between them interpolated components pass zero.
+    """
     same = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
     return quaternions * np.cumprod(np.r_[1, np.where(same, 1, -1)])[:, None]
 
@@ -142,30 +159,36 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
         )
 
 
-def extrapolation_limit(rows: Float[np.ndarray, " rows"]) -> float:
+def extrapolation_limit(
+    rows: Float[np.ndarray, " rows"], settings: AncillarySettings = DEFAULTS
+) -> float:
     """The maximum extrapolation, in seconds, of a product table with rows at these times: two of
     its steps, but at least 0.05 s and at most 0.5 s."""
     step = float(np.median(np.diff(rows))) if len(rows) > 1 else 0.0
-    return min(max(STEPS * step, SHORTEST), LONGEST)
+    wanted = max(settings.extrapolated_steps * step, settings.min_extrapolation)
+    return min(wanted, settings.max_extrapolation)
 
 
 def warn_of_extrapolation(
-    rows: Float[np.ndarray, " rows"], times: Float[np.ndarray, " lines"], source: Source
+    rows: Float[np.ndarray, " rows"],
+    times: Float[np.ndarray, " lines"],
+    source: Source,
+    settings: AncillarySettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """A warning if the rows of a product begin after, or end before, the times of the lines.
 
     **Raises:** `InputError` if they do so by more than `extrapolation_limit`.
     """
-    limit = extrapolation_limit(rows)
+    limit, rounding = extrapolation_limit(rows, settings), settings.time_rounding
     check_span(rows, limit, times, source)
     before, after = rows[0] - times.min(), times.max() - rows[-1]
-    if max(before, after) <= ROUNDING:
+    if max(before, after) <= rounding:
         return ()
-    number = int(((times < rows[0] - ROUNDING) | (times > rows[-1] + ROUNDING)).sum())
+    number = int(((times < rows[0] - rounding) | (times > rows[-1] + rounding)).sum())
     where = " and ".join(
         f"{value:.6g} s {text}"
         for value, text in ((before, "at its start"), (after, "at its end"))
-        if value > ROUNDING
+        if value > rounding
     )
     return (
         f"{source.name}: the table does not cover the whole image: extrapolated by {where} "
@@ -173,7 +196,13 @@ def warn_of_extrapolation(
     )
 
 
-def check_span(rows, extrapolate, times, source, thing="image line") -> None:
+def check_span(
+    rows: Float[np.ndarray, " rows"],
+    extrapolate: float,
+    times: Float[np.ndarray, " n"],
+    source: Source,
+    thing: str = "image line",
+) -> None:
     """Refuse times outside a table by more than the allowed extrapolation."""
     outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
     if outside.any():
@@ -186,13 +215,16 @@ def check_span(rows, extrapolate, times, source, thing="image line") -> None:
         )
 
 
-def check_covered(table: Table, times: Numbers, source: Source, thing: str = "image line") -> None:
+def check_covered(
+    table: TimeTable, times: Numbers, source: Source, thing: str = "image line"
+) -> None:
     """Refuse a table that does not cover the times, or has a gap among them.
 
     `source` names the table and its rows, `thing` what the times belong to.
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
     check_span(rows, table.extrapolate, times, source, thing)
+    # as in `interpolation.interval`, which decides for the image
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
     if wide.any():
@@ -205,14 +237,24 @@ def check_covered(table: Table, times: Numbers, source: Source, thing: str = "im
         )
 
 
-def _check_method(method, known, source):
+def _check_method(method: str, known: Sequence[str], source: Source) -> None:
     if method not in known:
         raise InputError(
             f"{source.name}: unknown interpolation {method!r}{did_you_mean(method, known)}"
         )
 
 
-def _table(times, values, rates, method, order, gap, extrapolate, what, source):
+def _table(
+    times: Float[np.ndarray, " rows"],
+    values: Float[np.ndarray, "rows k"],
+    rates: Float[np.ndarray, "rows k"] | None,
+    method: str,
+    order: int,
+    gap: float | None,
+    extrapolate: float,
+    what: str,
+    source: Source,
+) -> TimeTable:
     times, values = np.asarray(times, float), np.asarray(values, float)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
@@ -225,7 +267,7 @@ def _table(times, values, rates, method, order, gap, extrapolate, what, source):
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
     if method in ("lagrange", "usgscsm") and order < 1:
         raise InputError(f"{source.name}: the order of {method!r} is {order}; at least 1 is needed")
-    fewest = FEWEST[method] if method in FEWEST else order + 1
+    fewest = MIN_ROWS.get(method, order + 1)
     if len(times) < fewest:
         advice = " or a lower order" if method == "lagrange" else ""
         raise InputError(
@@ -242,9 +284,16 @@ def _table(times, values, rates, method, order, gap, extrapolate, what, source):
             f"{source.name}: extrapolate is {extrapolate:g}; seconds beyond the ends of the table "
             "are expected, 0 or more"
         )
-    gap = GAP * float(np.median(np.diff(times))) if gap is None else float(gap)
-    kind = "linear" if method == "slerp" else method
-    rates = None if rates is None else jnp.asarray(rates)
-    return Table(
-        jnp.asarray(times), jnp.asarray(values), rates, gap, kind, order, float(extrapolate)
+    # Up to four missing rows are interpolated. Larger: gaps are bridged unseen; smaller: uneven
+    # tables are refused. Not critical: the user can state `gap`.
+    gap = 5.0 * float(np.median(np.diff(times))) if gap is None else float(gap)
+    kind = cast(Method, "linear" if method == "slerp" else method)
+    return TimeTable(
+        jnp.asarray(times),
+        jnp.asarray(values),
+        None if rates is None else jnp.asarray(rates),
+        gap,
+        kind,
+        order,
+        float(extrapolate),
     )

@@ -12,29 +12,26 @@ hydrostatic equation the air above h weighs what p carries, so that
 
     ∫ (n − 1) dh  from h upwards  =  (n − 1)/ρ·p/ḡ,
 
-where ḡ is gravity at the centre of that air, about `CENTRE` above h.
+where ḡ is gravity at the centre of that air, about R·T/g₀ above h.
 """
 
-from typing import Any
+from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.types import Scalar
 
 GRAVITY = 9.80665
-"""g₀, m/s²."""
+"""g₀, m/s², of the standard."""
 EARTH_RADIUS = 6356766.0
-"""r of the geopotential height, metres."""
+"""r of the geopotential height, metres, of the standard: for the latitude where gravity is g₀."""
 GAS_CONSTANT = 8314.32 / 28.9644
-"""R of dry air, J/(kg·K)."""
+"""R of dry air, J/(kg·K): the standard's R* by its molar mass at sea level."""
 REFRACTIVITY = 2.779e-4 / 1.225
 """(n − 1)/ρ, m³/kg: n − 1 at 15 °C, 1013.25 hPa and 0.55 µm (Ciddor, 1996, Applied Optics 35,
 1566–1573), where ρ is 1.225 kg/m³. At 0.48 and 0.70 µm it is 0.5 % more and less."""
-
-CENTRE = 7300.0
-"""R·T/g₀ for 250 K, the mean temperature of the air above most heights, metres; 1 km more changes
-the integral by 3e-4."""
 
 BASES = 1e3 * np.array([0.0, 11.0, 20.0, 32.0, 47.0, 51.0, 71.0, 84.852])
 """Geopotential heights at which the layers begin, metres (table 4); the last is continued with
@@ -45,16 +42,27 @@ TEMPERATURES = 288.15 + np.r_[0.0, np.cumsum(LAPSES[:-1] * np.diff(BASES))]
 """Temperature at the beginning of each layer, kelvin."""
 
 
-def _pressure(H, base, temperature, lapse, pressure, *, numbers: Any = jnp):
+def _pressure(
+    H: Scalar,
+    base: Scalar,
+    temperature: Scalar,
+    lapse: Scalar,
+    pressure: Scalar,
+    *,
+    numbers: ModuleType = jnp,
+) -> tuple[Scalar, Scalar]:
+    """T and p at H in the layer that begins at `base`, with `numbers` jax.numpy or numpy."""
     exponent = GRAVITY / GAS_CONSTANT
     T = temperature + lapse * (H - base)
+    # both branches are computed, so that the one not chosen must not divide by zero
     power = -exponent / numbers.where(lapse == 0, 1.0, lapse)
     return T, pressure * numbers.where(
         lapse == 0, numbers.exp(-exponent * (H - base) / temperature), (T / temperature) ** power
     )
 
 
-def _base_pressures():
+def _base_pressures() -> Float[np.ndarray, " layers"]:
+    """Continuous from layer to layer, starting with the standard pressure at sea level."""
     pressures = [101325.0]
     for k in range(len(BASES) - 1):
         layer = BASES[k], TEMPERATURES[k], LAPSES[k], pressures[-1]
@@ -76,5 +84,7 @@ def refractivity(height: Scalar) -> tuple[Scalar, Scalar]:
     layer = sum((H >= base).astype(int) for base in BASES[1:])
     T, p = _pressure(H, *(jnp.asarray(a)[layer] for a in (BASES, TEMPERATURES, LAPSES, PRESSURES)))
     density = p / (GAS_CONSTANT * T)
-    gravity = GRAVITY * (EARTH_RADIUS / (EARTH_RADIUS + height + CENTRE)) ** 2
+    # R·T/g₀ = 7300 m for 250 K, the mean temperature above most heights; 1 km more changes the
+    # integral by 3e-4
+    gravity = GRAVITY * (EARTH_RADIUS / (EARTH_RADIUS + height + 7300.0)) ** 2
     return REFRACTIVITY * density, REFRACTIVITY * p / gravity

@@ -13,7 +13,7 @@ Needs pyerfa; two-line elements need sgp4 (both in the extra `geo`).
 
 import datetime
 import warnings
-from typing import NamedTuple, overload
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,7 @@ GM = 3.986004418e14
 """Geocentric gravitational constant, m³/s² (WGS 84)."""
 ARCSECOND = np.pi / 648000
 DAY = 86400.0
+"""Seconds of a day; ERFA's quasi Julian date of UTC stretches the day of a leap second."""
 
 Matrices = Float[np.ndarray, "rows 3 3"]
 Rows = Float[np.ndarray, "rows 3"]
@@ -61,7 +62,10 @@ def to_earth(
     times = np.asarray(times, float)
     if frame == "ITRF":
         return np.broadcast_to(np.eye(3), (len(times), 3, 3))
-    erfa = _erfa()
+    try:
+        import erfa
+    except ImportError:
+        raise InputError("inertial frames need pyerfa: pip install 'jaxbundle[geo]'") from None
     day, part = julian_date(epoch)
     part = part + times / DAY
     with warnings.catch_warnings():
@@ -69,10 +73,12 @@ def to_earth(
         ut1 = erfa.utcut1(day, part, orientation.ut1_utc)
         tt = erfa.taitt(*erfa.utctai(day, part))
     pole = orientation.x_pole * ARCSECOND, orientation.y_pole * ARCSECOND
+    # TEME: the equinox of GMST82; the same sidereal time that the elements were made with
     if frame == "TEME":
         return erfa.pom00(*pole, 0.0) @ _about("z", -erfa.gmst82(*ut1)).as_matrix()
     matrices = erfa.c2t06a(*tt, *ut1, *pole)
     if frame == "J2000":
+        # at the epoch J2000.0, as the frame is fixed
         bias, _, _ = erfa.bp06(2451545.0, 0.0)
         matrices = matrices @ bias.T
     return matrices
@@ -107,6 +113,7 @@ def turn_positions(
     if velocities is None:
         return P, None
     x, y = orientation.x_pole * ARCSECOND, orientation.y_pole * ARCSECOND
+    # Ω is along the celestial intermediate pole, up to 0.6″ off the z axis: 1.5 mm/s in a low orbit
     spin = EARTH_RATE * np.array([x, -y, 1.0])
     return P, np.einsum("nij,nj->ni", R, velocities) - np.cross(spin, P)
 
@@ -134,7 +141,9 @@ def two_line_orbit(
         raise InputError("two-line elements need sgp4: pip install 'jaxbundle[geo]'") from None
     first, second = first.strip(), second.strip()
     for number, line in enumerate((first, second), 1):
-        if not (len(line) == 69 and line[:2] == f"{number} " and _checksum(line) == line[68]):
+        # modulo 10 of the digits, a minus sign counting 1
+        checksum = str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
+        if not (len(line) == 69 and line[:2] == f"{number} " and checksum == line[68]):
             raise InputError(
                 f"two-line elements, line {number}: {line!r} is damaged (69 characters, the last "
                 "the checksum, are expected); copy it again"
@@ -162,8 +171,9 @@ def circular_orbit(
 ) -> tuple[Rows, Rows]:
     """Earth-fixed positions (m) and velocities (m/s) on a circular orbit about the rotating Earth.
 
-    **Arguments:** `height` above a sphere of this `radius`, metres; `inclination`; longitude of the
-    ascending `node` and `argument` of latitude at t = 0, radians. Kepler's rate, no perturbations.
+    **Arguments:** `height` above a sphere of this `radius` (WGS 84: its semi-major axis), metres;
+    `inclination`; longitude of the ascending `node` and `argument` of latitude at t = 0, radians.
+    Kepler's rate, no perturbations.
     """
     times = np.asarray(times, float)
     r = radius + height
@@ -191,17 +201,5 @@ def julian_date(epoch: str) -> tuple[float, float]:
     return 2451544.5 + days, (moment - midnight).total_seconds() / DAY
 
 
-def _checksum(line):
-    return str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
-
-
-def _about(axis, angles):
+def _about(axis: Literal["x", "z"], angles: Float[np.ndarray, " n"]) -> Rotation:
     return Rotation.from_euler(axis, angles[:, None])
-
-
-def _erfa():
-    try:
-        import erfa
-    except ImportError:
-        raise InputError("inertial frames need pyerfa: pip install 'jaxbundle[geo]'") from None
-    return erfa

@@ -30,9 +30,6 @@ from jaxbundle.pushbroom.trajectory import (
 )
 from jaxbundle.types import AnyArray, Numbers, Scalar
 
-LONGEST_IMAGE = 10_000_000
-"""Upper bound for lines or pixels."""
-
 
 class Offsets(eqx.Module):
     """Small changes of the trajectory: radians, metres, and their rates per second."""
@@ -71,7 +68,7 @@ class PushbroomImage(eqx.Module):
         return self.times.time((self.lines - 1) / 2)
 
 
-class Pose(NamedTuple):
+class LinePose(NamedTuple):
     """Exterior orientation of a line: P in metres, R camera → object, rate V of P in m/s."""
 
     P: Float[AnyArray, "3"]
@@ -111,28 +108,33 @@ def make_image(
 def check_size(lines: float, pixels: float, where: str) -> None:
     """Refuse an image size that is not integer, without lines, with fewer than 2 pixels, or
     impossibly large."""
+    # ten million lines are 7000 km of pixels of 0.7 m: more is a slip of the pen
+    largest = 10_000_000
     for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
-        if not least <= size <= LONGEST_IMAGE or size != int(size):
+        if not least <= size <= largest or size != int(size):
             raise InputError(
-                f"{where}: {size:.15g} {name}; a whole number from {least} to "
-                f"{LONGEST_IMAGE} is expected"
+                f"{where}: {size:.15g} {name}; a whole number from {least} to {largest} is expected"
             )
 
 
-def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
+def pose_at(image: PushbroomImage, t: Scalar) -> LinePose:
     """The pose at the time t, in seconds; NaN outside the tables."""
     return move_pose(recorded_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
-def recorded_pose(image: PushbroomImage, t: Scalar) -> Pose:
+def recorded_pose(image: PushbroomImage, t: Scalar) -> LinePose:
     """The pose of the platform from its tables, without offsets and mounting."""
-    of = image.trajectory
-    return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
+    trajectory = image.trajectory
+    return LinePose(
+        position_at(trajectory, t), rotation_at(trajectory, t), velocity_at(trajectory, t)
+    )
 
 
-def move_pose(given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]) -> Pose:
-    """The pose of the camera, `dt` seconds after the middle line."""
+def move_pose(
+    platform: LinePose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
+) -> LinePose:
+    """The pose of the camera on this pose of its platform, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)
-    R = given.R @ turn @ matrix_from_pitch_roll_yaw(mounting)
-    P = given.P + offsets.position + dt * offsets.position_rate
-    return Pose(P, R, given.V + offsets.position_rate)
+    R = platform.R @ turn @ matrix_from_pitch_roll_yaw(mounting)
+    P = platform.P + offsets.position + dt * offsets.position_rate
+    return LinePose(P, R, platform.V + offsets.position_rate)

@@ -30,15 +30,13 @@ import numpy as np
 from jax.lax.linalg import tridiagonal_solve
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.types import AnyArray, Scalar
+from jaxbundle.types import AnyArray, Scalar, present
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
-LEAST_DEGREE = 3
-"""Minimum degree of a piece, for the cubic methods."""
 
 
-class Table(eqx.Module):
+class TimeTable(eqx.Module):
     """Values against time, differentiable in all of them.
 
     `times` in seconds; `gap` the longest interpolated step between two rows, in seconds;
@@ -57,20 +55,21 @@ class Table(eqx.Module):
     pieces: Float[AnyArray, "intervals nodes k"] | None = None
 
 
-def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
+def interpolate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
     """The values at the time t, in seconds; NaN outside the table and in gaps."""
     i = interval(table, t)
     if table.pieces is not None:
-        return jnp.where(covers(table, i, t), _of_pieces(table, i, t), jnp.nan)
+        return jnp.where(covers(table, i, t), _evaluate_piece(table, i, t), jnp.nan)
     match table.method:
         case "linear":
-            value = _linear(table, i, t)
+            tau = fraction(table, i, t)
+            value = (1 - tau) * table.values[i] + tau * table.values[i + 1]
         case "lagrange":
             value = _lagrange(table, i, t)
         case "usgscsm":
             value = _usgscsm(table, i, t)
         case "hermite":
-            value = _hermite(table, table.rates, i, t)
+            value = _hermite(table, present(table.rates), i, t)
         case "spline":
             value = _hermite(table, spline_rates(table.times, table.values, table.gap), i, t)
         case _:
@@ -78,16 +77,16 @@ def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     return jnp.where(covers(table, i, t), value, jnp.nan)
 
 
-def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]]) -> Table:
+def convert_to_pieces(table: TimeTable, value: Callable[[Scalar], Float[Array, " k"]]) -> TimeTable:
     """The table with `value(t)`, its interpolation, as polynomials (`pieces`).
 
     They are exact for the methods of a table; of another smooth function, such as `slerp`, to order
     + 1 powers of an interval.
     """
-    nodes = max(table.order, LEAST_DEGREE) + 1
+    nodes = max(table.order, 3) + 1  # 3 is the degree of splines and of Hermite's polynomials
     t = table.times[:-1, None] + jnp.diff(table.times)[:, None] * _chebyshev(nodes)
     pieces = jax.vmap(jax.vmap(value))(t)
-    return Table(
+    return TimeTable(
         table.times,
         table.values,
         None,
@@ -99,37 +98,37 @@ def convert_to_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]
     )
 
 
-def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
+def rate(table: TimeTable, t: Scalar) -> Float[Array, " k"]:
     """The derivative of the interpolated values by time, per second."""
     return jax.jvp(lambda t: interpolate(table, t), (t,), (jnp.ones_like(t),))[1]
 
 
-def interval(table: Table, t: Scalar) -> Int[Array, "..."]:
+def interval(table: TimeTable, t: Scalar) -> Int[Array, "..."]:
     """The row i with tᵢ ≤ t < tᵢ₊₁; the first or last interval beyond the ends."""
     i = jnp.searchsorted(table.times, t, side="right") - 1
     return jnp.clip(i, 0, len(table.times) - 2)
 
 
-def fraction(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
+def fraction(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
     """τ, the elapsed fraction of interval i at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
-def covers(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
+def covers(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
     inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
     return inside & (times[i + 1] - times[i] <= table.gap)
 
 
-def span(table: Table) -> tuple[float, float]:
+def span(table: TimeTable) -> tuple[float, float]:
     """The first and the last time that the table covers."""
     times = np.asarray(table.times)
     return float(times[0]) - table.extrapolate, float(times[-1]) + table.extrapolate
 
 
-def breaks(table: Table) -> Float[np.ndarray, " rows"]:
+def breaks(table: TimeTable) -> Float[np.ndarray, " rows"]:
     """The times where one polynomial ends and the next begins."""
     return np.asarray(table.times)
 
@@ -137,17 +136,21 @@ def breaks(table: Table) -> Float[np.ndarray, " rows"]:
 def spline_rates(
     times: Float[AnyArray, " rows"], values: Float[AnyArray, "rows k"], gap: float = np.inf
 ) -> Float[Array, "rows k"]:
-    """The rates at the rows of the cubic spline with not-a-knot conditions at both ends.
+    """The rates at the rows of the cubic spline with not-a-knot conditions at both ends,
+
+        hᵢ·ẏᵢ₋₁ + 2(hᵢ₋₁ + hᵢ)·ẏᵢ + hᵢ₋₁·ẏᵢ₊₁ = 3(hᵢ·sᵢ₋₁ + hᵢ₋₁·sᵢ),    s = Δy/h.
 
     Splines on both sides of a step longer than `gap` are independent; with three rows it is a
     parabola, with two a straight line.
     """
     step = jnp.diff(times)
     slope = jnp.diff(values, axis=0) / step[:, None]
+    # One tridiagonal system for all splines of a table: its shape does not depend on the gaps, so
+    # that it can be differentiated and compiled.
     ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
-    forward = _end_rows(step, slope, ends[:-1], ends[1:])
+    forward = _end_rows(step, slope, ends[1:])
     # seen from behind, steps and slopes keep their signs
-    back = _end_rows(step[::-1], slope[::-1], ends[:0:-1], ends[-2::-1])
+    back = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
     back = tuple(v[::-1] for v in back)
     zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
     before, after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
@@ -168,14 +171,20 @@ def spline_rates(
     )
 
 
-def _end_rows(step, slope, first, last):
+def _end_rows(
+    step: Float[Array, " intervals"],
+    slope: Float[Array, "intervals k"],
+    last: Bool[Array, " intervals"],
+) -> tuple[Array, Array, Array]:
     """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
-    `first` and `last` tell where a spline begins and ends: not-a-knot needs four rows.
+    `last` tells where a spline ends: not-a-knot needs four rows.
     """
     pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
     h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
     both = h0 + h1
+    # Not-a-knot: the third derivative is continuous at the second row, which combined with its own
+    # equation leaves h₁·ẏ₀ + (h₀ + h₁)·ẏ₁ = knot (de Boor, 1978, chapter IV).
     knot = (((h0 + 2 * both) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both[:, None]
     parabola = s0 - (h0 / both)[:, None] * (s1 - s0)
     ending = lambda by: jnp.concatenate([last[by:], jnp.ones(by, bool)])
@@ -192,20 +201,18 @@ def _chebyshev(nodes: int) -> np.ndarray:
     return (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2
 
 
-def _of_pieces(table, i, t):
-    nodes = _chebyshev(table.pieces.shape[1])
+def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
+    pieces = present(table.pieces)
+    nodes = _chebyshev(pieces.shape[1])
     same = np.eye(len(nodes), dtype=bool)
     spans = nodes[:, None] - nodes + same
     tau = fraction(table, i, t)
-    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ table.pieces[i]
+    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
 
 
-def _linear(table, i, t):
-    tau = fraction(table, i, t)
-    return (1 - tau) * table.values[i] + tau * table.values[i + 1]
-
-
-def _lagrange(table, i, t):
+def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through order + 1 rows: half of them before t, except at the ends."""
     rows = table.order + 1
     first = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
     times = jax.lax.dynamic_slice_in_dim(table.times, first, rows)
@@ -215,7 +222,8 @@ def _lagrange(table, i, t):
     return jnp.prod(jnp.where(same, 1.0, (t - times) / spans), axis=1) @ values
 
 
-def _usgscsm(table, i, t):
+def _usgscsm(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
+    """Lagrange's formula through 2·half rows, with weights 0 for the rest of a fixed number."""
     most = (table.order + 1) // 2
     half = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), most)
     offset = jnp.arange(-most, most) + 1
@@ -228,7 +236,10 @@ def _usgscsm(table, i, t):
     return jnp.where(used, weights, 0.0) @ values
 
 
-def _hermite(table, rates, i, t):
+def _hermite(
+    table: TimeTable, rates: Float[AnyArray, "rows k"], i: Int[AnyArray, ""], t: Scalar
+) -> Float[AnyArray, " k"]:
+    """The cubic polynomial with the values and these rates at both ends of interval i."""
     tau, step = fraction(table, i, t), table.times[i + 1] - table.times[i]
     h01 = tau**2 * (3 - 2 * tau)
     h10, h11 = tau * (1 - tau) ** 2, -(tau**2) * (1 - tau)

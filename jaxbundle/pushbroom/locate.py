@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.vectors import Triple, along, difference, length, rotate
 from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
-from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.scanner import Pair, slopes_of
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
@@ -26,15 +26,20 @@ def locate_point(image: PushbroomImage, surface: Surface, line: Scalar, pixel: S
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
-def ground_point(pose: Pose, slopes: Pair, surface: Surface, corrections: Corrections) -> Triple:
+def ground_point(
+    pose: LinePose, slopes: Pair, surface: Surface, corrections: Corrections
+) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
+    # Backwards along the way of the light: aberration happens in the camera; the Earth has turned
+    # since the light left; refraction is last, as it needs the height of the point.
     o, d = P, rotate(R, (*slopes, -1.0))
     if corrections.aberration:
         d = without_aberration(d, inertial_velocity(o, V))
     X = along(o, d, surface.distance(o, d))
     if corrections.light_time:
         start, direction = o, d
+        # the distance changes by 1e-6 of itself in the first round, by 1e-12 in the second
         for _ in range(2):
             distance = length(difference(X, o))
             o, d = earlier_earth(start, distance), earlier_earth(direction, distance)
@@ -54,15 +59,15 @@ def locate_lines(
     """The points of all pixels of all lines, coordinates first."""
     slopes = slopes_of(image.optics, pixels)
 
-    def of_line(line):
+    def locate_line(line: Scalar) -> Triple:
         pose = pose_at(image, image.times.time(line))
         point = lambda slopes: ground_point(pose, slopes, surface, image.corrections)
         return jax.vmap(point)(slopes)
 
     if surface.iterative:
         # the state of a loop over 8000 pixels stays in the cache, that of many lines does not
-        return jnp.stack(jax.lax.map(of_line, lines), axis=0)
-    return jnp.stack(jax.vmap(of_line)(lines))
+        return jnp.stack(jax.lax.map(locate_line, lines), axis=0)
+    return jnp.stack(jax.vmap(locate_line)(lines))
 
 
 def locate_points(

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
@@ -83,9 +83,13 @@ def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     them."""
     attitude, position = image.trajectory.attitude.table, image.trajectory.position
     for table, white in ((attitude, errors.attitude_white), (position, errors.position_white)):
+        # `pieces` replace the rows (`interpolation`): errors of these would have no effect
         if len(white) and table.pieces is not None:
             raise ValueError("a table in pieces has no rows that errors could be added to")
-    turn = _rotate_angles if attitude.values.shape[1] == 3 else _rotate_quaternion
+    rotate_quaternion = lambda q, error: quaternion_multiply(
+        q, quaternion_from_rotation_vector(error)
+    )
+    turn = _rotate_angles if attitude.values.shape[1] == 3 else rotate_quaternion
     offsets = image.offsets
     return eqx.tree_at(
         lambda i: (
@@ -112,11 +116,8 @@ def add_errors(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     )
 
 
-def _rotate_quaternion(q, error):
-    return quaternion_multiply(q, quaternion_from_rotation_vector(error))
-
-
-def _rotate_angles(angles, error):
+def _rotate_angles(angles: Float[AnyArray, "3"], error: Float[AnyArray, "3"]) -> Float[Array, "3"]:
     """The angles of R·exp([ε]×), nearest to the given ones."""
+    # angles give Rᵀ, and (R·exp([ε]×))ᵀ = exp([ε]×)ᵀ·Rᵀ
     M = matrix_from_rotation_vector(error).T @ matrix_from_omega_phi_kappa(angles)
     return omega_phi_kappa_near(M, angles)

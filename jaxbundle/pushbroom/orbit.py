@@ -14,13 +14,13 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM, Rows
 
 J2 = 1.08262668e-3
-RADIUS = 6378137.0
-"""The reference radius of J2, metres (WGS 84)."""
-TOLERANCE = 1e-12
-"""Relative tolerance of the integration; 1e-5 m in a revolution."""
+"""The second zonal harmonic of the Earth, −√5·C̄₂₀ of EGM96 with C̄₂₀ = −484.165371736e-6."""
+RADIUS = float(WGS84.a)
+"""The reference radius of J2, metres."""
 
 
 def state_orbit(
@@ -46,18 +46,20 @@ def state_orbit(
             " metres, Earth-fixed or in the stated frame, are expected"
         )
     states = np.empty((len(times), 6))
+    tolerance = 1e-12  # relative: 1e-5 m in a revolution
+    # forward and backward from the epoch: `solve_ivp` integrates in one direction
     for part, order in ((times >= at, 1), (times < at, -1)):
         when = np.sort(times[part])[::order]
         if not len(when):
             continue
         found = solve_ivp(
-            lambda t, y: np.r_[y[3:], acceleration(y[:3], j2)],
+            lambda _, y: np.r_[y[3:], acceleration(y[:3], j2)],
             (at, when[-1]),
             start,
             "DOP853",
             t_eval=when,
-            rtol=TOLERANCE,
-            atol=TOLERANCE * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
+            rtol=tolerance,
+            atol=tolerance * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
             events=_ground,
         )
         if found.status:
@@ -65,7 +67,9 @@ def state_orbit(
                 f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "
                 "velocity, its unit and frame"
             )
+        # times need not be sorted, but those of the integration are
         states[part] = found.y.T[np.searchsorted(order * when, order * times[part])]
+    # from the axes at the epoch to those that have turned since
     back = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
     P = back.apply(states[:, :3])
     return P, back.apply(states[:, 3:]) - np.cross(spin, P)
@@ -81,8 +85,8 @@ def acceleration(r: Float[np.ndarray, "3"], j2: bool = True) -> Float[np.ndarray
     return central - 1.5 * J2 * GM * RADIUS**2 / distance**5 * r * (np.array([1, 1, 3.0]) - polar)
 
 
-def _ground(t, y):
-    return np.linalg.norm(y[:3]) - RADIUS
+def _ground(_: float, y: Float[np.ndarray, "6"]) -> float:
+    return float(np.linalg.norm(y[:3])) - RADIUS
 
 
 _ground.terminal = True

@@ -1,8 +1,6 @@
 """Passages of the detector line over a point, searched over the whole image.
 
-    F(t) = −s/q − η(ξ),    ξ = −r/q,    [r, s, q] = M(t)·D + m(t),
-
-the slope of the point ahead of the detector line, η a polynomial of ξ, changes its sign at every
+The slope F(t) by which the point is ahead of the line (`detector_line`) changes its sign at every
 passage. Between two times of the search (ends of pieces) F is approximated by the cubic with its
 values and rates at both: one that crosses zero and back within the step passes twice. Points behind
 the Earth are not seen.
@@ -12,76 +10,48 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import normal
-from jaxbundle.geometry.vectors import difference, dot
-from jaxbundle.pushbroom.newton import apparent_position, line_period, motion
-from jaxbundle.pushbroom.polynomial import value, value_and_rate
-from jaxbundle.system.programs import compile_once
+from jaxbundle.geometry.vectors import Vector, difference, dot
+from jaxbundle.pushbroom.detector_line import slope_ahead
+from jaxbundle.pushbroom.pieces import sample
+from jaxbundle.pushbroom.search import ScannerGeometry, Search
 
-SEARCH, FINE_SEARCH = 128, 512
-"""Largest number of search steps; the finer one if the camera may turn back."""
-DETECTORS = 257
-"""Number of points along the line for fitting η of ξ."""
-
-
-def sample_times(pieces, most: int = SEARCH):
-    """Ends of pieces, `most` steps at most."""
-    last = len(pieces.ends) - 1
-    chosen = np.unique(np.linspace(0, last, min(most, last) + 1).round().astype(int))
-    return pieces.ends[chosen]
+# start times [most, n]; their number, and whether the point is ahead of the last line, behind the
+# first, never above the horizon [n]
+Passages = tuple[Array, Array, Array, Array, Array]
+# F, its rate and the time of the previous step; the number of passages and their start times; F of
+# the first step; whether the camera has been above the horizon
+PassagesState = tuple[Array, Array, Array, Array, tuple[Array, ...], Array, Array]
+# number and time of a step, twelve numbers and their rates there, (P, V)
+SearchStep = tuple[Array, Array, Array, Array, tuple[Vector, Vector]]
 
 
-def line_of_detectors(optics, pixels):
-    """Coefficients of η as a polynomial of ξ."""
-    u = np.linspace(0, max(pixels - 1, 1), DETECTORS)
-    xi, eta = (np.asarray(v) for v in slopes(optics, u))
-    return jnp.asarray(np.polynomial.polynomial.polyfit(xi, eta, 5))
-
-
-slopes = compile_once(lambda optics, u: optics.slopes(u), ())
-
-
-def ahead(numbers, D, along):
-    """(F, ξ): the slope by which a sight D is ahead of the detectors; NaN behind the camera."""
-    r, s, q = (sum(numbers[3 * i + k] * D[k] for k in range(3)) + numbers[9 + i] for i in range(3))
-    front = q < 0
-    q = jnp.where(front, q, -1.0)
-    xi = -r / q
-    return jnp.where(front, -s / q - value(along, xi), jnp.nan), xi
-
-
-def sample(pieces, t):
-    """The twelve numbers at a time, their rates, and (P, V)."""
-    k = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
-    start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
-    half = (end - start) / 2
-    numbers, rates = value_and_rate(c, (t - start) / half - 1)
-    return numbers, rates / half, motion(numbers, rates / half, pieces.origin)
-
-
-def passages(image, search, X, most, margin):
+def find_passages(
+    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
+) -> Passages:
     """Approximate times of passages over the points, and their number; whether points are
     ahead of the last line, behind the first, or never above the horizon.
 
     The search begins and ends one line outside the image, to include its edges.
     """
-    step = (1 + margin) * line_period(image)
-    samples = search.samples.at[0].add(-step).at[-1].add(step)
+    step = (1 + margin) * image.line_period
+    samples = jnp.asarray(search.samples).at[0].add(-step).at[-1].add(step)
     numbers, rates, motions = jax.vmap(partial(sample, search.pieces))(samples)
     up = None if search.earth is None else normal(search.earth, X)
 
-    def step_to(state, sample):
+    def step_to(state: PassagesState, sample: SearchStep) -> tuple[PassagesState, None]:
         before, rate_before, t_before, count, starts, first, risen = state
         k, t, numbers, rates, motion = sample
-        D = difference(apparent_position(image, search.earth, motion, X), search.pieces.origin)
-        value, rate = jax.jvp(lambda n: ahead(n, D, search.along)[0], (numbers,), (rates,))
+        D = difference(image.apparent_position(search.earth, motion, X), search.pieces.origin)
+        ahead = lambda numbers: slope_ahead(numbers, D, search.detector_line)[0]
+        value, rate = jax.jvp(ahead, (numbers,), (rates,))
         if up is not None:
             above = dot(up, difference(motion[0], X)) > 0
             value, risen = jnp.where(above, value, jnp.nan), risen | above
         h = t - t_before
-        once, twice, places = _zeros(before, value, rate_before * h, rate * h)
+        once, twice, places = _find_zeros(before, value, rate_before * h, rate * h)
         new = once + 2 * twice
         starts = tuple(
             jnp.select(
@@ -105,21 +75,27 @@ def passages(image, search, X, most, margin):
         nowhere,
         never if up is not None else ~never,
     )
+    # Four steps of plain sights a turn hide the cost of the loop; steps with corrections are long
+    # enough, and four of them only take longer to compile.
     unroll = 1 if image.corrections.any else 4
     (final, _, _, count, starts, first, risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
+    # NaN at an end, where the point is behind the camera, is neither ahead nor behind
     return jnp.stack(starts), count, final > 0, first < 0, ~risen
 
 
-def _zeros(a, b, da, db):
+def _find_zeros(
+    a: Float[Array, " n"], b: Float[Array, " n"], da: Float[Array, " n"], db: Float[Array, " n"]
+) -> tuple[Array, Array, tuple[Array, Array]]:
     """Whether a function crosses zero once or twice from 0 to 1, and approximately where; from its
     values and rates at both ends (cubic), false if one is NaN."""
     known = ~(jnp.isnan(a) | jnp.isnan(b))
     once = known & ((a >= 0) != (b >= 0))
     straight = a / jnp.where(once, a - b, 1.0)
     turns = known & ~once & (a * da < 0) & (b * db > 0)
-    # the zero of the rate, c + 2h·s + k·s², between ends of different sign
+    # The zero of the rate, c + 2h·s + k·s², between ends of different sign; q avoids the
+    # cancellation of −h ± √(h² − ck) (Press et al., 2007, Numerical Recipes, section 5.6).
     rise = b - a
     c, h, k = da, 3 * rise - 2 * da - db, 3 * (da + db - 2 * rise)
     q = -(h + jnp.copysign(jnp.sqrt(jnp.maximum(h * h - c * k, 0.0)), h))

@@ -3,11 +3,11 @@
 A point X is at [r, s, q] = Rᵀ·(X − P) = M·(X − O) + m in the camera frame, O a fixed origin. The
 twelve numbers M, m are interpolated by polynomials of degree 3 through Chebyshev points of short
 pieces of time. A piece ends at interpolation nodes of a table and is halved until the polynomials
-reproduce image coordinates within `TOLERANCE` pixels. This costs a few multiplications per point,
-while interpolation and rotation cost hundreds. Degree 3 needs more pieces than 5, but half the
-time.
+reproduce image coordinates within a tolerance. This costs a few multiplications per point,
+while interpolation and rotation cost hundreds.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from math import comb
 
@@ -15,29 +15,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
-from jaxbundle.geometry.vectors import rotate
+from jaxbundle.geometry.vectors import Triple, rotate
 from jaxbundle.leastsquares.indexing.indices import round_up
-from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
+from jaxbundle.pushbroom.polynomial import value_and_rate
+from jaxbundle.pushbroom.search_settings import DEFAULTS, SearchSettings
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 DEGREE = 3
-TOLERANCE = 1e-7
-SHORTEST_PIECE = 1e-3
-"""Shortest piece, as a fraction of a line."""
-CHUNK = 1024
-"""Fixed batch size of times for the pose: one shape to compile."""
-MOST_SHARED = 128
-"""Images with at most this many pieces share compiled programs with those of similar number; with
-more, not all ends are search times (`passages`), and halves would make them uneven."""
-EQUAL_TIMES = 1e-6
-"""Rows of two tables closer in time than this fraction of a line count as one."""
-
+"""Of the polynomials: 5 needs fewer pieces, but twice the time for every point."""
 NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
 """Check times between the nodes and at the ends, where the polynomial error is largest."""
@@ -55,6 +47,12 @@ TO_HALVES = np.array(
 """From the coefficients of a polynomial in τ to those in τ' from −1 to 1, τ = (τ' ∓ 1)/2."""
 
 
+# start, end, coefficients
+Piece = tuple[float, float, Float[np.ndarray, "4 12"]]
+# M (rows first) and m
+TwelveNumbers = Sequence[Scalar] | Float[AnyArray, "12 ..."]
+
+
 class Pieces(eqx.Module):
     """Ends of the n pieces in seconds; coefficients of M (rows first) and m in τ from −1 to 1."""
 
@@ -63,7 +61,9 @@ class Pieces(eqx.Module):
     origin: Float[AnyArray, "3"]
 
 
-def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
+def make_pieces(
+    image: PushbroomImage, earth: Ellipsoid | None, settings: SearchSettings = DEFAULTS
+) -> Pieces:
     """The pieces from the edge of the first line to that of the last, within the tables.
 
     `earth` as in `make_search`.
@@ -76,26 +76,32 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     starts, ends = zip(*(span(table) for table in tables))
     first, last = max(first, *starts), min(last, *ends)
     nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
-    nodes = nodes[(nodes > first + EQUAL_TIMES * line) & (nodes < last - EQUAL_TIMES * line)]
-    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > EQUAL_TIMES * line], last]
-    origin, reach, per_radian = _sight(image, earth)
+    equal = settings.equal_times * line
+    nodes = nodes[(nodes > first + equal) & (nodes < last - equal)]
+    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > equal], last]
+    origin, reach, per_radian = _middle_sight(image, earth)
     left, right, found = ends[:-1], ends[1:], []
     while len(left):
-        values, checks = _numbers(image, origin, left, right, (first, last))
+        values, checks = _pose_numbers_of_pieces(
+            image, origin, left, right, (first, last), settings.times_at_once
+        )
         wrong = np.abs(TO_CHECKS @ values - checks)
         # turns act on the whole sight, shifts over its length
         error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
-        good = error <= TOLERANCE
+        good = error <= settings.piece_tolerance
         found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
+        # a rough trajectory, or a wrong row, would be halved for ever
         left, right = left[~good], right[~good]
-        if len(left) and (right - left).min() < SHORTEST_PIECE * line:
+        if len(left) and (right - left).min() < settings.min_piece * line:
             raise InputError(
                 f"attitude: the trajectory at {left[0]:.9g} s does not follow from its rows within "
-                f"{SHORTEST_PIECE:g} lines; look for wrong rows there"
+                f"{settings.min_piece:g} lines; look for wrong rows there"
             )
         middle = (left + right) / 2
         left, right = np.r_[left, middle], np.r_[middle, right]
-    more = round_up(len(found)) - len(found) if len(found) <= MOST_SHARED else 0
+    shared = len(found) <= settings.max_shared_pieces
+    more = round_up(len(found)) - len(found) if shared else 0
+    # a half has the same polynomial: pieces that only fill up move no position
     found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(
@@ -103,7 +109,7 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     )
 
 
-def _halve_some(pieces, number: int):
+def _halve_some(pieces: list[Piece], number: int) -> list[Piece]:
     """Pieces (start, end, coefficients) in order of time, some of the longest halved."""
     pieces = sorted(pieces, key=lambda piece: piece[1] - piece[0])
     whole, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
@@ -113,42 +119,81 @@ def _halve_some(pieces, number: int):
     return sorted(whole, key=lambda piece: piece[0])
 
 
-def _numbers(image, origin, left, right, span):
+def _pose_numbers_of_pieces(
+    image: PushbroomImage,
+    origin: Float[np.ndarray, "3"],
+    left: Float[np.ndarray, " n"],
+    right: Float[np.ndarray, " n"],
+    span: tuple[float, float],
+    batch: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """The twelve numbers at nodes and checks of many pieces: [n, 4, 12] and [n, 5, 12]."""
     places = np.r_[NODES, CHECKS]
     t = (left + right)[:, None] / 2 + (right - left)[:, None] / 2 * places
     t = np.clip(t, *span)
-    padded = np.pad(t.ravel(), (0, -t.size % CHUNK), mode="edge").reshape(-1, CHUNK)
+    padded = np.pad(t.ravel(), (0, -t.size % batch), mode="edge").reshape(-1, batch)
     numbers = np.concatenate([_pose_numbers(image, origin, times) for times in padded])
     numbers = numbers[: t.size].reshape(*t.shape, 12)
     return numbers[:, : DEGREE + 1], numbers[:, DEGREE + 1 :]
 
 
 @partial(compile_once, static=())
-def _pose_numbers(image, origin, times):
-    def at(t):
+def _pose_numbers(
+    image: PushbroomImage, origin: Float[np.ndarray, "3"], times: Float[np.ndarray, " times"]
+) -> Float[Array, "times 12"]:
+    def numbers_at(t: Scalar) -> Float[Array, "12"]:
         P, R, _ = pose_at(image, t)
         return jnp.concatenate([R.T.ravel(), R.T @ (origin - P)])
 
-    return jax.vmap(at)(times)
+    return jax.vmap(numbers_at)(times)
+
+
+def sample_times(pieces: Pieces, most: int) -> Float[AnyArray, " k"]:
+    """Ends of pieces, `most` steps at most."""
+    last = len(pieces.ends) - 1
+    chosen = np.unique(np.linspace(0, last, min(most, last) + 1).round().astype(int))
+    return pieces.ends[chosen]
+
+
+def sample(pieces: Pieces, t: Scalar) -> tuple[Array, Array, tuple[Triple, Triple]]:
+    """The twelve numbers at a time, their rates, and (P, V)."""
+    k = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
+    start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
+    half = (end - start) / 2
+    numbers, rates = value_and_rate(c, (t - start) / half - 1)
+    return numbers, rates / half, motion(numbers, rates / half, pieces.origin)
+
+
+def motion(
+    numbers: TwelveNumbers, rates: TwelveNumbers, origin: Float[AnyArray, "3"]
+) -> tuple[Triple, Triple]:
+    """P = O − Mᵀ·m, and its rate V, of the twelve numbers M, m."""
+    position = lambda *n: tuple(
+        origin[k] - sum(n[3 * i + k] * n[9 + i] for i in range(3)) for k in range(3)
+    )
+    return jax.jvp(position, tuple(numbers), tuple(rates))
 
 
 @partial(compile_once, static=())
-def _middle(image):
+def _middle(image: PushbroomImage) -> tuple[LinePose, Triple, Scalar]:
     pose = pose_at(image, image.middle_time)
     u = (image.pixels - 1) / 2
     slopes, per_pixel = jax.jvp(image.optics.slopes, (u,), (1.0,))
     return pose, rotate(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
 
 
-def _sight(image, earth):
+def _middle_sight(
+    image: PushbroomImage, earth: Ellipsoid | None
+) -> tuple[Float[np.ndarray, "3"], float, float]:
     """A point on the ground in the middle, its distance, and pixels a radian (the finer of two)."""
     (P, _, V), d, per_pixel = jax.tree.map(np.asarray, _middle(image))
     if earth is None:
-        s = -P[2] / d[2] if d[2] else 0.0
+        s = float(-P[2] / d[2]) if d[2] else 0.0
     else:
         s = float(ray_to_ellipsoid(earth, P, d))
+    # Looking at the sky or into the ground: a kilometre serves to weigh turns against shifts.
     reach = s if np.isfinite(s) and s > 0 else 1e3
     period = float(image.times.time(1.0) - image.times.time(0.0))
-    advance = max(np.linalg.norm(V) * period / reach, 1e-12)
+    # not zero: a camera may stand still
+    advance = max(float(np.linalg.norm(V)) * period / reach, 1e-12)
     return P + reach * np.array(d), reach, max(1 / float(per_pixel), 1 / advance)

@@ -22,7 +22,7 @@ def value(coefficients: Coefficients, x: Scalar) -> Float[Array, "..."]:
 def value_and_rate(
     coefficients: Coefficients, x: Scalar
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """The same, and its derivative by x."""
+    """c₀ + c₁·x + c₂·x² + … and its derivative by x, in one loop (Horner)."""
     total, rate = jnp.asarray(coefficients[-1]), jnp.zeros_like(x)
     for c in coefficients[-2::-1]:
         total, rate = total * x + c, rate * x + total

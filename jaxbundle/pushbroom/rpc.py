@@ -26,10 +26,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpack
+from jaxbundle.geometry.vectors import Triple, Vector, along, difference, unit, unpack
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import require_ellipsoid
 from jaxbundle.pushbroom.surfaces import Surface
@@ -37,15 +37,11 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 TERMS = 20
-STEPS = 6
-"""Newton steps of the inverse; the number of digits doubles with each."""
-LAST_STEP = 1e-9
-"""A last step below this, in units of the scales, ends Newton's method."""
-MARGIN = 0.1
-"""Tolerance beyond the scales (of 1) that counts as inside."""
-START_HEIGHT = 20e3
-"""A line of sight begins this far above the highest height of the domain, metres."""
-ROUNDS = 3
+"""Of a polynomial of degree 3 in three variables, in the format RPC00B."""
+DOMAIN_MARGIN = 0.1
+"""The part of the scales beyond ±1 that still counts as inside. Vendors' scales are rounded and
+their edges not sharp; larger: an extrapolation passes unnoticed, smaller: points at the edges of an
+image have warnings. Not critical."""
 
 
 class RpcStatus(IntEnum):
@@ -89,7 +85,11 @@ class Rpc(eqx.Module):
 
 def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, given in radians and metres; see `domain` for their status."""
-    return _image(rpc, *normalise(rpc, longitude, latitude, height))
+    line, sample = _ratios(rpc, *normalise(rpc, longitude, latitude, height))
+    return (
+        rpc.line_offset + rpc.line_scale * line,
+        rpc.sample_offset + rpc.sample_scale * sample,
+    )
 
 
 def locate(rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar) -> tuple[Array, Array, Array]:
@@ -104,33 +104,42 @@ def locate(rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar) -> tuple[Arra
             (sample - rpc.sample_offset) / rpc.sample_scale,
         ]
     )
-    held = stop_gradient((rpc, H, target))
+    fixed = stop_gradient((rpc, H, target))
 
-    def newton(_, state):
-        place, _ = state
-        J, v = jax.jacfwd(_twice_misclosure, has_aux=True)(place, held)
+    def newton(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        place = state[0]
+        J, v = jax.jacfwd(_twice_misclosure, has_aux=True)(place, fixed)
         step = _solve(J, v)
         return place - step, jnp.max(jnp.abs(step))
 
     start = (jnp.zeros(2), jnp.asarray(jnp.inf))
-    place, last = jax.lax.fori_loop(0, STEPS + 1, newton, start)
+    # From the middle of the domain four steps reach rounding (of coefficients with all terms the
+    # largest are 0.9, 1e-2, 2e-6, 3e-14); three more are a reserve for images far from linear.
+    place, last = jax.lax.fori_loop(0, 7, newton, start)
     L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
-    settled = last < LAST_STEP
+    # in units of the scales; the error after a step is about its square, below rounding
+    settled = last < 1e-9
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
-    found = lambda a: jnp.where(settled, a, jnp.nan)
+    settled_only = lambda a: jnp.where(settled, a, jnp.nan)
     status = jnp.where(
         settled, _inside(jnp.stack([L, P, H, *target])), int(RpcStatus.NOT_CONVERGED)
     )
-    return found(longitude), found(latitude), status
+    return settled_only(longitude), settled_only(latitude), status
 
 
-def _misclosure(place, _, data):
+def _misclosure(
+    place: Float[Array, "2"], _: None, data: tuple[Rpc, Scalar, Array]
+) -> Float[Array, "2"]:
+    """Line and sample of (L, P), both in units of the scales, minus those wanted."""
     (rpc, H, target), (L, P) = data, place
     return jnp.stack(_ratios(rpc, L, P, H)) - target
 
 
-def _twice_misclosure(place, data):
+def _twice_misclosure(
+    place: Float[Array, "2"], data: tuple[Rpc, Scalar, Array]
+) -> tuple[Array, Array]:
+    """The misclosure to be differentiated and, as `has_aux` of JAX, itself."""
     v = _misclosure(place, None, data)
     return v, v
 
@@ -158,17 +167,22 @@ def locate_on(
     earth = require_ellipsoid(surface.earth)
     top, d = sight(rpc, line, sample, earth)
 
-    def shift(state, _):
-        o, _ = state
+    def shift(
+        state: tuple[Vector, tuple[Array, Array, Scalar, Array]], _: None
+    ) -> tuple[tuple[Vector, tuple[Array, Array, Scalar, Array]], None]:
+        o = state[0]
         X = along(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h)
-        own = earth_fixed(earth, (longitude, latitude, h))
-        return (along(o, difference(own, X), 1.0), (longitude, latitude, h, status)), None
+        seen = earth_fixed(earth, (longitude, latitude, h))
+        return (along(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-    start = (along(top, d, -START_HEIGHT), nothing)
-    (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=ROUNDS)
+    # 20 km above the domain: also of a surface that rises above its heights the first point is met
+    start = (along(top, d, -20e3), nothing)
+    # The ray is nearly parallel to the line of sight: a round leaves of the distance between both
+    # only its product with the angle between them.
+    (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=3)
     missed = jnp.isnan(h)
     return longitude, latitude, h, jnp.where(missed, int(RpcStatus.NOT_CONVERGED), status)
 
@@ -181,7 +195,7 @@ def sight(
     Earth-fixed, metres; the direction is a unit vector.
     """
 
-    def point(height):
+    def point(height: Scalar) -> Float[Array, "3"]:
         longitude, latitude, _ = locate(rpc, line, sample, height)
         return jnp.stack(earth_fixed(earth, (longitude, latitude, height)))
 
@@ -224,7 +238,7 @@ def locate_points_on(
 def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     """The 20 terms in the order of RPC00B."""
     return (
-        1.0 + 0 * L,
+        1.0 + 0 * L,  # of the shape of L
         L,
         P,
         H,
@@ -258,15 +272,8 @@ def normalise(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> 
     )
 
 
-def _image(rpc, L, P, H):
-    line, sample = _ratios(rpc, L, P, H)
-    return (
-        rpc.line_offset + rpc.line_scale * line,
-        rpc.sample_offset + rpc.sample_scale * sample,
-    )
-
-
-def _ratios(rpc, L, P, H):
+def _ratios(rpc: Rpc, L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, Scalar]:
+    """a/b and c/d: line and sample in units of their scales."""
     terms = monomials(L, P, H)
     value = lambda coefficients: sum(c * m for c, m in zip(coefficients, terms))
     return (
@@ -275,12 +282,13 @@ def _ratios(rpc, L, P, H):
     )
 
 
-def _inside(values):
-    inside = jnp.max(jnp.abs(values)) <= 1 + MARGIN
+def _inside(values: Float[Array, "5"]) -> Int[Array, ""]:
+    """Status of normalised coordinates, ground and image."""
+    inside = jnp.max(jnp.abs(values)) <= 1 + DOMAIN_MARGIN
     return jnp.where(inside, int(RpcStatus.INSIDE), int(RpcStatus.OUTSIDE))
 
 
-def _solve(J, v):
+def _solve(J: Float[Array, "2 2"], v: Float[Array, "2"]) -> Float[Array, "2"]:
     """J⁻¹·v of 2 × 2."""
     determinant = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
     return (

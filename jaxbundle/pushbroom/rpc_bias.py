@@ -19,15 +19,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.choices import RPC_BIASES
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
-from jaxbundle.geometry.vectors import along
+from jaxbundle.geometry.vectors import Vector, along
 from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.rpc import MARGIN, Rpc, Scalar, project, project_points
+from jaxbundle.pushbroom.rpc import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
@@ -35,13 +35,9 @@ from jaxbundle.types import AnyArray
 MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
 """Unknowns of each axis."""
 CONTROL = Source("control points")
-SMALLEST_SINGULAR_VALUE = 1e-6
-"""Smallest relative singular value of the equations; below it points are collinear."""
-GRID = 12
-"""Points along each side of the grid to which an affine bias is fitted."""
 
 
-class Bias(eqx.Module):
+class RpcBias(eqx.Module):
     """a₀, a₁, a₂ and b₀, b₁, b₂, in pixels."""
 
     line: Float[AnyArray, "3"]
@@ -53,7 +49,7 @@ class BiasFit(eqx.Module):
     point residuals (pixels), redundancy numbers, w (σ a priori). σ0 is NaN without redundancy.
     """
 
-    bias: Bias
+    bias: RpcBias
     cofactor: Float[np.ndarray, "u u"]
     sigma0: float
     redundancy: int
@@ -68,7 +64,7 @@ class BiasFit(eqx.Module):
 
 
 def project_compensated(
-    rpc: Rpc, bias: Bias, longitude: Scalar, latitude: Scalar, height: Scalar
+    rpc: Rpc, bias: RpcBias, longitude: Scalar, latitude: Scalar, height: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, radians and metres, with the bias."""
     line, sample = project(rpc, longitude, latitude, height)
@@ -116,37 +112,58 @@ def fit_bias(
     _check_domain(rpc, control, source)
     terms = np.asarray(_terms(rpc, computed[:, 0], computed[:, 1])).T[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
-    if singular[-1] < SMALLEST_SINGULAR_VALUE * singular[0]:
+    # 1e-6 of 10 000 pixels is a hundredth of a pixel: points so near a line do not fix its sides
+    if singular[-1] < 1e-6 * singular[0]:
         raise InputError(f"{source.name}: all points on one line; give others, or use 'shift'")
+    ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
+    cofactors = np.einsum("nij,nj,nkj->nik", G, ground**2, G)
+    cofactors = cofactors + sigma[:, :, None] ** 2 * np.eye(2)
+    return _adjust(terms, np.stack([control.line, control.sample], 1) - computed, cofactors)
+
+
+def _adjust(
+    terms: Float[np.ndarray, "n k"],
+    difference: Float[np.ndarray, "n 2"],
+    cofactors: Float[np.ndarray, "n 2 2"],
+) -> BiasFit:
+    """Least squares of measured minus computed positions with P⁻¹ of each, `cofactors`.
+
+    Lines and samples of a point are correlated by its ground coordinates, so that all of it is
+    dense: a few control points.
+    """
+    n, k = terms.shape
     # rows in the order line, sample of the first point, of the second, …
     A = np.zeros((n, 2, 2 * k))
     A[:, 0, :k] = A[:, 1, k:] = terms
     A = A.reshape(2 * n, 2 * k)
     inverse_weights = np.zeros((n, 2, n, 2))
-    ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
-    each = np.einsum("nij,nj,nkj->nik", G, ground**2, G) + sigma[:, :, None] ** 2 * np.eye(2)
-    inverse_weights[np.arange(n), :, np.arange(n), :] = each
+    inverse_weights[np.arange(n), :, np.arange(n), :] = cofactors
     inverse_weights = inverse_weights.reshape(2 * n, 2 * n)
     P = np.linalg.inv(inverse_weights)
-    observed = np.stack([control.line, control.sample], 1)
     Q = np.linalg.inv(A.T @ P @ A)
-    x = Q @ A.T @ P @ (observed - computed).ravel()
-    v = (A @ x).reshape(n, 2) - (observed - computed)
+    x = Q @ A.T @ P @ difference.ravel()
+    v = (A @ x).reshape(n, 2) - difference
     Qv = inverse_weights - A @ Q @ A.T
     r = np.clip(np.diag(Qv @ P), 0.0, 1.0)
     test = np.diag(P @ Qv @ P)
-    free = r > 1e-8
+    free = r > 1e-8  # r = 0 exactly, up to rounding: the point has no test
     w = np.where(free, P @ v.ravel() / np.sqrt(np.where(free, test, 1.0)), np.nan)
     redundancy = 2 * n - 2 * k
     vtpv = float(v.ravel() @ P @ v.ravel())
     sigma0 = float(np.sqrt(vtpv / redundancy)) if redundancy else np.nan
     full = lambda a: jnp.asarray(np.r_[a, np.zeros(3 - k)])
     return BiasFit(
-        Bias(full(x[:k]), full(x[k:])), Q, sigma0, redundancy, v, r.reshape(n, 2), w.reshape(n, 2)
+        RpcBias(full(x[:k]), full(x[k:])),
+        Q,
+        sigma0,
+        redundancy,
+        v,
+        r.reshape(n, 2),
+        w.reshape(n, 2),
     )
 
 
-def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
+def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
     exact).
 
@@ -156,7 +173,8 @@ def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     if not np.any(np.r_[bias.line[1:], bias.sample[1:]]):
         moved = (rpc.line_offset + bias.line[0], rpc.sample_offset + bias.sample[0])
         return eqx.tree_at(lambda r: (r.line_offset, r.sample_offset), rpc, moved), None
-    side = np.linspace(-1, 1, GRID)
+    # 12³ points for 39 unknowns an axis
+    side = np.linspace(-1, 1, 12)
     L, P, H = (a.ravel() for a in np.meshgrid(side, side, side))
     place = (
         np.radians(float(rpc.longitude_offset) + float(rpc.longitude_scale) * L),
@@ -165,7 +183,8 @@ def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     )
     line, sample, _ = (np.asarray(a) for a in project_points(rpc, *place))
     terms = np.asarray(_terms(rpc, line, sample))
-    reach = 1 + MARGIN
+    reach = 1 + DOMAIN_MARGIN
+    # corners of the box of ground coordinates may be outside the image
     inside = (np.abs(terms[1]) <= reach) & (np.abs(terms[2]) <= reach)
     columns = (*place, line + bias.line @ terms, sample + bias.sample @ terms)
     table = RpcTable(*(np.asarray(column)[inside] for column in columns))
@@ -173,7 +192,7 @@ def apply_bias(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     return fitted, check_rpc(fitted, table)
 
 
-def _check_domain(rpc, control, source):
+def _check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
     """Refuse points outside the domain of the coefficients: another area, another image,
     swapped."""
     longitude, latitude, height, line, sample = control
@@ -189,16 +208,17 @@ def _check_domain(rpc, control, source):
         away = values - centre
         if name == "longitude":
             away = away - 360 * np.round(away / 360)
-        outside = np.abs(away) > (1 + MARGIN) * abs(scale)
+        reach = (1 + DOMAIN_MARGIN) * abs(scale)
+        outside = np.abs(away) > reach
         if outside.any():
-            row, reach = int(outside.argmax()), (1 + MARGIN) * abs(scale)
+            row = int(outside.argmax())
             raise InputError(
                 f"{source(row)}: {name} {values[row]:.9g}{unit} is outside the domain of the "
                 f"coefficients, {centre - reach:.9g} to {centre + reach:.9g}{unit}; {remedy}"
             )
 
 
-def _terms(rpc, line, sample):
+def _terms(rpc: Rpc, line: Scalar, sample: Scalar) -> Float[Array, "3 ..."]:
     """1, l̂, ŝ."""
     return jnp.stack(
         [
@@ -210,10 +230,17 @@ def _terms(rpc, line, sample):
 
 
 @partial(compile_once, static=())
-def _images(rpc, earth, longitude, latitude, height):
+def _images(
+    rpc: Rpc,
+    earth: Ellipsoid,
+    longitude: Float[AnyArray, " n"],
+    latitude: Float[AnyArray, " n"],
+    height: Float[AnyArray, " n"],
+) -> tuple[Array, Array]:
     """(l, s) [n, 2] and their derivatives by east, north, up [n, 2, 3]."""
 
-    def image(shift, place):
+    def shifted_image(shift: Float[Array, "3"], place: Vector) -> tuple[Array, Array]:
+        """(l, s) of a point moved by (east, north, up), as value and as `has_aux` of JAX."""
         east, north, _ = place
         s, c, z, k = jnp.sin(east), jnp.cos(east), jnp.sin(north), jnp.cos(north)
         X = earth_fixed(earth, place)
@@ -222,8 +249,8 @@ def _images(rpc, earth, longitude, latitude, height):
         value = jnp.stack(project(rpc, *geodetic(earth, X)))
         return value, value
 
-    def of_point(*place):
-        G, value = jax.jacfwd(image, has_aux=True)(jnp.zeros(3), place)
+    def image_and_slopes(*place: Scalar) -> tuple[Array, Array]:
+        G, value = jax.jacfwd(shifted_image, has_aux=True)(jnp.zeros(3), place)
         return value, G
 
-    return jax.vmap(of_point)(longitude, latitude, height)
+    return jax.vmap(image_and_slopes)(longitude, latitude, height)

@@ -36,12 +36,13 @@ class LineTimes(eqx.Module):
         """The time of a line."""
         if self.table is None:
             return self.first + self.period * line
-        return _at(self.table, line)
+        return _interpolate(self.table, line)
 
     def line(self, t: Scalar) -> Scalar:
         """The line of a time."""
         if self.table is None:
             return (t - self.first) / self.period
+        # the inverse of `_interpolate`, continued in the same way beyond the ends
         rows = jnp.searchsorted(self.table, t, side="right") - 1
         row = jnp.clip(rows, 0, len(self.table) - 2)
         start, end = self.table[row], self.table[row + 1]
@@ -83,7 +84,7 @@ class AngleTable(Optics):
     along: Float[AnyArray, " pixels"]
 
     def slopes(self, u: Scalar) -> Pair:
-        return jnp.tan(_at(self.across, u)), jnp.tan(_at(self.along, u))
+        return jnp.tan(_interpolate(self.across, u)), jnp.tan(_interpolate(self.along, u))
 
 
 class AnglePolynomial(Optics):
@@ -105,7 +106,7 @@ def slopes_of(optics: Optics, pixels: Float[AnyArray, " n"]) -> Pair:
     return jax.vmap(optics.slopes)(pixels)
 
 
-def _at(values, place):
+def _interpolate(values: Float[AnyArray, " n"], place: Scalar) -> Scalar:
     """Linear interpolation; the first and last step continue beyond the ends."""
     i = jnp.clip(jnp.floor(place).astype(int), 0, len(values) - 2)
     part = place - i

@@ -21,9 +21,6 @@ from jaxbundle.network.columns import did_you_mean
 
 Times = Float[np.ndarray, " n"]
 
-LEAD = 60.0
-"""A random walk begins this many seconds before the start, with value 0."""
-
 KEYS = {
     "constant": ("value",),
     "linear": ("value", "rate"),
@@ -67,9 +64,11 @@ def signal(
     return np.full(len(t), get("value"))
 
 
-def _walk(passed, sigma, step, rng):
-    # from a fixed time on, so that one seed gives one walk for any requested times
-    nodes = np.arange(-LEAD, passed[-1] + 3 * step, step)
+def _walk(passed: Times, sigma: float, step: float, rng: np.random.Generator) -> Times:
+    """A random walk that is 0 at the start, the spline through one node in every step."""
+    # From a fixed time on, so that one seed gives one walk for any requested times; a minute before
+    # the start, as tables begin some rows before the image.
+    nodes = np.arange(-60.0, passed[-1] + 3 * step, step)
     steps = sigma * np.sqrt(step) * rng.normal(size=len(nodes))
     spline = CubicSpline(nodes, np.cumsum(steps))
     return spline(passed) - spline(0.0)

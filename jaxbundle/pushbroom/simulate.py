@@ -7,8 +7,7 @@ Without errors only the interpolation error remains.
 """
 
 import dataclasses
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -21,21 +20,17 @@ from jaxbundle.errors import InputError
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import PushbroomImage, make_image
+from jaxbundle.pushbroom.interpolation import TimeTable
 from jaxbundle.pushbroom.locate import locate_lines
-from jaxbundle.pushbroom.noise import Noise, add_errors, draw, sigmas
+from jaxbundle.pushbroom.noise import Errors, Noise, add_errors, draw, sigmas
 from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.pushbroom.trajectory import Trajectory
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
-
-MARGIN = 6
-"""Rows of ancillary data before the first line and after the last."""
-TRUE_RATE = 20.0
-"""Rows per second of the true attitude spline; at least five times the rate of the instrument."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +64,8 @@ class Flight:
 
 def true_image(flight: Flight) -> PushbroomImage:
     """The image with the true trajectory."""
-    rate = max(TRUE_RATE, 5 * flight.attitude_rate)
+    # so dense that its own interpolation is not seen beside that of the instrument's rows
+    rate = max(20.0, 5 * flight.attitude_rate)
     return _image(flight, _position(flight, 2.0, "lagrange"), _attitude(flight, rate, "spline"))
 
 
@@ -85,17 +81,19 @@ def measured_image(flight: Flight) -> PushbroomImage:
     return _measure(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
 
 
-@partial(compile_once, static=())
-def _measure(image, sigma, key):
-    return with_errors_in_rows(image, draw(sigma, key))
-
-
-def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
+def with_errors_in_rows(image: PushbroomImage, errors: Errors) -> PushbroomImage:
     """Like `add_errors`, with bias and drift in the rows of the tables, as written by
     instruments."""
+    # The rows of `add_errors` can hold all of it: bias and drift are linear in time. The difference
+    # is what the interpolation makes of them, which acts on written rows.
     t0 = image.middle_time
 
-    def rows(table, bias, drift, white):
+    def rows(
+        table: TimeTable,
+        bias: Float[AnyArray, "3"],
+        drift: Float[AnyArray, "3"],
+        white: Float[AnyArray, "rows 3"],
+    ) -> Float[AnyArray, "rows 3"]:
         return white + bias + (table.times[:, None] - t0) * drift
 
     zero = jax.tree.map(jnp.zeros_like, errors)
@@ -113,11 +111,14 @@ def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
     )
 
 
+_measure = compile_once(lambda image, sigma, key: with_errors_in_rows(image, draw(sigma, key)), ())
+
+
 def take_image(
     image: PushbroomImage,
     surface: Surface,
     scene: Float[AnyArray, "bands rows columns"],
-    to_scene,
+    to_scene: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     lines: Float[np.ndarray, " lines"],
     resampling: Resampling = "bilinear",
 ) -> Float[np.ndarray, "bands lines pixels"]:
@@ -134,7 +135,7 @@ _ground = compile_once(locate_lines, ())
 _resample = compile_once(resample, 3)
 
 
-def _image(flight, position, attitude):
+def _image(flight: Flight, position: TimeTable, attitude: AttitudeTable) -> PushbroomImage:
     times = LineTimes(jnp.zeros(()), jnp.asarray(float(flight.period)))
     return make_image(
         Trajectory(position, attitude),
@@ -146,15 +147,20 @@ def _image(flight, position, attitude):
     )
 
 
-def _samples(flight, rate):
-    """Times of rows a whole number of steps from the first line."""
-    last = flight.period * (flight.lines - 1)
-    return np.arange(-MARGIN, np.ceil(last * rate) + MARGIN + 1) / rate
+def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
+    """Times of rows a whole number of steps from the first line, six before it and after the last.
+
+    Lagrange's polynomial of degree 7 takes four on either side; two more keep the edges of the
+    image away from the ends of a spline.
+    """
+    last, margin = flight.period * (flight.lines - 1), 6
+    return np.arange(-margin, np.ceil(last * rate) + margin + 1) / rate
 
 
-def _position(flight, rate, method):
+def _position(flight: Flight, rate: float, method: str) -> TimeTable:
     t, track = _samples(flight, rate), dict(flight.track)
     if "start" in track:
+        # a straight line is interpolated exactly
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
         return position_table(
             t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)), method="linear"
@@ -168,18 +174,13 @@ def _position(flight, rate, method):
     return position_table(t, P, V, method=method)
 
 
-def _attitude(flight, rate, method):
-    t = _samples(flight, rate)
-    angles = [
-        _sum_signals(flight.angles.get(name, 0.0), t, k, flight.seed)
-        for k, name in enumerate(("pitch", "roll", "yaw"))
-    ]
+def _attitude(flight: Flight, rate: float, method: str) -> AttitudeTable:
+    """The table of angles, sums of signals, each with random numbers of its own."""
+    t, angles = _samples(flight, rate), []
+    for axis, name in enumerate(("pitch", "roll", "yaw")):
+        parts = flight.angles.get(name, 0.0)
+        parts = parts if isinstance(parts, list | tuple) else [parts]
+        rng = [np.random.default_rng([flight.seed, axis, k]) for k in range(len(parts))]
+        angles.append(sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng)))
     reference = "earth" if "start" in flight.track else "orbit"
     return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)
-
-
-def _sum_signals(description, t, axis, seed):
-    """The sum of one or several signals."""
-    parts = description if isinstance(description, list | tuple) else [description]
-    rng = [np.random.default_rng([seed, axis, k]) for k in range(len(parts))]
-    return sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng))

@@ -105,6 +105,7 @@ def accuracy_table(
         angles = {axis: flight.angles[axis] for axis in axes if axis in flight.angles}
         varied = dataclasses.replace(quiet, angles=angles)
         truth = true_image(varied)
+        # without noise only the interpolation of the samples errs
         for method in FLOORS:
             image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
             errors = ground_errors(image, truth, surface, all_lines, all_pixels)

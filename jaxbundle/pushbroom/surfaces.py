@@ -70,6 +70,6 @@ class Height(Surface):
         return _from_outside(at_height(self.earth, self.level), o, s)
 
 
-def _from_outside(ellipsoid, o, s):
+def _from_outside(ellipsoid: Ellipsoid, o: Vector, s: Scalar) -> Scalar:
     """A ray from below the surface would end on the other side of the Earth."""
     return jnp.where(residual(ellipsoid, o) > 0, s, jnp.nan)

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
@@ -38,9 +38,13 @@ from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Numbers
 
-MARGIN = 1.0
-"""The traverse begins this far above the highest height and ends as far below the lowest, metres;
-more than the 6e-6·h by which an ellipsoid with longer axes leaves the surface of height h."""
+# column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁
+Cell = tuple[AnyArray, AnyArray, tuple[Array, ...]]
+# the coefficients of one coordinate in τ, from the constant upwards
+Parabola = Triple
+Path = tuple[Parabola, Parabola, Parabola]
+# τ, that of the hit (NaN: none), whether the last cell had no heights, whether the traversal ends
+TraversalState = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
 
 
 class Terrain(Surface):
@@ -67,6 +71,7 @@ class Terrain(Surface):
         tau = _first_hit(path, still.heights, self.over_voids)
         s = top + tau * (bottom - top)
         slope = _rate(path, tau, still.heights) / (bottom - top)
+        # Newton's step on the exact coordinates; derivatives go around the traversal
         s = s - _above_ground(s, None, (still, o, d)) / slope
         return implicit_root(_above_ground, solve_dense, s, None, (self, *start))
 
@@ -75,25 +80,30 @@ class Terrain(Surface):
         x, y, h = X if self.earth is None else geodetic(self.earth, X)
         dx = x - self.origin[0]
         if self.earth is not None:
+            # a turn more or less: the grid may cross the date line
             middle = self.step[0] * (self.heights.shape[1] - 1) / 2
             dx = dx - 2 * np.pi * jnp.round((dx - middle) / (2 * np.pi))
         return dx / self.step[0], (y - self.origin[1]) / self.step[1], h
 
-    def _slab(self, o, d):
+    def _slab(self, o: Vector, d: Vector) -> tuple[Scalar, Scalar]:
         """Where the ray enters and leaves the slab of all heights."""
+        # a metre wider: more than the 6e-6·h by which an ellipsoid with longer axes leaves the
+        # surface of height h
+        highest, lowest = self.highest + 1.0, self.lowest - 1.0
         if self.earth is None:
-            top = (self.highest + MARGIN - o[2]) / d[2]
-            bottom = (self.lowest - MARGIN - o[2]) / d[2]
+            top = (highest - o[2]) / d[2]
+            bottom = (lowest - o[2]) / d[2]
             return jnp.maximum(top, 0), jnp.where(bottom > 0, bottom, jnp.nan)
-        top = ray_to_ellipsoid(at_height(self.earth, self.highest + MARGIN), o, d)
-        bottom = ray_to_ellipsoid(at_height(self.earth, self.lowest - MARGIN), o, d)
+        top = ray_to_ellipsoid(at_height(self.earth, highest), o, d)
+        bottom = ray_to_ellipsoid(at_height(self.earth, lowest), o, d)
         # a camera within the slab sees its top only behind the bottom
         return jnp.where(top < bottom, top, 0.0), bottom
 
-    def _path(self, o, d, top, bottom):
+    def _path(self, o: Vector, d: Vector, top: Scalar, bottom: Scalar) -> Path:
         """Coefficients of (x, y, h) as parabolas in τ, from the top (0) to the bottom (1)."""
         ends = [self.grid(along(o, d, top + tau * (bottom - top))) for tau in (0.0, 0.5, 1.0)]
-        return tuple((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
+        x, y, h = ((a, 4 * b - 3 * a - c, 2 * (a + c) - 4 * b) for a, b, c in zip(*ends))
+        return x, y, h
 
 
 def make_terrain(
@@ -116,6 +126,7 @@ def make_terrain(
     if not np.isfinite(heights).any():
         raise InputError("terrain: no valid height; give a model that covers the image")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
+    # infinite heights, as some files mark voids, would pass for terrain
     heights = np.where(np.isfinite(heights), heights, np.nan)
     (x, y), (dx, dy) = origin, step
     return Terrain(
@@ -129,7 +140,7 @@ def make_terrain(
     )
 
 
-def _above_ground(s, _, data):
+def _above_ground(s: Scalar, _: None, data: tuple[Terrain, Vector, Vector]) -> Scalar:
     """The height above the terrain at the distance s along a ray."""
     terrain, o, d = data
     x, y, h = terrain.grid(along(o, d, s))
@@ -142,7 +153,7 @@ def bilinear(heights: Float[AnyArray, "rows columns"], x: Scalar, y: Scalar) -> 
     return _in_cell(cell, x, y)
 
 
-def _cell(heights, x, y):
+def _cell(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) -> Cell:
     """The heights at the corners of the cell that begins at column x, row y; NaN off the grid."""
     rows, columns = heights.shape
     i, j = y.astype(int), x.astype(int)
@@ -152,13 +163,14 @@ def _cell(heights, x, y):
     return x, y, tuple(jnp.where(inside, z, jnp.nan) for z in corners)
 
 
-def _in_cell(cell, x, y):
+def _in_cell(cell: Cell, x: Scalar, y: Scalar) -> Scalar:
+    """The bilinear surface of a cell."""
     x0, y0, (z00, z01, z10, z11) = cell
     u, v = x - x0, y - y0
     return (1 - v) * ((1 - u) * z00 + u * z01) + v * ((1 - u) * z10 + u * z11)
 
 
-def _rate(path, tau, heights):
+def _rate(path: Path, tau: Scalar, heights: Float[AnyArray, "rows columns"]) -> Scalar:
     """∂(h − bilinear)/∂τ."""
     (x, dx), (y, dy), (h, dh) = (value_and_rate(p, tau) for p in path)
     x0, y0, (z00, z01, z10, z11) = _cell(heights, jnp.floor(x), jnp.floor(y))
@@ -168,21 +180,23 @@ def _rate(path, tau, heights):
     return dh - along_x * dx - along_y * dy
 
 
-def _first_hit(path, heights, over_voids):
+def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids: bool) -> Scalar:
     """τ in [0, 1] of the first intersection, cell by cell; NaN if there is none."""
     rows, columns = heights.shape
     px, py, ph = path
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
-    least = 1e-9 / jnp.maximum(speed, 1.0)  # a billionth of a cell: the traversal always advances
+    # A billionth of a cell: at a border, where rounding may leave the ray in the old cell, the
+    # traversal still advances.
+    least = 1e-9 / jnp.maximum(speed, 1.0)
 
-    def border(p, tau):
+    def border(p: Parabola, tau: Scalar) -> Scalar:
         """Where the coordinate reaches the next line of the grid."""
-        at, rate = value_and_rate(p, tau)
-        target = jnp.where(rate > 0, jnp.floor(at) + 1, jnp.ceil(at) - 1)
-        step = (target - at) / jnp.where(rate == 0, 1, rate)
+        x, rate = value_and_rate(p, tau)
+        target = jnp.where(rate > 0, jnp.floor(x) + 1, jnp.ceil(x) - 1)
+        step = (target - x) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
-    def step(state):
+    def step(state: TraversalState) -> TraversalState:
         tau, hit, void, _ = state
         out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
         middle = (tau + out) / 2
@@ -192,6 +206,7 @@ def _first_hit(path, heights, over_voids):
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)
+        # a corner without height makes all of the cell NaN, so that the middle decides
         void = jnp.isnan(f[1])
         found = (part <= 1) & ~under
         done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
@@ -207,28 +222,30 @@ def _first_hit(path, heights, over_voids):
     return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
 
 
-def _leaves(p, x, size):
+def _leaves(p: Parabola, x: Scalar, size: int) -> Bool[Array, ""]:
     """Whether a coordinate is off the grid and does not come back."""
     return jnp.where(p[1] > 0, x > size - 1, x < 0)
 
 
-def _entry(p, size):
+def _entry(p: Parabola, size: int) -> Scalar:
     """τ where a coordinate comes to the grid, 0 if it is there at first, ∞ if it never is."""
     target = jnp.where(p[0] < 0, 0.0, size - 1.0)
     tau = jnp.zeros_like(p[0])
+    # Newton's method; the parabola is nearly straight, and three steps are exact to rounding
     for _ in range(3):
-        at, rate = value_and_rate(p, tau)
-        tau = tau + (target - at) / jnp.where(rate == 0, jnp.nan, rate)
+        x, rate = value_and_rate(p, tau)
+        tau = tau + (target - x) / jnp.where(rate == 0, jnp.nan, rate)
     outside = (p[0] < 0) | (p[0] > size - 1)
     return jnp.where(outside, jnp.where(tau > 0, tau, jnp.inf), 0.0)
 
 
-def _first_root(f0, fm, f1):
+def _first_root(f0: Scalar, fm: Scalar, f1: Scalar) -> Scalar:
     """The first w in [0, 1] where the parabola through (0, f0), (½, fm), (1, f1) is 0; else ∞."""
     a = 2 * (f0 + f1) - 4 * fm
     b = f1 - f0 - a
     discriminant = b * b - 4 * a * f0
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    # of the two forms of a root the one without cancellation (Press et al., 2007, section 5.6)
     q = -(b + jnp.where(b < 0, -root, root)) / 2
     first = q / jnp.where(a == 0, jnp.nan, a)
     second = f0 / jnp.where(q == 0, jnp.nan, q)

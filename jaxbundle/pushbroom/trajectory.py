@@ -33,7 +33,7 @@ from jaxbundle.geometry import (
     rotation_vector_from_quaternion,
 )
 from jaxbundle.pushbroom.interpolation import (
-    Table,
+    TimeTable,
     convert_to_pieces,
     covers,
     fraction,
@@ -44,13 +44,13 @@ from jaxbundle.pushbroom.interpolation import (
 from jaxbundle.types import AnyArray, Scalar
 
 
-class Attitude(eqx.Module):
+class AttitudeTable(eqx.Module):
     """Quaternions or angles against time; `slerp` overrides the method of the table.
 
     `reference`: `"earth"`, R leads to the frame of the positions; `"orbit"`, to the orbital frame.
     """
 
-    table: Table
+    table: TimeTable
     slerp: bool = eqx.field(static=True, default=False)
     reference: Literal["earth", "orbit"] = eqx.field(static=True, default="earth")
 
@@ -58,8 +58,8 @@ class Attitude(eqx.Module):
 class Trajectory(eqx.Module):
     """Positions in metres and attitudes."""
 
-    position: Table
-    attitude: Attitude
+    position: TimeTable
+    attitude: AttitudeTable
 
 
 def position_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
@@ -80,7 +80,7 @@ def rotation_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3 3"]:
     return orbital_frame(position_at(trajectory, t), velocity_at(trajectory, t)) @ R
 
 
-def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
+def attitude_at(attitude: AttitudeTable, t: Scalar) -> Float[Array, "3 3"]:
     """R from the camera frame to the frame the attitudes refer to."""
     table = attitude.table
     if table.values.shape[1] == 3:
@@ -89,17 +89,14 @@ def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
 
 
 def trajectory_in_pieces(trajectory: Trajectory) -> Trajectory:
-    """The same trajectory with its tables in pieces (`interpolation.convert_to_pieces`), whatever
-    their methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
+    """A trajectory with its tables in pieces (`interpolation.convert_to_pieces`), whatever their
+    methods: exact, and of `slerp` to 4e-12 for steps of 60°."""
     position, attitude = trajectory.position, trajectory.attitude
-    turned = (
-        (lambda t: _slerp(attitude.table, t))
-        if attitude.slerp
-        else (lambda t: interpolate(attitude.table, t))
-    )
+    method = _slerp if attitude.slerp else interpolate
+    turned = lambda t: method(attitude.table, t)
     return Trajectory(
         convert_to_pieces(position, lambda t: interpolate(position, t)),
-        Attitude(convert_to_pieces(attitude.table, turned), False, attitude.reference),
+        AttitudeTable(convert_to_pieces(attitude.table, turned), False, attitude.reference),
     )
 
 
@@ -111,12 +108,14 @@ def matrix_from_pitch_roll_yaw(angles: Float[AnyArray, "3"]) -> Float[Array, "3 
 def orbital_frame(P: Float[AnyArray, "3"], V: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The axes right, forward and up at P, of a platform that moves with V, as columns."""
     up = P / jnp.linalg.norm(P)
+    # V is not quite horizontal: right and forward are perpendicular to the vertical
     right = jnp.cross(V, up)
     right = right / jnp.linalg.norm(right)
     return jnp.stack([right, jnp.cross(up, right), up], axis=1)
 
 
-def _slerp(table, t):
+def _slerp(table: TimeTable, t: Scalar) -> Float[Array, "4"]:
+    """qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)); NaN outside the table and in gaps."""
     i = interval(table, t)
     start, end = table.values[i], table.values[i + 1]
     turn = rotation_vector_from_quaternion(quaternion_multiply(quaternion_conjugate(start), end))

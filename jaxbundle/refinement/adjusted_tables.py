@@ -8,14 +8,16 @@ import numpy as np
 from jaxbundle import cameras
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
 from jaxbundle.network.tables import Images, Network, Points
+from jaxbundle.refinement.refining import Refinement
 
 COLUMNS = ("id", "role", "X", "Y", "Z", "sX", "sY", "sZ")
 
 
-def point_rows(result) -> list[dict]:
+def point_rows(result: Refinement) -> list[dict]:
     """Adjusted points of a `Refinement`: id, role, X, Y, Z and σ of them, metres, in `COLUMNS`."""
     found, chosen = result.inspection, result.inspection.declared.rays.points
     axes = result.points.axes[chosen]
+    # the engine's cofactors are along the axes of each point: Σ = σ0²·Aᵀ·Q·A in X, Y, Z
     covariance = found.sigma0**2 * axes.transpose(0, 2, 1) @ found.point_cofactor @ axes
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     names = [(result.points.id[k], result.points.role[k]) for k in chosen]
@@ -25,7 +27,7 @@ def point_rows(result) -> list[dict]:
     ]
 
 
-def adjusted_photographs(result) -> Network | None:
+def adjusted_photographs(result: Refinement) -> Network | None:
     """The network of the photographs of a `Refinement` at its solution; None without any.
 
     Cameras, orientations and points have their adjusted values, without measurements removed by
@@ -48,12 +50,11 @@ def adjusted_photographs(result) -> Network | None:
     kept = np.zeros(len(network.observations), bool)
     for part in declared.parts:
         if not part.of_scanner:
-            kept[part.rows] = found.used[part.set].any(1)
+            # a point whose two coordinates were both removed by snooping is left out
+            kept[part.rows] = found.has_weight[part.set].any(1)
     adjusted = dict(zip(result.point_ids, result.positions))
     points = network.points
-    X = np.array(
-        [adjusted.get(id, given) for id, given in zip(points.id, points.position)]
-    ).reshape(-1, 3)
+    X = np.array([adjusted.get(id, X) for id, X in zip(points.id, points.position)]).reshape(-1, 3)
     roles = tuple("tie" if role == "control" else role for role in points.role)
     held = network.images.sigma == 0
     return network.replace(
@@ -64,7 +65,7 @@ def adjusted_photographs(result) -> Network | None:
         images=Images(
             network.images.id,
             network.images.camera,
-            np.asarray(poses.position) + declared.given.origin,
+            np.asarray(poses.position) + declared.inputs.origin,
             np.asarray(angles(poses.rotation)),
             np.where(held, 0.0, np.nan),
             network.images.source,

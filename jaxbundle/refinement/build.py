@@ -1,9 +1,11 @@
 """The observations and start values of a refinement; unusable input is reported before."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle import cameras
 from jaxbundle.errors import InputError
@@ -13,9 +15,9 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.orientation.intersection import intersection
 from jaxbundle.orientation.status import Status
-from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.refinement.declare import Given, Rays
-from jaxbundle.refinement.spline import FEWEST
+from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.refinement.declare import Rays, RefinementInput
+from jaxbundle.refinement.spline import MIN_INTERVALS
 from jaxbundle.refinement.tables import (
     GroundPoints,
     ScannerImage,
@@ -23,9 +25,7 @@ from jaxbundle.refinement.tables import (
     check_points_table,
 )
 from jaxbundle.system.programs import compile_once
-
-KNOTS = 10
-"""Largest number of jitter knots with a prior per measured point: more only cost time."""
+from jaxbundle.types import AnyArray
 
 
 def choose_rays(
@@ -38,6 +38,7 @@ def choose_rays(
     number = np.bincount(observations.point, minlength=len(points))
     number += np.bincount(frame_point, minlength=len(points))
     role = np.array(points.role, dtype=object)
+    # two equations for three coordinates: such a point would be undetermined
     lone = (role == "tie") & (number == 1)
     warnings = []
     if lone.any():
@@ -54,28 +55,31 @@ def choose_rays(
     if frames is not None and (lost := ~used[row[frames.distances.points]].all(1)).any():
         warnings.append(f"left out {count(lost.sum(), 'distance')} to an excluded point")
 
-    def rays(mask):
+    def rays_to(mask: Bool[np.ndarray, " points"]) -> Rays:
         return Rays(
             np.flatnonzero(mask[observations.point]),
             np.flatnonzero(mask[frame_point]),
             np.flatnonzero(mask),
         )
 
-    return rays(used), rays(check), warnings
+    return rays_to(used), rays_to(check), warnings
 
 
-def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
+def start_points(inputs: RefinementInput, rays: Rays) -> Float[np.ndarray, "points 3"]:
     """Given coordinates, or the intersection of the rays of a tie point."""
-    points, chosen = given.points, rays.points
+    points, chosen = inputs.points, rays.points
     X = points.X[chosen].copy()
     wanted = np.any(np.isnan(X), axis=1)
     if not wanted.any():
         return X
-    centre, direction, point = (np.concatenate(x) for x in zip(*_sights(given, rays)))
+    centre, direction, point = (np.concatenate(x) for x in zip(*_sights(inputs, rays)))
     at = np.searchsorted(chosen, point)
+    # the rays sorted by their points, without those of points whose coordinates are given
     order = np.argsort(at, kind="stable")
     order = order[wanted[at[order]]]
     rows, first, number = np.unique(at[order], return_index=True, return_counts=True)
+    # As many rays for every point as for the one with the most, the last repeated with weight 0:
+    # one batch instead of a loop over points.
     place = np.minimum(np.arange(number.max()), number[:, None] - 1)
     weight = (np.arange(number.max()) < number[:, None]).astype(float)
     mine = order[first[:, None] + place]
@@ -96,10 +100,10 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
 _meet = compile_once(jax.vmap(intersection), ())
 
 
-def _sights(given: Given, rays: Rays):
+def _sights(inputs: RefinementInput, rays: Rays) -> Iterator[tuple[np.ndarray, ...]]:
     """Origins, directions and points of the rays; image by image."""
-    observations, frames = given.observations, given.frames
-    for i, one in enumerate(given.images):
+    observations, frames = inputs.observations, inputs.frames
+    for i, one in enumerate(inputs.images):
         rows = rays.scanner[observations.image[rays.scanner] == i]
         found = _scanner_sights(one.image, jnp.asarray(observations.xy[rows]))
         yield *map(np.asarray, found), observations.point[rows]
@@ -112,19 +116,21 @@ def _sights(given: Given, rays: Rays):
         values = cameras.default_parameters(model) | dict(camera.parameters)
         interior = tuple(values[name] for name in model.parameters)
         M = matrix_from_omega_phi_kappa(jnp.asarray(frames.images.angles[j]))
-        one = lambda xy, m=model, p=interior, M=M: M.T @ jnp.stack(cameras.image_ray(m, p, *xy))
+        ray = lambda xy, m=model, p=interior, M=M: M.T @ jnp.stack(cameras.image_ray(m, p, *xy))
         centre = np.tile(frames.images.position[j], (len(rows), 1))
-        direction = jax.vmap(one)(jnp.asarray(frames.observations.xy[rows]))
-        yield centre, np.asarray(direction), given.frame_point[frames.observations.point[rows]]
+        direction = jax.vmap(ray)(jnp.asarray(frames.observations.xy[rows]))
+        yield centre, np.asarray(direction), inputs.frame_point[frames.observations.point[rows]]
 
 
 @compile_once
-def _scanner_sights(image, places):
-    def one(place):
+def _scanner_sights(
+    image: PushbroomImage, places: Float[AnyArray, "n 2"]
+) -> tuple[Float[AnyArray, "n 3"], Float[Array, "n 3"]]:
+    def sight(place: Float[AnyArray, "2"]) -> tuple[AnyArray, Array]:
         pose = pose_at(image, image.times.time(place[0]))
         return pose.P, jnp.stack(rotate(pose.R, (*image.optics.slopes(place[1]), -1.0)))
 
-    return jax.vmap(one)(places)
+    return jax.vmap(sight)(places)
 
 
 def check_input(
@@ -162,7 +168,9 @@ def _check_knots(one: ScannerImage, measured: int) -> None:
     if not any(one.freedom.jitter):
         return
     span = float(one.image.times.time(float(one.image.lines)) - one.image.times.time(0.0))
-    most = max(measured if free else KNOTS * measured, FEWEST)
+    # Free coefficients need a measured point each. With a prior they are always determined, but ten
+    # for each point already repeat their prior; more only take time.
+    most = max(measured if free else 10 * measured, MIN_INTERVALS)
     knots = span / one.freedom.knot_spacing
     if knots > most + 1:
         raise InputError(

@@ -12,11 +12,15 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.checks import determine
+from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import (
+    Data,
+    Declared,
+    Values,
     fill_places,
     lay_out_data,
     residuals,
@@ -24,13 +28,14 @@ from jaxbundle.leastsquares.indexing.rows import (
 )
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
-from jaxbundle.refinement.inspection import Inspection, Shared
+from jaxbundle.refinement.inspection import RefinementInspection, SharedUnknowns
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class CheckPoints:
+class RefinementCheckPoints:
     """Differences computed − given along the axes of the points, metres, NaN if the height is the
     given one; their σ; the number of rays. `residual` of every ray, not divided by σ, with
     `residual_sigma`, in the order of the rays of the images.
@@ -52,23 +57,25 @@ class CheckPoints:
         return np.where(number > 0, np.sqrt(square.sum(0) / np.maximum(number, 1)), np.nan)
 
 
-def intersect(found: Inspection, rays: Rays) -> CheckPoints:
+def intersect(found: RefinementInspection, rays: Rays) -> RefinementCheckPoints:
     """The check points of these rays, with the refined images."""
-    given, adjusted = found.declared.given, found.solution.values
-    checks = declare(given, rays, given.points.X[rays.points], adjusted)
+    inputs, adjusted = found.declared.inputs, found.solution.values
+    checks = declare(inputs, rays, inputs.points.X[rays.points], adjusted)
     problem, start = checks.problem, checks.problem.data.start
     values, Q = determine(found.solution, problem)
     known, axes = problem.table("point").free > 0, start["point"].axes
     change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
+    # residuals at the given coordinates, not at those that the rays determine
     here = Solution(problem, start)
-    A = _slopes(*here.arguments, found.shared, found.estimate)
+    A = _slopes(*here.arguments, found.shared_unknowns, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations_of(o).number]
+    # A·Q·Aᵀ of every ray
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
-    weight = problem.data.weight
+    weight = problem.data.weight  # 1/σ
     of_rays = lambda by_set: checks.image_by_image([np.asarray(x) for x in by_set])
-    return CheckPoints(
-        tuple(given.points.id[k] for k in rays.points),
+    return RefinementCheckPoints(
+        tuple(inputs.points.id[k] for k in rays.points),
         np.where(known, np.einsum("pki,pi->pk", axes, change), np.nan),
         np.where(known, sigma, np.nan),
         checks.number_of_rays,
@@ -78,14 +85,21 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
 
 
 @compile_once
-def _slopes(declared, plan, values, data, shared: Shared, estimate):
+def _slopes(
+    declared: Declared,
+    plan: Plan,
+    values: Values,
+    data: Data,
+    shared: SharedUnknowns,
+    estimate: Float[AnyArray, " m"],
+) -> dict[str, Float[Array, "n r m"]]:
     """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""
     plan, laid = fill_places(plan, lay_out_data(plan, data))
-    put = lambda wide, x: wide.at[: len(x)].set(x)
+    put = lambda wide, x: wide.at[: len(x)].set(x)  # into tables padded to shared shapes
 
-    def of_shared(estimate):
+    def residuals_after(estimate: Float[AnyArray, " m"]) -> dict[str, Float[Array, "n r"]]:
         now = shared.tables(estimate)
         moved = {t: jax.tree.map(put, values[t], now[t]) if t in now else values[t] for t in values}
         return restore_order(plan, residuals(declared, plan, moved, laid))
 
-    return jax.jacfwd(of_shared)(estimate)
+    return jax.jacfwd(residuals_after)(estimate)

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.pushbroom.image import Offsets, PushbroomImage
-from jaxbundle.pushbroom.scanner import AnglePolynomial, Optics
+from jaxbundle.pushbroom.scanner import AnglePolynomial, Optics, Pair
 from jaxbundle.pushbroom.trajectory import orbital_frame, position_at, velocity_at
 from jaxbundle.refinement.spline import NO_SPLINE, JitterSpline, make_spline
 from jaxbundle.system.programs import compile_once
@@ -39,6 +39,8 @@ from jaxbundle.types import AnyArray, Scalar
 Three = tuple[float, float, float]
 HELD: Three = (0.0, 0.0, 0.0)
 FREE: Three = (math.inf, math.inf, math.inf)
+
+ARCSECONDS_PER_RADIAN = math.degrees(1) * 3600
 
 TURNS = ("pitch", "roll", "yaw")
 TRACK = ("across track", "along track", "up")
@@ -93,27 +95,28 @@ class Sizes(NamedTuple):
     look_along: int
 
 
-LEAST = Sizes(3, 3, 3, 3, 3, 1, 3, 1, 1)
+SMALLEST_SIZES = Sizes(3, 3, 3, 3, 3, 1, 3, 1, 1)
+"""At least one number of each unknown: an array without elements would be another program."""
 
 
 class ChangedOptics(Optics):
     """(ξ, η) of `base` divided by 1 + e, and polynomials added."""
 
     base: Optics
-    relative: Float[AnyArray, ""]
-    added: AnglePolynomial
+    relative_change: Float[AnyArray, ""]
+    polynomials: AnglePolynomial
 
-    def slopes(self, u):
-        return change_slopes(self.base.slopes(u), self.relative, self.added.slopes(u))
+    def slopes(self, u: Scalar) -> Pair:
+        return change_slopes(self.base.slopes(u), self.relative_change, self.polynomials.slopes(u))
 
 
-def change_slopes(slopes, relative, added):
+def change_slopes(slopes: Pair, relative: Scalar, added: Pair) -> Pair:
     """(ξ, η)/(1 + e) and what is added."""
     (xi, eta), (more_xi, more_eta) = slopes, added
     return xi / (1 + relative) + more_xi, eta / (1 + relative) + more_eta
 
 
-class Name(NamedTuple):
+class UnknownName(NamedTuple):
     """One unknown for reports: `owner`, e.g. "image A"; its name; its unit in reports, and the
     factor from the adjustment's unit. `group`: name for grouping in weak directions."""
 
@@ -136,7 +139,7 @@ class Form(eqx.Module):
     sizes: Sizes = eqx.field(static=True)
 
     @property
-    def own(self) -> int:
+    def image_unknowns(self) -> int:
         """The number of the image's own unknowns; those of its sensor follow."""
         return sum(self.sizes) - sum(getattr(self.sizes, name) for name in OF_SENSOR)
 
@@ -155,14 +158,18 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
 @compile_once
 def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
     """F: across, along, up at the middle line."""
-    t, of = image.middle_time, image.trajectory
-    up = jnp.array([0.0, 0.0, 1.0]) if local else position_at(of, t)
-    return orbital_frame(up, velocity_at(of, t))
+    t, trajectory = image.middle_time, image.trajectory
+    # in a local frame the centre of the Earth is nowhere; up is Z
+    up = jnp.array([0.0, 0.0, 1.0]) if local else position_at(trajectory, t)
+    return orbital_frame(up, velocity_at(trajectory, t))
 
 
 def pad_forms(forms: list[Form]) -> list[Form]:
-    """The forms padded to the largest size of each unknown, at least one."""
-    sizes = Sizes(*map(max, zip(LEAST, *(form.sizes for form in forms))))
+    """The forms padded to the largest size of each unknown, at least one.
+
+    All images are then rows of one table; numbers that an image does not have are held.
+    """
+    sizes = Sizes(*map(max, zip(SMALLEST_SIZES, *(form.sizes for form in forms))))
     return [dataclasses.replace(form, sizes=sizes) for form in forms]
 
 
@@ -174,7 +181,7 @@ def change_of(sizes: Sizes, p: Float[AnyArray, " n"]) -> Change:
 
 def change_image(image: PushbroomImage, form: Form, change: Change, t: Scalar) -> PushbroomImage:
     """The image at the time t with its unknowns changed."""
-    jitter = form.spline.at(change.jitter, t)
+    jitter = form.spline.evaluate(change.jitter, t)
     return dataclasses.replace(
         image,
         offsets=change_offsets(image.offsets, form.axes, change, jitter),
@@ -183,7 +190,9 @@ def change_image(image: PushbroomImage, form: Form, change: Change, t: Scalar) -
     )
 
 
-def change_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "3"]) -> Offsets:
+def change_offsets(
+    old: Offsets, axes: Float[AnyArray, "3 3"], change: Change, jitter: Float[AnyArray, "3"]
+) -> Offsets:
     """The offsets with attitude and position changed."""
     return Offsets(
         old.attitude + change.attitude + jitter,
@@ -195,6 +204,7 @@ def change_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "
 
 def change_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
     """The optics with focal length and look angles changed."""
+    # a zero coefficient more: a polynomial must have one
     pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
     middle, half = middle_and_half(image)
     added = AnglePolynomial(
@@ -228,24 +238,28 @@ def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
     )
 
 
-def names(sizes: Sizes, image: str, sensor: str) -> list[Name]:
+def names(sizes: Sizes, image: str, sensor: str) -> list[UnknownName]:
     """The name of every number of an image's vector."""
-    own, of = f"image {image}", f"sensor {sensor}"
-    arcsec = math.degrees(1) * 3600
-    found = [Name(own, f"{x} bias", "arcsec", arcsec, f"{x} bias") for x in TURNS]
-    found += [Name(own, f"{x} drift", "arcsec/s", arcsec, f"{x} drift") for x in TURNS]
-    found += [
-        Name(own, f"{x} jitter {k + 1}", "arcsec", arcsec, f"{x} jitter")
+    image, sensor = f"image {image}", f"sensor {sensor}"
+    arcsec = ARCSECONDS_PER_RADIAN
+    listed = [UnknownName(image, f"{x} bias", "arcsec", arcsec, f"{x} bias") for x in TURNS]
+    listed += [UnknownName(image, f"{x} drift", "arcsec/s", arcsec, f"{x} drift") for x in TURNS]
+    listed += [
+        UnknownName(image, f"{x} jitter {k + 1}", "arcsec", arcsec, f"{x} jitter")
         for x in TURNS
         for k in range(sizes.jitter // 3)
     ]
-    found += [Name(own, f"position {x}", "m", 1.0, f"position {x}") for x in TRACK]
-    found += [Name(own, f"velocity {x}", "m/s", 1.0, f"velocity {x}") for x in TRACK]
-    found += [Name(of, "focal length (relative)", "ppm", 1e6, "focal length")]
-    found += [Name(of, f"mounting {x}", "arcsec", arcsec, f"mounting {x}") for x in TURNS]
+    listed += [UnknownName(image, f"position {x}", "m", 1.0, f"position {x}") for x in TRACK]
+    listed += [UnknownName(image, f"velocity {x}", "m/s", 1.0, f"velocity {x}") for x in TRACK]
+    listed += [UnknownName(sensor, "focal length (relative)", "ppm", 1e6, "focal length")]
+    listed += [
+        UnknownName(sensor, f"mounting {x}", "arcsec", arcsec, f"mounting {x}") for x in TURNS
+    ]
     for word, number in (("across", sizes.look_across), ("along", sizes.look_along)):
-        found += [
-            Name(of, f"look angle {word}, û^{k}", "1e-6", 1e6, f"look angle {word}, û^{k}")
+        listed += [
+            UnknownName(
+                sensor, f"look angle {word}, û^{k}", "1e-6", 1e6, f"look angle {word}, û^{k}"
+            )
             for k in range(number)
         ]
-    return found
+    return listed

@@ -1,6 +1,7 @@
 """The solution of a refinement, and its statistics in the order of its unknowns and rays."""
 
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,32 +11,32 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, with_data
+from jaxbundle.leastsquares.quality.snooping import Removed as EngineRemoved
 from jaxbundle.leastsquares.quality.snooping import snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.refinement.declare import Declared
+from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
-
-ROUNDS, SAME = 10, 1e-9
-"""Largest number of solutions, each with the S of the previous one; tolerance of S."""
+from jaxbundle.types import AnyArray, present
 
 
-class Shared(eqx.Module):
-    """The changes of the shared unknowns, as a function of the tables. `at`: by table,
+class SharedUnknowns(eqx.Module):
+    """The changes of the shared unknowns, as a function of the tables. `places`: by table,
     their numbers, rows and directions; `start`: of these tables."""
 
-    at: dict[str, tuple[np.ndarray, ...]]
+    places: dict[str, tuple[np.ndarray, ...]]
     start: Values
     spaces: tuple[tuple[str, Space], ...] = eqx.field(static=True)
 
     def __call__(self, values: Values) -> Float[Array, " m"]:
-        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.at.values()))
-        for t, (k, row, direction) in self.at.items():
+        """The changes of the shared unknowns from the start to these tables."""
+        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.places.values()))
+        for t, (k, row, direction) in self.places.items():
             change = jax.vmap(spaces[t].difference)(values[t], self.start[t])
             found = found.at[k].set(change[row, direction])
         return found
@@ -43,7 +44,7 @@ class Shared(eqx.Module):
     def tables(self, changes: Float[AnyArray, " m"]) -> Values:
         """The tables after these changes."""
         spaces, moved = dict(self.spaces), {}
-        for t, (k, row, direction) in self.at.items():
+        for t, (k, row, direction) in self.places.items():
             rows = jax.tree.leaves(self.start[t])[0].shape[0]
             change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(changes[k])
             moved[t] = jax.vmap(spaces[t].retract)(self.start[t], change)
@@ -53,15 +54,22 @@ class Shared(eqx.Module):
 _estimate = compile_once(lambda shared, values: shared(values))
 
 
-class Inspection:
+class RefinementInspection:
     """Statistics at a solution of the engine; cofactors are to be multiplied by σ0²."""
 
-    def __init__(self, declared: Declared, solution: Solution, steps: int, removed=()):
+    def __init__(
+        self,
+        declared: DeclaredRefinement,
+        solution: Solution,
+        steps: int,
+        removed: Sequence[EngineRemoved] = (),
+    ):
         self.declared, self.solution, self.steps = declared, solution, steps
-        self.removed = tuple(_name(declared, one) for one in removed)
+        self.removed = tuple(_describe_removed(declared, blunder) for blunder in removed)
 
     @property
     def redundancy(self) -> int:
+        """Observations and priors minus unknowns."""
         return self.solution.problem.counts.redundancy
 
     @property
@@ -70,24 +78,25 @@ class Inspection:
         return self.solution.sigma0 if self.redundancy > 0 else 1.0
 
     @functools.cached_property
-    def shared(self) -> Shared:
+    def shared_unknowns(self) -> SharedUnknowns:
         """The location of the shared unknowns."""
         problem, at = self.declared.problem, {}
         for k, column in enumerate(self.declared.columns):
             at.setdefault(column.table, []).append((k, column.row, column.direction))
+        # columns, as index arrays of the tables
         at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
         start = {t: jax.device_get(problem.data.start[t]) for t in at}
-        return Shared(at, start, problem.declared.named_spaces)
+        return SharedUnknowns(at, start, problem.declared.named_spaces)
 
     @functools.cached_property
     def estimate(self) -> Float[np.ndarray, " m"]:
         """The changes of the shared unknowns."""
-        return np.asarray(_estimate(self.shared, self.solution.values))
+        return np.asarray(_estimate(self.shared_unknowns, self.solution.values))
 
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Cofactors of the shared unknowns."""
-        return self.solution.propagate(self.shared)
+        return self.solution.propagate(self.shared_unknowns)
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
@@ -108,11 +117,12 @@ class Inspection:
     @property
     def positions(self) -> Float[np.ndarray, "points 3"]:
         """Adjusted coordinates of the points."""
-        return np.asarray(self.solution.values["point"].position) + self.declared.given.origin
+        return np.asarray(self.solution.values["point"].position) + self.declared.inputs.origin
 
     @functools.cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
         """v of every set of observations in its unit, including removed ones."""
+        # with the weights before snooping: what a removed observation disagrees by is of interest
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
         found = Solution(with_data(problem, data), self.solution.values).residuals
@@ -120,46 +130,54 @@ class Inspection:
         return {o: v / unit(o) for o, v in found.items()}
 
     @property
-    def used(self) -> dict[str, np.ndarray]:
+    def has_weight(self) -> dict[str, np.ndarray]:
         """Which residuals of every set carry weight."""
         return {o: np.asarray(w) > 0 for o, w in self.solution.problem.data.weight.items()}
 
     def rows(self, o: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """v, r, w of a set of observations, NaN if missing, and the removed ones."""
-        used, found = self.used[o], self.solution.reliability
+        used, found = self.has_weight[o], self.solution.reliability
         tell = lambda x: np.where(used, x[o], np.nan)
         return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
 
 
-def adjust(declared: Declared, snooping: str, significance: float) -> Inspection:
+def adjust(
+    declared: DeclaredRefinement, snooping: str, significance: float
+) -> RefinementInspection:
     """Solve, optionally remove blunders, and inspect the solution.
 
     **Raises:** `NotSolvedError` with the undetermined unknowns."""
     steps = 0
 
-    def again(problem: Problem, values: Values) -> Solution:
+    def adjust_from(problem: Problem, values: Values) -> Solution:
         nonlocal steps
         problem, _ = declared.rescale(problem, values)
-        for _ in range(ROUNDS):
+        # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution: its own derivatives are second
+        # ones of the trajectory, and v needs them nowhere. It is right when it is that of the
+        # solution, within 1e-9 of itself; the second solution starts at the first, and is near it.
+        for _ in range(10):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
             problem, change = declared.rescale(problem, values)
-            if not (change > SAME and converged(minimum.termination)):
+            if not (change > 1e-9 and converged(minimum.termination)):
                 break
         found = Solution(problem, values)
         _require_solved(declared, found, minimum, steps)
         return found
 
-    found, removed = again(declared.problem, declared.problem.data.start), []
+    found, removed = adjust_from(declared.problem, declared.problem.data.start), []
     if snooping != "none":
-        found, removed = snoop(found, again, test=snooping, significance=significance)
-    return Inspection(declared, found, steps, removed)
+        found, removed = snoop(found, adjust_from, test=snooping, significance=significance)
+    return RefinementInspection(declared, found, steps, removed)
 
 
-def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
+def _require_solved(
+    declared: DeclaredRefinement, found: Solution, minimum: Minimum, steps: int
+) -> None:
     settled = bool(converged(minimum.termination))
     if settled and found.determined and found.problem.counts.redundancy >= 0:
         return
+    # A singular system often does not converge either: the cause is reported, not the symptom.
     reasons = [w.sentence for w in weaknesses(declared, found)] if not found.determined else []
     if reasons or settled:
         told = reasons[0] if reasons else "more unknowns than observations"
@@ -174,27 +192,29 @@ def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
     )
 
 
-def _name(declared: Declared, one) -> Removed:
+def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
-    given, chosen = declared.given, declared.rays.points
+    inputs, chosen = declared.inputs, declared.rays.points
     names = [part.set for part in declared.parts]
-    points, set = given.points, declared.problem.observations_of(one.set)
-    if one.set in names:
-        number = names.index(one.set)
+    points, set = inputs.points, declared.problem.observations_of(blunder.set)
+    if blunder.set in names:
+        number = names.index(blunder.set)
         part = declared.parts[number]
+        # the rank of a row, set by set, in the order of the images
         place = np.argsort(np.argsort(declared.image, kind="stable"))
         before = sum(len(p.rows) for p in declared.parts[:number])
         told = [
-            f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
-            for r in one.rows
+            f"point {points.id[chosen[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
+            for r in blunder.rows
         ]
+        # observations of a point that cannot be told apart were removed together
         name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
-        rows = [int(place[before + r]) for r in one.rows]
-        return Removed("image", rows[0], name, one.test, tuple(rows[1:]))
+        rows = [int(place[before + r]) for r in blunder.rows]
+        return Removed("image", rows[0], name, blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
-        p = declared.control[one.row]
-        name = f"{points.axis_names[one.residual]} of control point {points.id[chosen[p]]}"
-        return Removed("control", 3 * int(p) + one.residual, name, one.test)
-    a, b = (points.id[chosen[r[one.row]]] for r in set.rows)
-    return Removed("distance", one.row, f"distance {a}–{b}", one.test)
+        p, axis = int(declared.control[blunder.row]), present(blunder.residual)
+        name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"
+        return Removed("control", 3 * p + axis, name, blunder.test)
+    a, b = (points.id[chosen[r[blunder.row]]] for r in set.rows)
+    return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)

@@ -20,7 +20,7 @@ with X̃ the apparent position of X with corrections. In lines and pixels,
 the first Newton step from the measured position to the projected point: computed − observed up to
 terms of v². S is evaluated at the start values and again at the solution, and held while the
 equations are solved. The required trajectory and optics refer to the measured line and pixel: they
-are computed once and stored with the measurement (`Line`).
+are computed once and stored with the measurement (`MeasuredLine`).
 
 **Points.** X = X₀ + Aᵀ·δ with the axes A of the point (rows: east, north, up; or X, Y, Z), along
 each of which it may be held, controlled with σ, or free.
@@ -37,9 +37,9 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import round_up
-from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.leastsquares.spaces import Change, Vector
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, move_pose, recorded_pose
+from jaxbundle.pushbroom.image import LinePose, Offsets, PushbroomImage, move_pose, recorded_pose
 from jaxbundle.pushbroom.project import misclosure_of
 from jaxbundle.refinement.freedom import (
     Form,
@@ -60,50 +60,55 @@ class Placed(NamedTuple):
     axes: Float[AnyArray, "*rows 3 3"]
 
 
+# X and the axes as scalars (`leastsquares.spaces`)
+PlacedBlock = tuple[tuple[Scalar, ...], tuple[tuple[Scalar, ...], ...]]
+
+
 @dataclasses.dataclass(frozen=True)
 class AlongAxes:
     """The space of `Placed`: a change is one along the axes, which are orthonormal."""
 
     width = 3
 
-    def prepare(self, value):
+    def prepare(self, value: Placed) -> PlacedBlock:
         return tuple(value.position), tuple(map(tuple, value.axes))
 
-    def move(self, block, change):
+    def move(self, block: PlacedBlock, change: Change) -> tuple[Scalar, ...]:
         X, axes = block
         steps = [tuple(d * x for x in axis) for d, axis in zip(change, axes)]
         return tuple(sum(parts) for parts in zip(X, *steps))
 
-    def retract(self, value, change):
+    def retract(self, value: Placed, change: Float[AnyArray, "3"]) -> Placed:
         return value._replace(position=value.position + change @ value.axes)
 
-    def difference(self, value, origin):
-        return origin.axes @ (value.position - origin.position)
+    # the axes of the origin: `retract` moves along them, and they do not change
+    def difference(self, value: Placed, origin: Placed) -> Float[Array, "3"]:
+        return jnp.matmul(origin.axes, value.position - origin.position)
 
-    def hold(self, value, given, free):
+    def hold(self, value: Placed, given: Placed, free: Float[AnyArray, "3"]) -> Placed:
         return self.retract(given, free * self.difference(value, given))
 
-    def chart(self, value):
+    def chart(self, value: Placed) -> None:  # noqa: ARG002
         return None
 
 
 @dataclasses.dataclass(frozen=True)
-class Row(Vector):
+class VectorRow(Vector):
     """Many numbers that add, as one array: one operation instead of many scalars."""
 
-    def prepare(self, value):
+    def prepare(self, value: Float[AnyArray, " k"]) -> Float[AnyArray, " k"]:
         return value
 
-    def move(self, block, change):
+    def move(self, block: Float[Array, " k"], change: Change) -> Float[Array, " k"]:
         return block.at[jnp.array(self.moving)].add(jnp.stack(change)) if change else block
 
 
-class Line(NamedTuple):
+class MeasuredLine(NamedTuple):
     """What belongs to a measured line and pixel: the pose that the tables give, seconds from the
     middle line, offsets, mounting and axes F of the image; the coefficient of every unknown of the
     spline in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
 
-    pose: Pose
+    pose: LinePose
     dt: Scalar
     offsets: Offsets
     mounting: Float[AnyArray, "*n 3"]
@@ -123,27 +128,46 @@ class ScannerPoint:
     earth: Ellipsoid | None
     sizes: Sizes
 
-    def __call__(self, own, sensor, X, line: Line):
+    def __call__(
+        self,
+        own: Float[AnyArray, " p"],
+        sensor: Float[AnyArray, " q"],
+        X: Float[AnyArray, "3"],
+        line: MeasuredLine,
+    ) -> Float[AnyArray, "2"]:
+        """v = S·g, in lines and pixels."""
         return line.scale @ self.misclosure(own, sensor, X, line)
 
-    def misclosure(self, own, sensor, X, line: Line) -> Float[Array, "2"]:
+    def misclosure(
+        self,
+        own: Float[AnyArray, " p"],
+        sensor: Float[AnyArray, " q"],
+        X: Float[AnyArray, "3"],
+        line: MeasuredLine,
+    ) -> Float[Array, "2"]:
         """g: the slopes of the point minus those of the pixel."""
         change = change_of(self.sizes, jnp.concatenate([own, sensor]))
         jitter = change.jitter @ line.jitter
         offsets = change_offsets(line.offsets, line.axes, change, jitter)
         pose = move_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
         added = line.across @ change.look_across, line.along @ change.look_along
-        slopes = change_slopes(line.slopes, change.focal_length, added)
+        xi, eta = line.slopes
+        slopes = change_slopes((xi, eta), change.focal_length, added)
         return misclosure_of(pose, slopes, X, self.corrections, self.earth)
 
 
-def line_of(image: PushbroomImage, form: Form, origin, place: Float[AnyArray, "2"]) -> Line:
+def line_of(
+    image: PushbroomImage,
+    form: Form,
+    origin: Float[AnyArray, "3"],
+    place: Float[AnyArray, "2"],
+) -> MeasuredLine:
     """What belongs to a measured (line, pixel), in coordinates relative to an origin; without S."""
     t = image.times.time(place[0])
     pose, (middle, half) = recorded_pose(image, t), middle_and_half(image)
     weights = form.spline.weights(t)
     powers = lambda n: jnp.array([((place[1] - middle) / half) ** k for k in range(n)])
-    return Line(
+    return MeasuredLine(
         pose._replace(P=pose.P - origin),
         t - image.middle_time,
         image.offsets,
@@ -158,37 +182,59 @@ def line_of(image: PushbroomImage, form: Form, origin, place: Float[AnyArray, "2
 
 
 def lines_of(
-    kind: ScannerPoint, image: PushbroomImage, form: Form, origin, own, sensor, X, places
-) -> tuple[Line, Float[np.ndarray, "n 2"]]:
+    kind: ScannerPoint,
+    image: PushbroomImage,
+    form: Form,
+    origin: Float[AnyArray, "3"],
+    own: Float[AnyArray, " p"],
+    sensor: Float[AnyArray, " q"],
+    X: Float[AnyArray, "n 3"],
+    places: Float[AnyArray, "n 2"],
+) -> tuple[MeasuredLine, Float[np.ndarray, "n 2"]]:
     """What belongs to the measured places of points X [n, 3] of an image, S where its corrections
     are `own` and `sensor`; and v."""
     n = len(places)
-    wide = np.minimum(np.arange(round_up(n)), n - 1)
-    given = np.asarray(X)[wide], np.asarray(places)[wide]
-    found = _lines_of(kind, image, form, origin, own, sensor, *given)
+    # padded by the last one: images with similar numbers of points share a program
+    padded = np.minimum(np.arange(round_up(n)), n - 1)
+    at_places = np.asarray(X)[padded], np.asarray(places)[padded]
+    found = _lines_of(kind, image, form, origin, own, sensor, *at_places)
     return jax.tree.map(lambda x: np.asarray(x)[:n], found)
 
 
 @compile_once
-def _lines_of(kind, image, form, origin, own, sensor, X, places):
-    def one(X, place):
-        def misclosure(place):
+def _lines_of(
+    kind: ScannerPoint,
+    image: PushbroomImage,
+    form: Form,
+    origin: Float[AnyArray, "3"],
+    own: Float[AnyArray, " p"],
+    sensor: Float[AnyArray, " q"],
+    X: Float[AnyArray, "n 3"],
+    places: Float[AnyArray, "n 2"],
+) -> tuple[MeasuredLine, Float[AnyArray, "n 2"]]:
+    def line_and_residual(
+        X: Float[AnyArray, "3"], place: Float[AnyArray, "2"]
+    ) -> tuple[MeasuredLine, Float[AnyArray, "2"]]:
+        def misclosure(place: Float[Array, "2"]) -> tuple[Array, tuple[Array, MeasuredLine]]:
             line = line_of(image, form, origin, place)
             g = kind.misclosure(own, sensor, X, line)
+            # ∂g/∂(l, u) needs the trajectory's own derivative by time; g and the line come with it
             return g, (g, line)
 
         slope, (g, line) = jax.jacfwd(misclosure, has_aux=True)(place)
         line = line._replace(scale=-jnp.linalg.inv(slope))
         return line, line.scale @ g
 
-    return jax.vmap(one)(X, places)
+    return jax.vmap(line_and_residual)(X, places)
 
 
-def _along_axes(X, given: Placed):
+# Kinds are compared by their functions, as keys of compiled programs: a lambda in `control` or
+# `priors` would be another one, and compiled again, for every refinement.
+def _along_axes(X: Float[AnyArray, "3"], given: Placed) -> Float[AnyArray, "3"]:
     return given.axes @ (X - given.position)
 
 
-def _itself(correction, _):
+def _itself(correction: Float[AnyArray, " k"], _: None) -> Float[AnyArray, " k"]:
     return correction
 
 

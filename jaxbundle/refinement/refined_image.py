@@ -2,15 +2,16 @@
 
 Positions are changed at the rows of their table, which is exact for changes linear in time. The
 attitude, R(t)·exp([a + ȧ·(t − t₀) + s(t)]×), becomes a table of quaternions for slerp: the rows of
-the old table and the knots of the spline, halved until slerp follows within `TOLERANCE`.
+the old table and the knots of the spline, halved until slerp follows within 1e-9.
 """
 
 import dataclasses
-from functools import partial
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
@@ -20,26 +21,17 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.pushbroom.ancillary import attitude_table
 from jaxbundle.pushbroom.image import PushbroomImage, no_offsets
-from jaxbundle.pushbroom.interpolation import Table, span
+from jaxbundle.pushbroom.interpolation import TimeTable, span
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
-from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory, attitude_at
 from jaxbundle.refinement.freedom import Change, Form, change_image, change_optics
 from jaxbundle.system.programs import compile_once
-
-TOLERANCE = 1e-9
-"""Radians: a millimetre from 1000 km."""
-MARGIN = 2
-"""Rows of the old table kept before the first line and after the last."""
-FEWEST = 2048
-"""Rows that are computed at a time, at least."""
-LONGEST_TABLE = 200_000
-"""Largest length of a table."""
-SLOPE_TOLERANCE = 1e-12
-"""Tolerance of slopes for equal optics."""
+from jaxbundle.types import AnyArray, Scalar
 
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
     """An image without offsets that equals `image` with its changes."""
+    # without the jitter, which has no middle: the attitude is computed time by time below
     moved = change_image(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)),
@@ -53,7 +45,7 @@ def refined_image(image: PushbroomImage, form: Form, change: Change) -> Pushbroo
     )
 
 
-def _position(moved: PushbroomImage) -> Table:
+def _position(moved: PushbroomImage) -> TimeTable:
     table, offsets = moved.trajectory.position, moved.offsets
     dt = (table.times - moved.middle_time)[:, None]
     values = table.values + offsets.position + dt * offsets.position_rate
@@ -62,24 +54,27 @@ def _position(moved: PushbroomImage) -> Table:
 
 
 @compile_once
-def _rotations(image, form, change, times):
+def _rotations(
+    image: PushbroomImage, form: Form, change: Change, times: Float[AnyArray, " n"]
+) -> Float[Array, "n 3 3"]:
     """R of the platform in the frame of the attitude table, changed, at many times."""
 
-    def at(t):
+    def rotation(t: Scalar) -> Float[Array, "3 3"]:
         offsets = image.offsets
-        turn = offsets.attitude + change.attitude + form.spline.at(change.jitter, t)
+        turn = offsets.attitude + change.attitude + form.spline.evaluate(change.jitter, t)
         turn += (t - image.middle_time) * (offsets.attitude_rate + change.attitude_rate)
         return attitude_at(image.trajectory.attitude, t) @ matrix_from_rotation_vector(turn)
 
-    return jax.vmap(at)(times)
+    return jax.vmap(rotation)(times)
 
 
-def _attitude(image, form, change) -> Attitude:
+def _attitude(image: PushbroomImage, form: Form, change: Change) -> AttitudeTable:
     old = image.trajectory.attitude
     rows = np.asarray(old.table.times)
     first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    start = max(np.searchsorted(rows, first, side="right") - 1 - MARGIN, 0)
-    end = min(np.searchsorted(rows, last) + MARGIN, len(rows) - 1)
+    # two rows more than the image needs, so that readers may interpolate otherwise
+    start = max(np.searchsorted(rows, first, side="right") - 1 - 2, 0)
+    end = min(np.searchsorted(rows, last) + 2, len(rows) - 1)
     covered = np.clip([first, last], *span(old.table))
     # an extrapolated end becomes a row
     times = np.union1d(rows[start : end + 1], covered[(covered < rows[0]) | (covered > rows[-1])])
@@ -94,7 +89,10 @@ def _attitude(image, form, change) -> Attitude:
         there = R(middle)
         turn = _turns(rotations[left], rotations[left + 1])
         half = rotations[left] @ _pad(_exponentials, turn / 2)
-        wrong = np.linalg.norm(_turns(half, there), axis=1) > TOLERANCE
+        # 1e-9 rad is a millimetre from 1000 km. The error of slerp is largest in the middle; each
+        # halving leaves a quarter of it.
+        wrong = np.linalg.norm(_turns(half, there), axis=1) > 1e-9
+        # a gap has no values to be followed
         wrong &= ~np.isin(times[left + 1], gaps)
         # both halves of a split interval are checked again
         order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
@@ -103,72 +101,71 @@ def _attitude(image, form, change) -> Attitude:
         pending = np.repeat(split, 1 + split)
         times = np.r_[times, middle[wrong]][order]
         rotations = np.concatenate([rotations, there[wrong]])[order]
-        if len(times) > LONGEST_TABLE:
+        if len(times) > 200_000:  # 20 MB of text: noise, not an attitude
             raise InputError(
-                f"attitude: more than {LONGEST_TABLE} rows would be needed to write it; the "
+                "attitude: more than 200000 rows would be needed to write it; the "
                 "table is too rough between its rows"
             )
     quaternions = _pad(_quaternions, rotations)
+    # 1 % more than the longest step, or times rounded in a file would make a gap of it
     longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
     return attitude_table(
         times, quaternions, method="slerp", reference=old.reference, gap=1.01 * longest
     )
 
 
-def _turns(a, b):
+def _turns(
+    a: Float[np.ndarray, "n 3 3"], b: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Rotation vectors from matrices a to b."""
     return _pad(_logarithms, a.transpose(0, 2, 1) @ b)
 
 
-@partial(compile_once, static=())
-def _logarithms(R):
-    return jax.vmap(rotation_vector_from_matrix)(R)
+_logarithms = compile_once(jax.vmap(rotation_vector_from_matrix), ())
+_exponentials = compile_once(jax.vmap(matrix_from_rotation_vector), ())
+_quaternions = compile_once(jax.vmap(quaternion_from_matrix), ())
 
 
-@partial(compile_once, static=())
-def _exponentials(turns):
-    return jax.vmap(matrix_from_rotation_vector)(turns)
-
-
-@partial(compile_once, static=())
-def _quaternions(R):
-    return jax.vmap(quaternion_from_matrix)(R)
-
-
-def _pad(function, rows):
-    """The function of rows padded to few shapes, to compile little."""
+def _pad(
+    function: Callable[[np.ndarray], AnyArray], rows: Float[np.ndarray, "n ..."]
+) -> Float[np.ndarray, "n ..."]:
+    """The function of rows padded to few shapes, to compile little: 2048 rows, which take no time,
+    or that times a power of 2."""
     n = len(rows)
-    size = FEWEST << max(int(np.ceil(np.log2(n / FEWEST))), 0)
+    size = 2048 << max(int(np.ceil(np.log2(n / 2048))), 0)
     return np.asarray(function(np.asarray(rows)[np.minimum(np.arange(size), n - 1)]))[:n]
 
 
-def _optics(image, change) -> Optics:
+def _optics(image: PushbroomImage, change: Change) -> Optics:
     """Optics of the same kind if possible, else a table of angles."""
     wanted = change_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters
+        # a longer principal distance is the same only without distortion
         candidate = dataclasses.replace(base, parameters=jnp.asarray(parameters).at[0].mul(1 + e))
     elif isinstance(base, AnglePolynomial):
-        candidate = _sum(base, e, wanted.added)
+        candidate = _sum(base, e, wanted.polynomials)
     else:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
     target = _slopes(wanted, u)
-    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SLOPE_TOLERANCE:
+    # the same up to rounding: a nanometre in a kilometre
+    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= 1e-12:
         return candidate
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
 
 
 @compile_once
-def _slopes(optics, u):
+def _slopes(optics: Optics, u: Float[AnyArray, " pixels"]) -> Float[Array, "2 pixels"]:
     return jnp.stack(jax.vmap(optics.slopes)(u))
 
 
-def _sum(base, e, added):
+def _sum(base: AnglePolynomial, e: Scalar, added: AnglePolynomial) -> AnglePolynomial:
     """base/(1 + e) + added as one polynomial about the middle of `base`."""
     total = []
     for own, more in ((base.across, added.across), (base.along, added.along)):
+        # û of `added` as a polynomial of û of `base`, (û·half + middle − middle′)/half′
         line = np.array([float(base.middle - added.middle), float(base.half)]) / float(added.half)
         moved = np.polynomial.Polynomial(np.asarray(more))(np.polynomial.Polynomial(line)).coef
         total.append(

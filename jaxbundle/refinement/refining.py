@@ -16,10 +16,10 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import STATED, Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
-from jaxbundle.refinement.check_points import CheckPoints, intersect
+from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
 from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
-from jaxbundle.refinement.freedom import Name, change_of
-from jaxbundle.refinement.inspection import Inspection, adjust
+from jaxbundle.refinement.freedom import UnknownName, change_of
+from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
@@ -36,24 +36,24 @@ UNIT_OF_WEIGHT = "1 line or pixel"
 class Refinement:
     """The result: `inspection` holds its numbers."""
 
-    inspection: Inspection
-    check: CheckPoints | None
+    inspection: RefinementInspection
+    check: RefinementCheckPoints | None
     warnings: tuple[str, ...]
 
     @property
     def images(self) -> list[ScannerImage]:
         """The given scanner images."""
-        return self.inspection.declared.given.images
+        return self.inspection.declared.inputs.images
 
     @property
     def frames(self) -> Network | None:
         """The given photographs."""
-        return self.inspection.declared.given.frames
+        return self.inspection.declared.inputs.frames
 
     @property
     def points(self) -> GroundPoints:
         """All given points, including those of the photographs."""
-        return self.inspection.declared.given.points
+        return self.inspection.declared.inputs.points
 
     @property
     def point_ids(self) -> list[str]:
@@ -61,7 +61,7 @@ class Refinement:
         return [self.points.id[k] for k in self.inspection.declared.rays.points]
 
     @property
-    def names(self) -> list[Name]:
+    def names(self) -> list[UnknownName]:
         """Names of the unknowns shared by points."""
         return [column.name for column in self.inspection.declared.columns]
 
@@ -88,8 +88,10 @@ class Refinement:
     def global_test(self) -> dict:
         """χ² test of vᵀPv (`statistics.global_test`); `passed` is None where nobody stated σ of
         line and pixel, or of the image coordinates of photographs."""
-        given, r = self.inspection.declared.given, self.redundancy
-        sets = [given.observations, *([] if given.frames is None else [given.frames.observations])]
+        inputs, r = self.inspection.declared.inputs, self.redundancy
+        frames = [] if inputs.frames is None else [inputs.frames.observations]
+        sets = [inputs.observations, *frames]
+        # one set of unstated σ makes vᵀPv a number without scale
         origin = next((one.sigma_origin for one in sets if one.sigma_origin != STATED), STATED)
         return chi_squared_test(r * self.sigma0**2, r, origin)
 
@@ -118,16 +120,16 @@ class Refinement:
         at = {one.id: k for k, one in enumerate(self.images)}
         if id not in at:
             raise InputError(f"no scanner image {id!r}; there are {', '.join(at)}")
-        k, given = at[id], self.inspection.declared.given
-        values, form = self.inspection.solution.values, given.forms[k]
-        p = np.concatenate([values[IMAGE][k], values[SENSOR][given.sensor[k]]])
+        k, inputs = at[id], self.inspection.declared.inputs
+        values, form = self.inspection.solution.values, inputs.forms[k]
+        p = np.concatenate([values[IMAGE][k], values[SENSOR][inputs.sensor[k]]])
         return refined_image(self.images[k].image, form, change_of(form.sizes, p))
 
     def image_points(self) -> list[dict]:
         """One row per image point used, image by image: ids, v, r and w of both
         coordinates, whether it was removed."""
         declared, points = self.inspection.declared, self.point_ids
-        images = declared.given.ids
+        images = declared.inputs.ids
         rows = [
             {"image": images[i], "point": points[p], "v": v, "r": r, "w": w, "removed": bool(gone)}
             for part in declared.parts
@@ -139,8 +141,8 @@ class Refinement:
         """One row per distance used: ids of both points, v, r, w, whether it was
         removed."""
         found, rows = self.inspection, []
-        for given in found.declared.problem.observations:
-            if given.kind.name == "distances":
+        for distances in found.declared.problem.observations:
+            if distances.kind.name == "distances":
                 rows += [
                     {
                         "from": self.point_ids[a],
@@ -150,7 +152,7 @@ class Refinement:
                         "w": float(w[0]),
                         "removed": bool(gone),
                     }
-                    for a, b, v, r, w, gone in zip(*given.rows, *found.rows(given.name))
+                    for a, b, v, r, w, gone in zip(*distances.rows, *found.rows(distances.name))
                 ]
         return rows
 
@@ -185,8 +187,8 @@ def refine(
     check_input(images, points, observations, frames)
     points = _checks_upright(points, images[0].earth)
     rays, check_rays, warnings = choose_rays(points, observations, frames)
-    given = gather(images, points, observations, frames)
-    found = adjust(declare(given, rays, start_points(given, rays)), snooping, significance)
+    inputs = gather(images, points, observations, frames)
+    found = adjust(declare(inputs, rays, start_points(inputs, rays)), snooping, significance)
     for weak in weaknesses(found.declared, found.solution):
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(found, check_rays) if len(check_rays.points) else None
@@ -197,6 +199,7 @@ def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoin
     """The axes of check points as east, north, up, for points at a given height."""
     if earth is None or earth.a != earth.b:
         return points
+    # one ray at a given height leaves two unknowns, which must be along the surface of that height
     axes = points.axes.copy()
     for k, role in enumerate(points.role):
         if role == "check":

@@ -1,15 +1,13 @@
 """The report of a refinement as text and as a document for JSON."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement
 from jaxbundle.statistics.global_test import describe_test
-
-LISTED_CORRELATION = 0.9
-"""Correlations above this are listed."""
-MOST_LISTED = 12
-"""Largest number of listed correlations and worst image points."""
+from jaxbundle.types import present
 
 
 def to_json(result: Refinement) -> dict:
@@ -41,7 +39,18 @@ def to_json(result: Refinement) -> dict:
             )
         ],
         "correlation": result.correlation.tolist(),
-        "points": _points(result),
+        "points": [
+            {
+                "id": result.points.id[k],
+                "role": result.points.role[k],
+                "X": X,
+                "sigma": s,
+                "axes": list(result.points.axis_names),
+            }
+            for k, X, s in zip(
+                found.declared.rays.points, result.positions.tolist(), found.point_sigma.tolist()
+            )
+        ],
         "image_points": [
             {**row, "v": row["v"].tolist(), "r": row["r"].tolist(), "w": row["w"].tolist()}
             for row in result.image_points()
@@ -60,24 +69,15 @@ def to_json(result: Refinement) -> dict:
     return document
 
 
-def _points(result):
-    rows, sigma = [], result.inspection.point_sigma.tolist()
-    for k, X, s in zip(result.inspection.declared.rays.points, result.positions.tolist(), sigma):
-        rows.append(
-            {
-                "id": result.points.id[k],
-                "role": result.points.role[k],
-                "X": X,
-                "sigma": s,
-                "axes": list(result.points.axis_names),
-            }
-        )
-    return rows
-
-
-def report(result: Refinement, verdict: str = "") -> str:
+def report(
+    result: Refinement, verdict: str = "", *, min_correlation: float = 0.9, most: int = 12
+) -> str:
     """The report: the `verdict` if given, input, warnings, unknowns, correlations, blunders,
-    checks."""
+    checks.
+
+    Correlations above `min_correlation` (the σ of one unknown is 1/√(1 − 0.9²) = 2.3 times what it
+    would be with the other known) and image points are listed, the `most` largest.
+    """
     found = result.inspection
     rows = result.image_points()
     used = [row for row in rows if not row["removed"]]
@@ -94,19 +94,23 @@ def report(result: Refinement, verdict: str = "") -> str:
         f"{found.steps} steps",
         f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
     ]
-    for one in [*(image.id for image in result.images), *_photographs(result)]:
-        v = np.array([row["v"] for row in used if row["image"] == one])
+    scanner_ids = [image.id for image in result.images]
+    for id in result.inspection.declared.inputs.ids:
+        v = np.array([row["v"] for row in used if row["image"] == id])
         if len(v):
-            unit = "lines, pixels" if one in {i.id for i in result.images} else "camera's unit"
+            unit = "lines, pixels" if id in scanner_ids else "camera's unit"
             rms = np.sqrt((v**2).mean(0))
-            lines.append(f"RMS of image {one}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
+            lines.append(f"RMS of image {id}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
     if result.warnings:
         lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
     lines += ["", "Unknowns", *_unknowns(result)]
-    strong = _correlations(result)
-    if strong:
-        lines += ["", f"Correlations above {LISTED_CORRELATION:g}", *strong]
-    lines += ["", "Image points with the largest tests", *_tests(used)]
+    C, names = result.correlation, result.names
+    i, j = np.nonzero(np.triu(np.abs(C) > min_correlation, 1))
+    if len(i):
+        lines += ["", f"Correlations above {min_correlation:g}"]
+        order = np.argsort(-np.abs(C[i, j]), kind="stable")[:most]
+        lines += [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
+    lines += ["", "Image points with the largest tests", *_tests(used, most)]
     if result.removed:
         lines += ["", "Removed as blunders"]
         lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]
@@ -115,11 +119,7 @@ def report(result: Refinement, verdict: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _photographs(result):
-    return () if result.frames is None else result.frames.images.id
-
-
-def _unknowns(result):
+def _unknowns(result: Refinement) -> Iterator[str]:
     sigma = result.inspection.sigma
     yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
     for name, value, s, p in zip(result.names, result.estimate, sigma, result.prior_sigma):
@@ -130,17 +130,10 @@ def _unknowns(result):
         )
 
 
-def _correlations(result):
-    C, names = result.correlation, result.names
-    i, j = np.nonzero(np.triu(np.abs(C) > LISTED_CORRELATION, 1))
-    order = np.argsort(-np.abs(C[i, j]), kind="stable")[:MOST_LISTED]
-    return [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
-
-
-def _tests(rows):
+def _tests(rows: list[dict], most: int) -> Iterator[str]:
     worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
     yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
-    for row in sorted(rows, key=worst, reverse=True)[:MOST_LISTED]:
+    for row in sorted(rows, key=worst, reverse=True)[:most]:
         pair = lambda values, form: " ".join(
             format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
         )
@@ -151,8 +144,8 @@ def _tests(rows):
         )
 
 
-def _checks(result):
-    c = result.check
+def _checks(result: Refinement) -> Iterator[str]:
+    c = present(result.check)
     earth = result.images[0].earth is not None
     names = ("east", "north", "up") if earth else ("X", "Y", "Z")
     yield f"Check points, computed − given ({', '.join(names)}; m)"

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 
 from jaxbundle.types import AnyArray, Scalar
 
-FEWEST = 3
-"""Minimum number of intervals between knots: with fewer only constant and line remain."""
+MIN_INTERVALS = 3
+"""Smallest number of intervals between knots. Three have six coefficients, less two for constant
+and line; one or two are little more than a single cubic polynomial. Not critical."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +49,11 @@ class JitterSpline:
     def basis(self) -> Float[np.ndarray, "coefficients unknowns"]:
         """Z."""
         k = np.arange(self.coefficients)
+        # the columns of Q behind those that span constant and line
         full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
         return full[:, 2:]
 
-    def at(self, z: Float[AnyArray, "3 k"], t: Scalar) -> Float[Array, "3"]:
+    def evaluate(self, z: Float[AnyArray, "3 k"], t: Scalar) -> Float[Array, "3"]:
         """s(t) of three axes; z may have more columns than there are unknowns."""
         return jnp.asarray(z)[:, : self.unknowns] @ self.weights(t)
 
@@ -60,6 +62,7 @@ class JitterSpline:
         if not self.intervals:
             return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)
+        # All coefficients, as b is 0 beyond 2: they are few, and no index depends on the time.
         near = 2 / 3 - x**2 + x**3 / 2
         far = jnp.maximum(2 - x, 0.0) ** 3 / 6
         return jnp.asarray(self.basis.T) @ jnp.where(x < 1, near, far)
@@ -67,7 +70,8 @@ class JitterSpline:
 
 def make_spline(first: float, last: float, spacing: float) -> JitterSpline:
     """The spline over a span of time with knots at most `spacing` seconds apart."""
-    intervals = max(int(np.ceil((last - first) / spacing - 1e-9)), FEWEST)
+    # less 1e-9, or rounding would make four intervals of three
+    intervals = max(int(np.ceil((last - first) / spacing - 1e-9)), MIN_INTERVALS)
     return JitterSpline(float(first), float((last - first) / intervals), intervals)
 
 

@@ -1,6 +1,7 @@
 """The input of a refinement: scanner images, ground points, measurements."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,10 +53,10 @@ class GroundPoints:
 
 
 def local_points(
-    id,
-    role,
-    X,
-    sigma=None,
+    id: Sequence[str],
+    role: Sequence[str],
+    X: Float[np.ndarray, "points 3"],
+    sigma: float | Float[np.ndarray, "#points 3"] | None = None,
     source: Source = Source("points"),  # noqa: B008
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
@@ -72,6 +73,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
     theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
     X = points.X.copy()
     for k, id in enumerate(theirs.id):
+        # coordinates of a network may be approximate: they only fill gaps
         if id in known and np.isnan(X[known[id]]).any():
             X[known[id]] = theirs.position[k]
     new = [k for k, id in enumerate(theirs.id) if id not in known]
@@ -118,6 +120,7 @@ def check_observations(
         where = f"{observations.source(row)}: point {points.id[p]!r} in image {one.id!r}"
         sizes = (one.image.lines, one.image.pixels)
         for name, value, size in zip(("line", "pixel"), observations.xy[row], sizes):
+            # pixels are areas about integers, so that the image ends half a pixel beyond the last
             if not -0.5 <= value <= size - 0.5:
                 raise InputError(
                     f"{where}: {name} {value:g} is off the image, which has {size}; -0.5 to "
@@ -133,14 +136,9 @@ def check_observations(
     for i, one in enumerate(images):
         rows = np.flatnonzero(observations.image == i)
         t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
-        tables = (
-            ("positions", one.image.trajectory.position),
-            (
-                "attitude",
-                one.image.trajectory.attitude.table,
-            ),
-        )
-        for what, table in tables:
+        trajectory = one.image.trajectory
+        tables = {"positions": trajectory.position, "attitude": trajectory.attitude.table}
+        for what, table in tables.items():
             out = ~np.asarray(covers(table, interval(table, t), t))
             if out.any():
                 row, at = rows[out.argmax()], float(t[out.argmax()])

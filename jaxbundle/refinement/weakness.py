@@ -10,6 +10,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.quality.names import (
@@ -19,19 +20,32 @@ from jaxbundle.leastsquares.quality.names import (
     undetermined,
 )
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.refinement.declare import Declared
-
-SMALLEST_EIGENVALUE = 1e-2
-"""Smaller eigenvalues mean a σ more than ten times that of the unknown alone."""
-NULL = 1e-10
-"""Eigenvalues below this are rounding."""
-SMALLEST_PART = 0.15
-"""An unknown with at least this fraction of the largest component belongs to the direction."""
-MOST_LISTED = 4
-"""Largest number of unknowns listed in one direction."""
+from jaxbundle.refinement.declare import DeclaredRefinement
+from jaxbundle.refinement.freedom import UnknownName
 
 
-class Weakness(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class WeaknessSettings:
+    """Which directions are reported, and how.
+
+    - `weak_eigenvalue`: of the scaled normal matrix; σ along the direction is 1/√ of it, ten times
+      that of single unknowns. Larger: usual correlations are reported too.
+    - `null_eigenvalue`: below it the direction is undetermined, and the eigenvalue rounding of
+      squares of 1e-16 that were summed over many points.
+    - `min_component`: unknowns with at least this fraction of the largest component are named, up
+      to `most_named` of them: for the sentence only.
+    """
+
+    weak_eigenvalue: float = 1e-2
+    null_eigenvalue: float = 1e-10
+    min_component: float = 0.15
+    most_named: int = 4
+
+
+DEFAULTS = WeaknessSettings()
+
+
+class WeakDirection(NamedTuple):
     """A direction: its eigenvalue, unknowns with their components, a sentence for the report."""
 
     eigenvalue: float
@@ -39,26 +53,30 @@ class Weakness(NamedTuple):
     sentence: str
 
 
-def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
+def weaknesses(
+    declared: DeclaredRefinement, found: Solution, settings: WeaknessSettings = DEFAULTS
+) -> list[WeakDirection]:
     """All weak directions, the weakest first; jitter is one per axis."""
     S, names = _observe(declared, found)
     if not np.isfinite(S).all():
+        # a point that its own observations leave open, so that it could not be eliminated
         vague = undetermined(found.problem, found.values)
-        sentence = f"the points do not determine {', '.join(vague[:MOST_LISTED])}"
-        return [Weakness(0.0, tuple(vague), sentence)]
+        sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
+        return [WeakDirection(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)
     weak, jitter = [], set()
     for value, vector in zip(values, vectors.T):
-        if value >= SMALLEST_EIGENVALUE:
+        if value >= settings.weak_eigenvalue:
             break
         shares = _shares(vector, names)
-        least = SMALLEST_PART * shares[0][1]
-        named = [name for name, share in shares if share >= least][:MOST_LISTED]
+        least = settings.min_component * shares[0][1]
+        named = [name for name, share in shares if share >= least][: settings.most_named]
+        is_null = bool(value < settings.null_eigenvalue)
         if " jitter of " in named[0]:
             # many directions of one spline: one sentence
-            jitter.add((named[0], value < NULL))
+            jitter.add((named[0], is_null))
             continue
-        weak.append(Weakness(float(value), tuple(named), _sentence(named, value)))
+        weak.append(WeakDirection(float(value), tuple(named), _sentence(named, value, is_null)))
     for name in sorted({name for name, _ in jitter}):
         none = (name, True) in jitter
         value = 0.0 if none else float(values[0])
@@ -66,36 +84,41 @@ def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
             f"the points leave parts of the {name} undetermined, so that only its prior holds it; "
             "use wider knot spacing or more points"
         )
-        weak.append(Weakness(value, (name,), sentence))
+        weak.append(WeakDirection(value, (name,), sentence))
     return weak
 
 
-def _sentence(named, value):
-    how = "do not determine" if value < NULL else "hardly determine"
+def _sentence(named: list[str], value: float, null: bool) -> str:
+    how = "do not determine" if null else "hardly determine"
     text = f"the points {how} the {named[0]}"
     if named[1:]:
         text += f" against {', '.join(named[1:])}"
-    if value < NULL:
+    if null:
         return text
     return f"{text} (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
 
 
-def _shares(vector, names):
+def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[tuple[str, float]]:
     """Names of unknowns with the part of the vector they have, the largest first."""
     total = {}
     for part, name in zip(vector, names):
         word = f"{name.group} of {name.owner}"
+        # of eigenvector components, whose squares add up: all coefficients of a spline as one
         total[word] = total.get(word, 0.0) + part**2
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
 
-def _observe(declared: Declared, found: Solution):
+def _observe(
+    declared: DeclaredRefinement, found: Solution
+) -> tuple[Float[np.ndarray, "m m"], list[UnknownName]]:
     """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
     points that distances keep in the engine's reduced system are eliminated here."""
     weight = dict(found.problem.data.weight)
-    for given in found.problem.observations:
-        if given.kind.snooped == "" and given.kind.of != ("image",):
-            weight[given.name] = 0 * weight[given.name]
+    # Priors hide what the points leave open. Those of photographs stay: an orientation that was
+    # measured is no weakness of the points.
+    for observations in found.problem.observations:
+        if observations.kind.snooped == "" and observations.kind.of != ("image",):
+            weight[observations.name] = 0 * weight[observations.name]
     data = dataclasses.replace(found.problem.data, weight=weight)
     problem = with_data(found.problem, data)
     S = scaled_system(problem, found.values)[0]
@@ -104,5 +127,6 @@ def _observe(declared: Declared, found: Solution):
     kept = np.array([place in columns for place in places])
     points = np.array([place[0] == "point" for place in places])
     cross = S[np.ix_(kept, points)]
+    # the pseudoinverse: what no observation determines of these points is not eliminated
     less = cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
     return S[np.ix_(kept, kept)] - less, [columns[p] for p, k in zip(places, kept) if k]

@@ -34,7 +34,7 @@ from jaxbundle.pushbroom.corrections import (
     true_direction,
 )
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
-from jaxbundle.pushbroom.image import Pose, make_image, pose_at
+from jaxbundle.pushbroom.image import LinePose, make_image, pose_at
 from jaxbundle.pushbroom.locate import ground_point, locate_points
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes, slopes_of
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
@@ -200,7 +200,7 @@ def test_sizes_off_the_nadir(off_nadir, light, aberration, refraction):
     for k, h in enumerate((500e3, 800e3)):
         P = np.array([el.WGS84.a + h, 0, 0])
         V = np.array([0, 0, np.sqrt(GM / P[0])])
-        pose = Pose(P, np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), V)
+        pose = LinePose(P, np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), V)
         at = lambda *c, pose=pose: np.array(sight(pose, Corrections(*map(bool, c)), slopes))
         plain = at(0, 0, 0)
         d = (plain - P) / np.linalg.norm(plain - P)

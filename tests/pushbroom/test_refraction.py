@@ -18,7 +18,7 @@ from scipy.integrate import quad, solve_ivp
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.atmosphere import refractivity
 from jaxbundle.pushbroom.corrections import Corrections, refract
-from jaxbundle.pushbroom.image import Pose
+from jaxbundle.pushbroom.image import LinePose
 from jaxbundle.pushbroom.locate import ground_point
 from jaxbundle.pushbroom.surfaces import Height
 
@@ -95,7 +95,7 @@ sight = jax.jit(ground_point, static_argnums=3)
 @partial(np.vectorize, otypes=[float])
 def found(camera, ground, off_nadir):
     P, R = np.array([RADIUS + camera, 0, 0]), np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
-    pose = Pose(P, R, np.zeros(3))
+    pose = LinePose(P, R, np.zeros(3))
     slopes, surface = (np.tan(np.radians(off_nadir)), 0.0), Height(ground, EARTH)
     X, plain = (np.array(sight(pose, slopes, surface, Corrections(refraction=c)))
                 for c in (True, False))  # fmt: skip

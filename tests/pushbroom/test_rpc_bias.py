@@ -9,13 +9,13 @@ from rpc_scenes import made_up, places
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
 from jaxbundle.pushbroom.rpc import project_points
-from jaxbundle.pushbroom.rpc_bias import Bias, apply_bias, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc_bias import RpcBias, apply_bias, fit_bias, project_compensated
 from jaxbundle.pushbroom.rpc_fit import RpcTable
 
 RPC = made_up()
 PLACES = places(RPC, 12)
-BIAS = Bias(jnp.array([3.0, 0.5, -0.8]), jnp.array([-7.0, 0.2, 0.4]))
-SHIFT = Bias(jnp.array([3.0, 0, 0]), jnp.array([-7.0, 0, 0]))
+BIAS = RpcBias(jnp.array([3.0, 0.5, -0.8]), jnp.array([-7.0, 0.2, 0.4]))
+SHIFT = RpcBias(jnp.array([3.0, 0, 0]), jnp.array([-7.0, 0, 0]))
 image = jax.jit(jax.vmap(project_compensated, (None, None, 0, 0, 0)))
 
 

@@ -72,9 +72,9 @@ def true_unknowns(form):
 
 
 def test_bias_drift_and_jitter_of_1_hz_come_back_within_3_sigma(refined):
-    truth = true_unknowns(refined.inspection.declared.given.forms[0])
+    truth = true_unknowns(refined.inspection.declared.inputs.forms[0])
     error = np.abs(refined.estimate - truth)
-    assert len(truth) == 6 + 2 * refined.inspection.declared.given.forms[0].spline.unknowns
+    assert len(truth) == 6 + 2 * refined.inspection.declared.inputs.forms[0].spline.unknowns
     assert (error < 3 * np.maximum(refined.inspection.sigma, 0)).all()
     # the biases are determined far better than they were wrong
     assert (refined.inspection.sigma[:2] < 0.1 * np.abs(BIAS[:2])).all()
@@ -118,9 +118,9 @@ def test_the_residual_of_what_is_located_is_zero():
     places, heights = np.array([[120.3, 600.2]]), np.array([350.0])
     X = ground(image, form, p, heights, places)
     kind, origin = ScannerPoint(switch, WGS84, form.sizes), np.zeros(3)
-    line, _ = lines_of(kind, image, form, origin, *np.split(p, [form.own]), X, places)
+    line, _ = lines_of(kind, image, form, origin, *np.split(p, [form.image_unknowns]), X, places)
     line = jax.tree.map(lambda x: jnp.asarray(x[0]), line)
-    g = kind.misclosure(*np.split(p, [form.own]), X[0], line)
+    g = kind.misclosure(*np.split(p, [form.image_unknowns]), X[0], line)
     # a pixel is 4e-5
     assert np.abs(g).max() < 1e-9
 

@@ -96,7 +96,7 @@ def equations(case):
     """v/σ of a vector of all unknowns, from image, network and points as they were given: nothing
     of the declarations takes part but S."""
     result = case[0]
-    found, given = result.inspection, result.inspection.declared.given
+    found, given = result.inspection, result.inspection.declared.inputs
     one, form, network = given.images[0], given.forms[0], given.frames
     columns, rays = found.declared.columns, given.observations
     own = [form.sizes, names(form.sizes, "A", "A")]

@@ -14,10 +14,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
 from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
-from jaxbundle.pushbroom.correct import BLOCK, Nodes, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.rectification import BLOCK, MapNodes, block_places
 from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
@@ -108,7 +108,7 @@ def write_corrected(
                 )
             reading = threading.Lock()  # GDAL: one thread at a time in a data set
 
-            def block(nodes: Nodes) -> Float[np.ndarray, "bands rows columns"] | None:
+            def block(nodes: MapNodes) -> Float[np.ndarray, "bands rows columns"] | None:
                 places = block_places(image, search, surface, nodes, occlusion)
                 if places is None:
                     return None

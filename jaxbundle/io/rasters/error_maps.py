@@ -10,9 +10,9 @@ from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.correct import Nodes, block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.rectification import MapNodes, block_errors, block_places
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 
@@ -37,7 +37,7 @@ def write_error_map(
     """
     squares = []  # sums and numbers of each block: the map itself may not fit in memory
 
-    def block(nodes: Nodes) -> Float[np.ndarray, "3 rows columns"] | None:
+    def block(nodes: MapNodes) -> Float[np.ndarray, "3 rows columns"] | None:
         places = block_places(image, search, surface, nodes)
         if places is None:
             return None

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
+from jaxbundle.pushbroom.rectification import BLOCK, STEP, MapNodes
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Progress
 
@@ -21,7 +21,7 @@ def write_map(
     surface: Surface,
     count: int,
     dtype: str,
-    block: Callable[[Nodes], np.ndarray | None],
+    block: Callable[[MapNodes], np.ndarray | None],
     progress: Progress | None = None,
     names: Sequence[str] = (),
 ) -> None:

@@ -75,10 +75,10 @@ from jaxbundle.pushbroom.ancillary import (
 )
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import check_size, make_image
-from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.interpolation import TimeTable
 from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, LineTimes, Optics
-from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory
 
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
@@ -224,7 +224,7 @@ def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) 
     return frame
 
 
-def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
+def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Source]:
     section = file.section("position")
     kinds = [kind for kind in KINDS if kind in section]
     if len(kinds) != 1:
@@ -248,7 +248,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
 
 def _orbit(
     file: TomlFile, section: TomlSection, kind: str, earth: Ellipsoid | None
-) -> tuple[Table, Source]:
+) -> tuple[TimeTable, Source]:
     """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
@@ -286,7 +286,9 @@ def _orbit(
     return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
 
 
-def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source, tuple[str, ...]]:
+def _attitude(
+    file: TomlFile, earth: Ellipsoid | None
+) -> tuple[AttitudeTable, Source, tuple[str, ...]]:
     """The attitudes, the source of their rows, warnings."""
     section = file.section("attitude")
     frame = _frame(section, earth, (*FRAMES, "orbit"))

@@ -62,7 +62,7 @@ def _words(values: Iterable[object]) -> np.ndarray:
 
 def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
-    declared, given = result.inspection.declared, result.inspection.declared.given
+    declared, given = result.inspection.declared, result.inspection.declared.inputs
     xy = lambda of_scanner: np.asarray(
         given.observations.xy if of_scanner else present(given.frames).observations.xy
     )
@@ -115,14 +115,14 @@ def _unknowns(result: Refinement) -> Section:
 
 def _images(result: Refinement, used: Sequence[ImagePoint]) -> Columns:
     camera, rms = [], []
-    for id in result.inspection.declared.given.ids:
+    for id in result.inspection.declared.inputs.ids:
         v = np.array([row["v"] for row in used if row["image"] == id]).reshape(-1, 2)
         rms.append(np.sqrt((v**2).sum(1).mean()) if len(v) else np.nan)
     scanners = [one.id for one in result.images]
     if result.frames is not None:
         camera = [result.frames.cameras[c].id for c in result.frames.images.camera]
     return {
-        "id": Column(_words(result.inspection.declared.given.ids), "image"),
+        "id": Column(_words(result.inspection.declared.inputs.ids), "image"),
         "camera": Column(_words([*(f"scanner {id}" for id in scanners), *camera]), "camera"),
         "rms": Column(np.array(rms), "RMS |v|"),
     }

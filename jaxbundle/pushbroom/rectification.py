@@ -1,10 +1,9 @@
-"""Geometric correction of an image to a map, block by block.
+"""Rectification of an image to a map (the command `correct`), block by block.
 
 For a block of the map, ground points at a grid of nodes give, by linear interpolation, the point of
 every pixel on the ellipsoid and its vertical; the height, constant or from a terrain model, is then
 added. Every point is projected into the image, starting from the interpolated image position, or
-by a search if that does not converge, and the image is resampled there. Between
-nodes 16 pixels apart a map's curvature is below a millimetre for pixels of 10 m: (16·10 m)²/8R.
+by a search if that does not converge, and the image is resampled there.
 
 A point is hidden by other terrain if the ray of its image position ends before it:
 optionally the first intersection of every pixel's ray is computed, and points farther from it than
@@ -17,27 +16,30 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
-from jaxbundle.geometry.vectors import difference, dot, length
+from jaxbundle.geometry.vectors import Triple, difference, dot, length
 from jaxbundle.pushbroom.accuracy import east_north, horizontal
-from jaxbundle.pushbroom.image import Pose, PushbroomImage
+from jaxbundle.pushbroom.image import LinePose, PushbroomImage
 from jaxbundle.pushbroom.locate import ground_point
-from jaxbundle.pushbroom.passages import sample
-from jaxbundle.pushbroom.project import Search, project_from, project_points, scanner_of
-from jaxbundle.pushbroom.surfaces import Ground, Surface
+from jaxbundle.pushbroom.pieces import sample
+from jaxbundle.pushbroom.project import project_from, project_points
+from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
+from jaxbundle.pushbroom.surfaces import Height, Plane, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
-BLOCK, STEP = 256, 16
-"""Pixels of a block of the map along each side, and between its nodes."""
-SEARCH_MARGIN = 2.0 * BLOCK
-"""Nodes are searched this many lines and pixels beyond the image, to enclose its edges."""
+BLOCK = 256
+"""Pixels of a block of the map along each side: a usual tile of GeoTIFF, in which maps are written,
+and 0.5 MB a coordinate. The shapes of compiled programs follow from it."""
+STEP = 16
+"""Pixels between the nodes of a block, a divisor of `BLOCK`. The sagitta of the Earth's curvature
+between nodes, (16·10 m)²/8R = 0.5 mm for pixels of 10 m, grows with the square of both."""
 
 
-class Nodes(NamedTuple):
+class MapNodes(NamedTuple):
     """Ground points at the nodes of a block: on the ellipsoid (Z = 0), and the vertical there."""
 
     X: Float[AnyArray, "3 n n"]
@@ -51,37 +53,39 @@ class Places(NamedTuple):
     pixel: Float[AnyArray, "rows columns"]
 
 
-def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> Nodes:
+def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> MapNodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
-    return Nodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
+    return MapNodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
 
 
-@partial(compile_once, static=())
-def _ground_and_up(earth, place):
-    return jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))
+_ground_and_up = compile_once(
+    lambda earth, place: (jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))), ()
+)
 
 
-def local_nodes(x: np.ndarray, y: np.ndarray) -> Nodes:
+def local_nodes(x: np.ndarray, y: np.ndarray) -> MapNodes:
     """Nodes at X and Y of a local frame, metres."""
     zero = np.zeros_like(x)
-    return Nodes(np.stack([x, y, zero]), np.stack([zero, zero, zero + 1]))
+    return MapNodes(np.stack([x, y, zero]), np.stack([zero, zero, zero + 1]))
 
 
 def block_places(
     image: PushbroomImage,
     search: Search,
     surface: Surface,
-    nodes: Nodes,
+    nodes: MapNodes,
     occlusion: bool = False,
 ) -> Places | None:
     """Image positions of the pixels of a block; None if none of them is near the image.
 
     With `occlusion` pixels hidden by other terrain have none.
     """
+    # start values only: between the heights of terrain an image position moves by pixels
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
-    found = project_points(image, search, raised.reshape(3, -1), margin=SEARCH_MARGIN)
+    # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
+    found = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():
@@ -101,20 +105,23 @@ def block_places(
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
-def _search(image, search, X, portion):
+def _search(
+    image: PushbroomImage, search: Search, X: Float[np.ndarray, "3 n"], portion: int
+) -> Float[np.ndarray, "2 n"]:
     """Lines and pixels of points [3, n] by a search of the image, in batches of points."""
     places = np.empty((2, X.shape[1]))
     for k in range(0, X.shape[1], portion):
         few = X[:, k : k + portion]
         n = few.shape[1]
         full = np.pad(few, ((0, 0), (0, portion - n)), mode="edge")
+        # of one shape, so that one program serves any number of points
         found = project_points(image, search, full, margin=0.0)
         places[:, k : k + n] = np.asarray(found.line)[0, :n], np.asarray(found.pixel)[0, :n]
     return places
 
 
 def block_errors(
-    truth: PushbroomImage, search: Search, surface: Surface, nodes: Nodes, places: Places
+    truth: PushbroomImage, search: Search, surface: Surface, nodes: MapNodes, places: Places
 ) -> Float[np.ndarray, "2 rows columns"]:
     """East and north map errors of the pixels of a block, metres.
 
@@ -126,43 +133,59 @@ def block_errors(
 
 
 @partial(compile_once, static=())
-def _errors(truth, search, surface, nodes, places):
+def _errors(
+    truth: ScannerGeometry, search: Search, surface: Surface, nodes: MapNodes, places: Places
+) -> Float[Array, "2 rows columns"]:
     ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
 
-    def of_point(line, pixel, X):
+    def error(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> Float[Array, "2"]:
         true = _locate(truth, search, surface, line, pixel)
         return horizontal(east_north(surface, true), true, tuple(X))
 
-    of_row = lambda args: jax.vmap(of_point)(*args)
-    return jnp.moveaxis(jax.lax.map(of_row, (*places, ground)), -1, 0)
+    # row by row: the state of a ray's traversal of terrain stays in the cache
+    errors_of_row = lambda row: jax.vmap(error)(*row)
+    return jnp.moveaxis(jax.lax.map(errors_of_row, (*places, ground)), -1, 0)
 
 
-def _locate(image, search, surface, line, pixel):
+def _locate(
+    image: ScannerGeometry, search: Search, surface: Surface, line: Scalar, pixel: Scalar
+) -> Triple:
     """The point seen at an image position, by the pieces of the search."""
     numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
-    pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
+    pose = LinePose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
 @partial(compile_once, static=())
-def _are_occluded(image, search, surface, line, pixel, ground):
+def _are_occluded(
+    image: ScannerGeometry,
+    search: Search,
+    surface: Surface,
+    line: Float[AnyArray, "rows columns"],
+    pixel: Float[AnyArray, "rows columns"],
+    ground: Float[AnyArray, "3 rows columns"],
+) -> Bool[Array, "rows columns"]:
     """Whether the rays of image positions end before their points [3, rows, columns].
 
-    A ray without heights on its way to the point hides nothing.
+    A ray without heights on its way to the point hides nothing. Half a pixel of the map is what
+    the interpolation between nodes and of the terrain may differ by without a shadow.
     """
     half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
-    def of_point(line, pixel, X):
+    def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> bool | Bool[AnyArray, ""]:
         _, _, (P, _) = sample(search.pieces, image.times.time(line))
         gap = difference(X, _locate(image, search, surface, line, pixel))
         return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
 
-    of_row = lambda args: jax.vmap(of_point)(*args)
-    return jax.lax.map(of_row, (line, pixel, jnp.moveaxis(ground, 0, -1)))
+    row_is_occluded = lambda row: jax.vmap(is_occluded)(*row)
+    return jax.lax.map(row_is_occluded, (line, pixel, jnp.moveaxis(ground, 0, -1)))
 
 
-def _fill(starts):
-    """Positions of unseen nodes, from a plane through the others: sufficient as start values."""
+def _fill(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, "2 n n"]:
+    """Positions of unseen nodes, from a plane through the others: sufficient as start values.
+
+    Were they left out, pixels beside the outermost seen node would have no start at all.
+    """
     seen = np.isfinite(starts[0])
     if seen.all():
         return starts
@@ -172,20 +195,26 @@ def _fill(starts):
     return np.where(seen, starts, (A @ plane).T.reshape(starts.shape))
 
 
-def _level(surface):
+def _level(surface: Surface) -> Scalar:
     """A representative height of the surface."""
     if isinstance(surface, Terrain):
         return (surface.lowest + surface.highest) / 2
-    return 0.0 if isinstance(surface, Ground) else surface.level
+    return surface.level if isinstance(surface, Height | Plane) else 0.0
 
 
 @partial(compile_once, static=())
-def _places(image, search, surface, nodes, starts):
+def _places(
+    image: ScannerGeometry,
+    search: Search,
+    surface: Surface,
+    nodes: MapNodes,
+    starts: Float[AnyArray, "2 n n"],
+) -> tuple[Array, Array, Array]:
     ground = _ground(surface, nodes)
     return *project_from(image, search, tuple(ground), *_spread(starts)), ground
 
 
-def _ground(surface, nodes):
+def _ground(surface: Surface, nodes: MapNodes) -> Float[Array, "3 rows columns"]:
     """The points of all pixels, [3, BLOCK, BLOCK]."""
     X, vertical = _spread(nodes.X), _spread(nodes.up)
     if isinstance(surface, Terrain):
@@ -196,15 +225,10 @@ def _ground(surface, nodes):
     return X + height * vertical
 
 
-def _spread(nodes):
+def _spread(nodes: Float[AnyArray, "k n n"]) -> Float[Array, "k rows columns"]:
     """From nodes to all pixels, linear in between: [k, n, n] to [k, BLOCK, BLOCK]."""
     return jnp.einsum("ri,kij,cj->krc", WEIGHTS, nodes, WEIGHTS)
 
 
-def _weights():
-    pixel = np.arange(BLOCK) / STEP
-    node = np.arange(BLOCK // STEP + 1)
-    return np.maximum(1 - np.abs(pixel[:, None] - node), 0)
-
-
-WEIGHTS = _weights()
+WEIGHTS = np.maximum(1 - np.abs(np.arange(BLOCK)[:, None] / STEP - np.arange(BLOCK // STEP + 1)), 0)
+"""Of the nodes along one side, [BLOCK, nodes]: hat functions."""
