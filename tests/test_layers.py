@@ -57,8 +57,16 @@ def layer_of(path: Path) -> str:
 
 
 def imports(path: Path):
-    """(module, inside a function) of every import; relative ones made absolute."""
+    """(module, inside a function) of every import; relative ones made absolute. Those of
+    `if TYPE_CHECKING:` are left out: they never run."""
     tree = ast.parse(path.read_text())
+    unread = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for statement in block.body
+        for node in ast.walk(statement)
+    }
     inside = {
         id(node)
         for function in ast.walk(tree)
@@ -67,6 +75,8 @@ def imports(path: Path):
     }
     package = ("jaxbundle", *path.relative_to(PACKAGE).parent.parts)
     for node in ast.walk(tree):
+        if id(node) in unread:
+            continue
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield alias.name, id(node) in inside

@@ -24,7 +24,8 @@ SOLVED = ("opencv", "kannala-brandt", "snavely")
 """Models in pixels that `calibrate_batch` solves without start values."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
-"""Fields of view tried if the views give no start values for a fisheye."""
+"""Fields of view tried if the views give no start values for a fisheye; between them every
+principal distance is within a third of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +105,9 @@ def first_cameras(
     return [found[i] for i in range(len(xy))]
 
 
-def _attempts(model: CameraModel, free: tuple[str, ...], size):
+def _attempts(
+    model: CameraModel, free: tuple[str, ...], size: tuple[float, float]
+) -> list[tuple[str, tuple[str, ...], dict[str, float] | None]]:
     """Model, free parameters and start values of the attempts."""
     if _by_fit(model) or model.unit != "px":
         if _by_fit(model) and model.wide:
@@ -164,7 +167,15 @@ def parameters_of(
     return parameters | given
 
 
-def _fit(first, xy, image_size, model, free, pixel_size, given) -> dict[str, float]:
+def _fit(
+    first: FirstCamera,
+    xy: Float[np.ndarray, "n 2"],
+    image_size: tuple[float, float],
+    model: CameraModel,
+    free: Sequence[str],
+    pixel_size: tuple[float, float] | None,
+    given: Mapping[str, float],
+) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
     if {*given} - {*model.principal_distance}:

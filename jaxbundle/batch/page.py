@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from jaxbundle.batch.population import FEWEST, LEVEL, OUTLIER_LIMIT, Population
+from jaxbundle.batch.population import Population
 from jaxbundle.network.columns import count
 from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of, estimate, fixed, significant
 from jaxbundle.report.page import (
@@ -24,9 +24,6 @@ from jaxbundle.report.page.columns import Column, estimates
 from jaxbundle.report.page.document import NOTHING
 from jaxbundle.report.page.markup import figure, grid, paragraph
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD
-
-MOST_OUTLYING = 30
-"""Number of cameras listed as outlying; the table has all."""
 
 
 def compose_batch(
@@ -59,11 +56,11 @@ def _judge(found: Population) -> list[Finding]:
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
     words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
-    far = int((np.nan_to_num(found.farthest) > OUTLIER_LIMIT).sum())
+    limit = found.settings.outlier_limit
+    far = int((np.nan_to_num(found.farthest) > limit).sum())
     if np.isfinite(found.farthest).any():
         words = (
-            f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
-            "deviations from the median"
+            f"{far} with a parameter more than {limit:g} robust standard deviations from the median"
         )
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
@@ -123,7 +120,8 @@ def _parameters(found: Population) -> list[Section]:
 def _histograms(found: Population) -> Iterator[str]:
     for name, values in found.values.items():
         edges, counted = found.histogram(values)
-        if counted.sum() >= FEWEST and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
+        enough = counted.sum() >= found.settings.min_cameras
+        if enough and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
             yield figure(
                 draw_histogram(edges, counted, name, "number of cameras"),
                 f"{name} of {counted.sum()} converged cameras",
@@ -135,7 +133,7 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
     told = found.correlations(against)
     if not told:
         return []
-    level = LEVEL / len(told)
+    level = found.settings.level / len(told)
     rows = [
         (
             f"{one.parameter} with {one.column}",
@@ -149,8 +147,8 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
     ]
     note = paragraph(
         "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
-        f"large by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
-        "the median, from the lower half of the column to the upper."
+        f"large by chance; significant at {100 * found.settings.level:g} % for all of these "
+        "together. Change: of the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
     return [
@@ -170,7 +168,7 @@ def _outlying(found: Population) -> list[Section]:
         return []
     rows = [
         (found.keys[i], significant(found.numbers["rms"][i], 4), words)
-        for i, words in said[:MOST_OUTLYING]
+        for i, words in said[:30]  # a screen or two; the table has all
     ]
     more = len(said) - len(rows)
     note = paragraph(f"and {more} more: sort the table.") if more else ""

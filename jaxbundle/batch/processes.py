@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import chain, zip_longest
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,12 +30,8 @@ from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.leastsquares.sharding import use_own_devices
 
-ROWS_AT_ONCE = 256
-PAUSE = 0.2
-"""Seconds between checks for the files of other processes."""
 
-
-def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Counter:
+def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -> Counter:
     """As `run_batch`, in processes joined by `jaxbundle.join_processes`, which have the same
     arguments and see the same folder of results; afterwards they are no longer joined.
 
@@ -108,7 +105,7 @@ def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
         }
         if len(found) == len(names):
             return found
-        time.sleep(PAUSE)
+        time.sleep(0.2)  # seconds: far below a run, far above the look at a file
 
 
 def add_parts(file: str | Path) -> None:
@@ -134,7 +131,7 @@ def add_parts(file: str | Path) -> None:
         for row in in_turn:
             if row is not None and row["key"] not in lines:
                 some.append(row)
-            if len(some) == ROWS_AT_ONCE:
+            if len(some) == 256:  # lines a write: bounds the memory
                 lines.append(some)
                 some = []
         lines.append(some)

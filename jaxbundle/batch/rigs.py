@@ -37,7 +37,7 @@ UNEXPECTED = (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError)
 
 
 @dataclasses.dataclass(frozen=True)
-class Rig:
+class RigViews:
     """Views of one rig.
 
     **Fields:** `cameras`, their names; `sizes`, columns and rows of each; `images`: names [cameras]
@@ -75,7 +75,7 @@ class RigSettings:
 
 
 def solve_rigs(
-    rigs: Sequence[Rig], settings: RigSettings, tell: Callable[[float], None] = lambda part: None
+    rigs: Sequence[RigViews], settings: RigSettings, tell: Callable[[float], None] = lambda _: None
 ) -> list[tuple[dict, Adjustment | None]]:
     """The row of every rig, as a line of `jaxbundle batch`, and its adjustment, if any.
 
@@ -94,7 +94,9 @@ def solve_rigs(
     return solved
 
 
-def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[FirstCamera | None]]:
+def _first_cameras(
+    rigs: Sequence[RigViews], settings: RigSettings
+) -> list[list[FirstCamera | None]]:
     """The cameras of every rig, those of one image size calibrated together; None for one without
     finite measurements."""
     found: list[list[FirstCamera | None]] = [[None] * len(rig.cameras) for rig in rigs]
@@ -115,7 +117,7 @@ def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[Firs
 
 
 def _solve(
-    rig: Rig, firsts: list[FirstCamera | None], settings: RigSettings
+    rig: RigViews, firsts: list[FirstCamera | None], settings: RigSettings
 ) -> tuple[dict, Adjustment | None]:
     """The row of a rig, without its RMS, and its adjustment."""
     try:
@@ -141,7 +143,9 @@ def _solve(
     return row, result
 
 
-def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[str, str]]:
+def _adjust(
+    rig: RigViews, firsts: Sequence[FirstCamera | None], settings: RigSettings
+) -> tuple[Adjustment, dict[str, str]]:
     """The adjustment of a rig, and what epochs were excluded, with the reason.
 
     **Raises:** `InputError`, `NotSolvedError`."""
@@ -172,7 +176,7 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
     ), excluded
 
 
-def _contradicting(rig: Rig, result: Adjustment, settings: RigSettings) -> dict[int, float]:
+def _contradicting(rig: RigViews, result: Adjustment, settings: RigSettings) -> dict[int, float]:
     """Epochs that contradict the mounting, and their RMS, pixels."""
     place = {id: e for of in rig.images for e, id in enumerate(of)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
@@ -207,7 +211,9 @@ def _undetermined(result: Adjustment, settings: RigSettings) -> list[str]:
     return found
 
 
-def declare_rig(rig: Rig, firsts: Sequence[FirstCamera | None], settings: RigSettings) -> Network:
+def declare_rig(
+    rig: RigViews, firsts: Sequence[FirstCamera | None], settings: RigSettings
+) -> Network:
     """The network of a rig, with start values.
 
     **Raises:** `NotSolvedError` for a camera without start values."""
@@ -248,7 +254,14 @@ def with_free(moves: Mapping[str, Any]) -> dict[str, Any]:
     return {"free": VELOCITY, **moves}
 
 
-def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -> Network:
+def _network_of(
+    rig: RigViews,
+    cameras: Sequence[Camera],
+    images: Sequence[tuple[Any, ...]],
+    rays: Float[np.ndarray, "n 4"],
+    sigma: Float[np.ndarray, "2"],
+    settings: RigSettings,
+) -> Network:
     """The network of images (camera, epoch, pose) and rays (image, point, x, y)."""
     ids = np.array([rig.images[c][e] for c, e, *_ in images], dtype=object)
     names = [rig.cameras[c] for c, *_ in images]

@@ -14,9 +14,6 @@ from jaxbundle.batch.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
-SMALLEST_PART = 0.05
-"""A parameter with this part of the square of a vanishing direction is named."""
-
 
 def is_vague(
     model: CameraModel,
@@ -40,13 +37,9 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
-    return finite[:, None] & (share > SMALLEST_PART)
-
-
-STRAIGHT, SAME = 0.01, 0.01
-"""Largest change of scale across half of a board that is seen from the front, and largest
-difference of it between photographs that are tilted alike: a tilt of 20° at a distance of five
-boards makes 0.04."""
+    # a twentieth of the square of the direction: of those that nothing determines, the ones that
+    # change visibly together
+    return finite[:, None] & (share > 0.05)
 
 
 def weak_geometry(
@@ -61,6 +54,10 @@ def weak_geometry(
     the relative distance of a point at x from the middle of the view. Equal l in all views give two
     conditions for the camera, however many there are (Sturm and Maybank, 1999).
     """
+    # Largest change of scale across half of a board that counts as seen from the front, and largest
+    # difference between photographs that count as tilted alike: a tilt of 20° at a distance of five
+    # boards makes 0.04.
+    straight = alike = 0.01
     centred = points - points.mean(0)
     axes, size = np.linalg.svd(centred)[2], np.linalg.svd(centred, compute_uv=False)
     if size[2] > 1e-6 * size[0]:
@@ -73,6 +70,8 @@ def weak_geometry(
         middle = view[seen].mean(0)
         extent = np.sqrt(((view[seen] - middle) ** 2).sum(1).mean())
         x, ones = (view[seen] - middle) / extent, np.ones((int(seen.sum()), 1))
+        # the direct linear transformation of the plane (Hartley, 1997): four points, and two that
+        # control it
         from_plane, zero = np.concatenate([X[seen], ones], 1), np.zeros((int(seen.sum()), 3))
         A = np.concatenate(
             [
@@ -91,14 +90,14 @@ def weak_geometry(
     extent = np.median(extents)
     # the tilts about the middle of one view, in the same unit of length
     tilts, middles = np.array(tilts) * (extent / np.array(extents))[:, None], np.array(middles)
-    if np.linalg.norm(tilts, axis=1).max() < STRAIGHT:
+    if np.linalg.norm(tilts, axis=1).max() < straight:
         return (
             "all photographs look straight at the board: a longer principal distance and a larger "
             "distance give the same images"
         )
     shift = (middles - middles[0]) / extent
     about_one = tilts / (1 - np.einsum("vi,vi->v", tilts, shift))[:, None]
-    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < SAME:
+    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < alike:
         return (
             "all photographs show the board tilted alike, in the same direction of the image: one "
             "tilt does not separate the principal distance from the distance, nor the principal "

@@ -40,8 +40,8 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.system.workers import Workers
 
 RIGS_A_WRITE = 32
-OF_A_PROCESS = 280e6
-"""Bytes of a process that searches boards, before its first photograph (measured)."""
+"""Rigs between two writes: what an interruption loses. A rig is a network of its own, and takes
+longer than a camera of a batch; not critical."""
 SIGMA_IMAGE = "sigma_image"
 WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
 """Settings present only in lines computed with them."""
@@ -81,18 +81,18 @@ class BatchSettings:
     brief: bool
 
     @classmethod
-    def of(
+    def check(
         cls,
-        model,
-        free,
-        board,
-        rig,
-        pixel_size,
-        overrides,
-        max_iterations,
-        snooping,
-        significance,
-        brief,
+        model: str | CameraModel,
+        free: Sequence[str] | None,
+        board: Board | None,
+        rig: bool,
+        pixel_size: float | None,
+        overrides: Sequence[str],
+        max_iterations: int,
+        snooping: str | None,
+        significance: float,
+        brief: bool,
     ) -> "BatchSettings":
         """The settings from the arguments of `run_batch`.
 
@@ -176,7 +176,8 @@ def plan_works(
         # the photographs of a folder are of one size
         of_folders = (filter(is_photograph, Path(one).rglob("*")) for one in folders.values())
         some = [path for found in of_folders for path in islice(found, 1)]
-        at_once = searches_at_once(some, settings.board, OF_A_PROCESS)
+        # bytes of a process that searches boards, before its first photograph (measured)
+        at_once = searches_at_once(some, settings.board, 280e6)
         workers = held.enter_context(Workers(search_alone, at_once))
         if settings.rig:
             rigs = RigFolders(tuple(folders.values()), settings.board, kept, workers)
@@ -191,7 +192,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     brief, of_rigs = settings.brief, settings.as_rigs()
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
-    def cameras(chosen, _):
+    def cameras(chosen: Sequence[int], _: Tell) -> list[dict]:
         batch = calibrate_batch(
             **stack.arguments(chosen),
             model=settings.model,
@@ -200,7 +201,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
         )
         return [batch.row(i, brief) for i in range(len(chosen))]
 
-    def rigs(chosen, tell):
+    def rigs(chosen: Sequence[int], tell: Tell) -> list[dict]:
         return [shorten(row, brief) for row, _ in solve_rigs(stack.rigs(chosen), of_rigs, tell)]
 
     if settings.are_plain() and not stack.of_rigs:
@@ -212,7 +213,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
     brief, of_rigs = settings.brief, settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.adjusting}
 
-    def solve(chosen, tell):
+    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
@@ -239,7 +240,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
 def _photographed_rigs(found: RigFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
     of_rigs = settings.as_rigs()
 
-    def solve(chosen, tell):
+    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
@@ -273,10 +274,10 @@ def _network(path: str, name: str, settings: BatchSettings) -> Work:
     solve = lambda chosen, _: [
         network_row(path, settings.overrides, **settings.adjusting) for _ in chosen
     ]
-    return Work((name,), settings.of_networks(), lambda i: of_input(path), solve, "its files", True)
+    return Work((name,), settings.of_networks(), lambda _: of_input(path), solve, "its files", True)
 
 
-def network_row(path: str, overrides: Sequence[str] = (), **options) -> dict:
+def network_row(path: str, overrides: Sequence[str] = (), **options: Any) -> dict:
     """The status and brief result of one network (`options` of `adjust`), or the reason for a
     failure."""
     try:

@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,6 +48,12 @@ from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, head_line
 from jaxbundle.types import Progress
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.result import Calibration
+    from jaxbundle.calibration.rig.result import RigCalibration
+    from jaxbundle.calibration.several import Calibrations
 
 COMMAND = "calibrate"
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
@@ -111,7 +118,7 @@ def files_of(names: Sequence[str]) -> list[str]:
 
 
 def write_calibration(
-    calibration, folder: str | Path, plots: bool = True, force: bool = False
+    calibration: "Calibration", folder: str | Path, plots: bool = True, force: bool = False
 ) -> None:
     """Write a calibration into a folder (see the module's docstring).
 
@@ -127,11 +134,11 @@ def write_calibration(
 
 
 def _fill(
-    calibration,
+    calibration: "Calibration",
     folder: Path,
     plots: bool,
     origin: Origin,
-    choice=None,
+    choice: "ModelComparison | None" = None,
     progress: Progress | None = None,
 ) -> None:
     name = file_name(calibration.name)
@@ -166,7 +173,9 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     return remark
 
 
-def write_calibrations(found, folder: str | Path, plots: bool = True, force: bool = False) -> None:
+def write_calibrations(
+    found: "Calibrations", folder: str | Path, plots: bool = True, force: bool = False
+) -> None:
     """Write one calibration into a folder, several into separate subfolders.
 
     Several have a common report.txt, report.html and result.json; a rig adds its
@@ -180,11 +189,11 @@ def write_calibrations(found, folder: str | Path, plots: bool = True, force: boo
 
 
 def fill_calibrations(
-    found,
+    found: "Calibrations",
     folder: Path,
     plots: bool,
     origin: Origin = UNKNOWN,
-    choice=None,
+    choice: "ModelComparison | None" = None,
     progress: Progress | None = None,
 ) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
@@ -233,7 +242,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
 
 
-def calibrations_dict(found, brief: bool = False) -> dict:
+def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
     """The JSON of one calibration, or of several under their names, with the rig."""
     if len(found.cameras) == 1:
         return next(iter(found.cameras.values())).to_dict(brief)
@@ -245,7 +254,9 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     return document
 
 
-def fill_comparison(choice, folder: Path, plots: bool, progress: Progress | None = None) -> None:
+def fill_comparison(
+    choice: "ModelComparison", folder: Path, plots: bool, progress: Progress | None = None
+) -> None:
     """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
@@ -265,7 +276,7 @@ def fill_comparison(choice, folder: Path, plots: bool, progress: Progress | None
         )
 
 
-def save_plots(calibration, folder: Path, progress: Progress | None = None) -> None:
+def save_plots(calibration: "Calibration", folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
     near = float(np.median(calibration.distances))
     drawings = {
@@ -281,7 +292,7 @@ def save_plots(calibration, folder: Path, progress: Progress | None = None) -> N
     draw_figures(calibration.adjustment, folder, progress)
 
 
-def save_rig_plots(rig, folder: Path, progress: Progress | None = None) -> None:
+def save_rig_plots(rig: "RigCalibration", folder: Path, progress: Progress | None = None) -> None:
     """Coverage and uncertainty of every camera in the rig."""
     drawings = {}
     for name in rig.names:
@@ -300,7 +311,7 @@ def json_text(document: dict) -> str:
     return json.dumps(_plain(document), ensure_ascii=False, indent=1) + "\n"
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

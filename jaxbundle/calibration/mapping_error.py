@@ -20,23 +20,21 @@ calibration, International Journal of Computer Vision 130.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import grid_of
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.display import print_in_one_screen
+from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.projection import have_rays, slopes_of_images
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
-
-DRAWS = 20_000
-"""Samples of K for its quantile, accurate to 1 %."""
-FEWEST = 2
-"""Grid points that determine the rotation: three angles from two coordinates each."""
 
 
 @print_in_one_screen
@@ -62,11 +60,14 @@ class MappingError:
 
     def quantile(self, probability: float = 0.95) -> float:
         """The quantile of √K for this probability, pixels; from a reproducible sample."""
-        z = np.random.default_rng(0).normal(size=(DRAWS, len(self.weights)))
+        # a weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %
+        z = np.random.default_rng(0).normal(size=(20_000, len(self.weights)))
         return float(np.sqrt(np.quantile(z**2 @ self.weights, probability)))
 
 
-def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> MappingError:
+def mapping_error(
+    adjustment: Adjustment, camera: str, grid: tuple[int, int] = GRID
+) -> MappingError:
     """The mapping error of an adjusted camera, whose image size is known.
 
     **Arguments:** `grid`: columns and rows of the grid for the mean.
@@ -84,13 +85,14 @@ def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> Mapp
     farthest = farthest_measurements(problem, adjustment.values)[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]
-    if len(near) < FEWEST or len(near) == len(xy):
+    # two points determine the rotation: three angles from two coordinates each
+    if len(near) < 2 or len(near) == len(xy):
         return whole
     part = _weights(_form(given, p, names, near, "rotation"), C)
     return dataclasses.replace(whole, measured=MappingError(part, len(near) / len(uv)))
 
 
-def _weights(H, C) -> Float[np.ndarray, " k"]:
+def _weights(H: Float[np.ndarray, "k k"], C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
     """λ, by a root of H, in units of σ: C may be numerically singular, as for tied parameters."""
     sigma = np.sqrt(np.diagonal(C))
     unit = np.where(sigma > 0, sigma, 1.0)
@@ -100,7 +102,11 @@ def _weights(H, C) -> Float[np.ndarray, " k"]:
 
 
 def mapping_form(
-    camera, p, names, grid: tuple[int, int] = GRID, frame: str = "rotation"
+    camera: Camera,
+    p: Float[np.ndarray, " parameters"],
+    names: Sequence[str],
+    grid: tuple[int, int] = GRID,
+    frame: str = "rotation",
 ) -> Float[np.ndarray, "k k"]:
     """H of the named parameters of a camera at the values `p` of all: pixels²; `frame` "camera":
     that of A, without a rotation."""
@@ -110,7 +116,13 @@ def mapping_form(
     return _form(camera, p, names, xy, frame)
 
 
-def _form(camera, p, names, xy, frame):
+def _form(
+    camera: Camera,
+    p: Float[np.ndarray, " parameters"],
+    names: Sequence[str],
+    xy: Float[np.ndarray, "n 2"],
+    frame: str,
+) -> Float[np.ndarray, "k k"]:
     model = get_model(camera.model)
     columns = tuple(model.parameters.index(name) for name in names)
     A = slopes_of_images(model, p, columns, xy, frame)

@@ -1,13 +1,15 @@
 """Accuracy of a calibration: uncertainty maps, coverage of the image, comparison of two halves."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
@@ -23,13 +25,13 @@ from jaxbundle.statistics.projection import (
 )
 
 GRID = (11, 9)
-"""Columns and rows of the grid of a map."""
+"""Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ is
+smooth, and changes little between neighbours."""
 DRAWN = (21, 17)
-"""The same for a figure, with σ interpolated in between."""
-CELLS = (12, 9)
-"""Columns and rows of the cells in which coverage is counted."""
-HELD_OUT_FEWEST = 4
-"""Minimum number of photographs for calibrations from halves."""
+"""Those of the grid of a figure, half as far apart, with σ interpolated in between."""
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 
 @print_in_one_screen
@@ -51,7 +53,7 @@ class UncertaintyMap:
     def sigma(self) -> Float[np.ndarray, "rows columns"]:
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 2)
 
-    def to_xarray(self):
+    def to_xarray(self) -> "Dataset":
         """σ and covariance over u and v (pixels), as an `xarray.Dataset` (extra `grids`)."""
         axes = np.array(["u", "v"])
         return data_set(
@@ -81,14 +83,16 @@ class UncertaintyMap:
         return float(np.fmax.reduce(_in_corners(self.sigma)))
 
 
-def grid_of(image_size, columns: int = GRID[0], rows: int = GRID[1]):
+def grid_of(
+    image_size: tuple[int, int] | Sequence[float], columns: int = GRID[0], rows: int = GRID[1]
+) -> Float[np.ndarray, "rows columns 2"]:
     """A grid from corner to corner of an image, pixels [rows, columns, 2]."""
     w, h = image_size
     return np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1)
 
 
 def uncertainty_map(
-    adjustment,
+    adjustment: Adjustment,
     camera: str,
     distance: float = np.inf,
     frame: str = "scene",
@@ -155,8 +159,8 @@ def over_distance(
             for own in near
         ]
     )
-    of = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
-    return of(middle), np.fmax.reduce(of(variance.T))
+    interpolate = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
+    return interpolate(middle), np.fmax.reduce(interpolate(variance.T))
 
 
 @print_in_one_screen
@@ -174,12 +178,19 @@ class Coverage:
     reach: float
 
     @property
-    def part(self) -> float:
+    def take_images(self) -> float:
         return float((self.counts > 0).mean())
 
 
-def coverage(uv: Float[np.ndarray, "n 2"], image_size, cells=CELLS) -> Coverage:
-    """The coverage of an image by measured points, pixels."""
+def coverage(
+    uv: Float[np.ndarray, "n 2"],
+    image_size: tuple[int, int] | Sequence[float],
+    cells: tuple[int, int] = (12, 9),
+) -> Coverage:
+    """The coverage of an image by measured points, pixels.
+
+    **Arguments:** `cells`: columns and rows, squares in an image of 4 : 3; more would stay empty
+    between the points of a board."""
     uv = uv[np.isfinite(uv).all(1)]
     (w, h), (columns, rows) = image_size, cells
     counts, *_ = np.histogram2d(
@@ -222,13 +233,13 @@ class CrossValidation:
     comparison: Comparison | None
 
 
-def kept_rays(adjustment):
+def kept_rays(adjustment: Adjustment) -> Bool[np.ndarray, " rays"]:
     """Which observations of the adjusted network were not removed as gross errors."""
     weight = np.asarray(adjustment.problem.data.image_weight)
     return (weight > 0).all(1)
 
 
-def cross_validation(result) -> CrossValidation | None:
+def cross_validation(result: Adjustment) -> CrossValidation | None:
     """Calibrate from every other photograph, and test that camera on the rest.
 
     **Arguments:** the adjustment of one camera: its start values are used, and its removed
@@ -237,18 +248,21 @@ def cross_validation(result) -> CrossValidation | None:
     **Returns:** None if there are too few photographs, or a half does not determine the camera.
     """
     network = result.problem.network
-    if len(network.images) < 2 * HELD_OUT_FEWEST:
+    if len(network.images) < 8:  # four photographs are few for a camera, fewer none
         return None
-    network = at_result(network, result)
+    network = start_at_result(network, result)
     turns = np.arange(len(network.images)) % 2
     try:
         again = partial(adjust, robust=result.robust)
-        halves = [again(part(network, turns == half)) for half in (0, 1)]
+        halves = [again(take_images(network, turns == half)) for half in (0, 1)]
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
         own = [half.camera_parameters(name) for half in halves]
-        held = [again(_held(part(network, turns == 1 - half), own[half])) for half in (0, 1)]
+        held = [
+            again(_with_fixed_camera(take_images(network, turns == 1 - half), own[half]))
+            for half in (0, 1)
+        ]
     except (InputError, NotSolvedError):
         return None
     if not all(other.converged for other in held):
@@ -269,7 +283,7 @@ def cross_validation(result) -> CrossValidation | None:
     )
 
 
-def _compare(camera: Camera, halves) -> Comparison | None:
+def _compare(camera: Camera, halves: Sequence[Mapping[str, float]]) -> Comparison | None:
     model = get_model(camera.model)
     try:
         return compare_cameras(
@@ -281,7 +295,9 @@ def _compare(camera: Camera, halves) -> Comparison | None:
         return None
 
 
-def at_result(network: Network, result, keep=None) -> Network:
+def start_at_result(
+    network: Network, result: Adjustment, keep: Bool[np.ndarray, " rays"] | None = None
+) -> Network:
     """The network with adjusted values as start values; parameters with a prior keep theirs, to
     which the prior refers. `keep`: remaining rays, by default those not removed."""
     camera, exterior = network.cameras[0], result.image_values
@@ -298,7 +314,7 @@ def at_result(network: Network, result, keep=None) -> Network:
     )
 
 
-def part(network: Network, keep) -> Network:
+def take_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
     """The network with some of its images and their rays."""
     images, rays = network.images, network.observations
     index = np.cumsum(keep) - 1
@@ -318,19 +334,21 @@ def part(network: Network, keep) -> Network:
     )
 
 
-def _held(network: Network, parameters) -> Network:
+def _with_fixed_camera(network: Network, parameters: Mapping[str, float]) -> Network:
     camera = dataclasses.replace(network.cameras[0], parameters=parameters, free=())
     return network.replace(cameras=(camera,))
 
 
-def _rms(adjustment) -> float:
+def _rms(adjustment: Adjustment) -> float:
     """√(Σ|v|²/points) in pixels."""
     camera = adjustment.problem.network.cameras[0]
     v, _ = residuals_in_pixels(adjustment, camera)
     return float(np.sqrt(np.nanmean((v**2).sum(1))))
 
 
-def residuals_in_pixels(adjustment, camera):
+def residuals_in_pixels(
+    adjustment: Adjustment, camera: Camera
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Residuals v [n, 2] of the image points of a camera, and the points [n, 2], in pixels; v is
     NaN where a point was removed."""
     problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from jaxbundle.arguments import show
 from jaxbundle.calibration.calibrate import calibrate
@@ -46,7 +47,7 @@ def calibrate_cameras(
     *,
     rig: bool = False,
     progress: Progress | None = None,
-    **options,
+    **options: Any,
 ) -> Calibrations:
     """Calibrate several cameras from photographs of one board.
 

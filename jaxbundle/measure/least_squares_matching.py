@@ -149,8 +149,7 @@ def match_least_squares(
     settings = settings or LeastSquaresSettings()
     n, dtype = template.shape[0], template.dtype
     start = start.astype(dtype)
-    mean = jnp.mean(template)
-    contrast = jnp.std(template)
+    mean, contrast = jnp.mean(template), jnp.std(template)
     textured = contrast > settings.min_contrast * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
     grey = ((template - mean) / unit).ravel()
@@ -160,23 +159,16 @@ def match_least_squares(
     # unknowns scaled by their effect at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
     computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
-
-    def normal_equations(p: Unknowns) -> tuple[Normal, Unknowns, Scalar]:
-        # forward, and stored: in reverse, or within the products, grey values are looked up again
-        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
-        return J.T @ J, J.T @ v, v @ v
-
     begin = size * _with_radiometry(start, other, x, y)
-    p, N, square, moving = _minimise(normal_equations, begin, steps, settings)
+    p, N, square, moving = _minimise(computed, grey, begin, steps, settings)
     Q, determined = _inverse(N, settings.min_pivot)
     contrast2 = (p[7] / size[7]) ** 2
     if blur > 0:
         M = _correlate(jax.jacfwd(computed)(p), n, blur)
         variance = square / (n * n - jnp.trace(Q @ M))
-        noise_gradients = variance * _expect_noise(contrast2, size, x, y, blur)
-        Q, real = _inverse(N - noise_gradients, settings.min_pivot)
-        determined &= real
-        C = variance * Q @ M @ Q
+        N = N - variance * _expect_noise(contrast2, size, x, y, blur)
+        Q, real = _inverse(N, settings.min_pivot)
+        determined, C = determined & real, variance * Q @ M @ Q
     else:
         variance = square / (n * n - UNKNOWNS)
         C, drawn = _white_noise(p, Q, determined, variance, contrast2, (size, x, y))
@@ -185,20 +177,19 @@ def match_least_squares(
             p, C = _bend(p, J, v, variance, bend, x, y, reach, settings.min_pivot)
         p = p + drawn
     p = p / size
-    affine = p[:6].reshape(2, 3)
     known = textured & determined & (p[7] > 0)
     return LeastSquaresMatch(
-        affine=affine,
+        affine=p[:6].reshape(2, 3),
         radiometry=jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
         covariance=jnp.where(known, C[2:6:3, 2:6:3], jnp.inf),
         sigma0=unit * jnp.sqrt(variance),
         correlation=jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
-        status=_status(affine, start, image.shape, n, textured, known, moving, settings),
+        status=_status(p, start, image.shape, n, textured, known, moving, settings),
     )
 
 
 def _status(
-    affine: Float[Array, "2 3"],
+    p: Unknowns,
     start: Float[Array, "2 3"],
     shape: tuple[int, ...],
     n: int,
@@ -208,6 +199,7 @@ def _status(
     settings: LeastSquaresSettings,
 ) -> Int[Array, ""]:
     """The first reason for the end of a matching."""
+    affine = p[:6].reshape(2, 3)
     middle = (jnp.asarray(shape[::-1]) - 1) / 2
     h = n // 2
     corners = jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], affine.dtype)
@@ -377,20 +369,27 @@ def _with_radiometry(
 
 
 def _minimise(
-    normal_equations: Callable[[Unknowns], tuple[Normal, Unknowns, Scalar]],
+    computed: Callable[[Unknowns], Pixels],
+    grey: Pixels,
     begin: Unknowns,
     steps: int,
     settings: LeastSquaresSettings,
 ) -> tuple[Unknowns, Normal, Scalar, Bool[Array, ""]]:
     """The unknowns, N, vᵀv, and whether they still change, after damped steps.
 
-    Marquardt's own rule (1963), λ by tenfold: a step is accepted if vᵀv does not grow, and the position decides about
-    the end, in pixels. The engine (`leastsquares/iterations/loop.py`) accepts by the gain ratio and
-    ends by the σ of the unknowns. Its limits for rounding are those of 64 bits, whereas windows are
-    matched in 32. Measured there on 512 windows of 17 × 17 pixels in pieces of 41 × 41, stopping at
-    0.1 σ: the same RMS error, 0.016 pixel, and the same time, 0.40 ms against 0.43; from starts up
-    to 2.5 pixels off it loses 6 matches, this rule 3; at 0.01 σ it loses 6 near ones to rounding.
+    Marquardt's own rule (1963), λ by tenfold: a step is accepted if vᵀv does not grow, and the
+    position decides about the end, in pixels. The engine (`leastsquares/iterations/loop.py`)
+    accepts by the gain ratio and ends by the σ of the unknowns; its limits for rounding are those
+    of 64 bits, whereas windows are matched in 32. Measured on 512 windows of 17 × 17 pixels in
+    pieces of 41 × 41, stopping at 0.1 σ: the same RMS error, 0.016 pixel, and the same time, 0.40
+    ms against 0.43 here; from starts up to 2.5 pixels off it loses 6 matches, this rule 3. At 0.01
+    σ it loses 6 of the near ones to rounding.
     """
+
+    def normal_equations(p: Unknowns) -> tuple[Normal, Unknowns, Scalar]:
+        # forward, and stored: in reverse, or within the products, grey values are looked up again
+        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
+        return J.T @ J, J.T @ v, v @ v
 
     def improve(state: tuple[Array, ...]) -> tuple[Array, ...]:
         count, p, N, g, square, damping, moving = state

@@ -12,14 +12,15 @@ mounting reveals.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import show
-from jaxbundle.batch.epochs import FEWEST, contradicting, epoch_keys
+from jaxbundle.batch.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
@@ -33,6 +34,7 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
 def calibrate_rig(
@@ -106,9 +108,9 @@ def calibrate_rig(
 
 
 def require_solved(found: Result) -> Result:
-    """The same.
+    """The result of an adjustment that converged.
 
-    **Raises:** `NotSolvedError` where it is not solved."""
+    **Raises:** `NotSolvedError` for another one."""
     if not found.converged:
         names = found.undetermined
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
@@ -120,7 +122,9 @@ def require_solved(found: Result) -> Result:
     return found
 
 
-def _poses(calibrations, keys):
+def _poses(
+    calibrations: Mapping[str, Calibration], keys: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """M and X0 of every camera at every epoch it saw."""
     return {
         name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
@@ -128,7 +132,9 @@ def _poses(calibrations, keys):
     }
 
 
-def _start_of_mountings(names, poses):
+def _start_of_mountings(
+    names: Sequence[str], poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """b and R of every camera, from the epochs it shares with one that has them already."""
     base, turn = {names[0]: np.zeros(3)}, {names[0]: np.eye(3)}
     while len(base) < len(names):
@@ -136,10 +142,10 @@ def _start_of_mountings(names, poses):
         common = lambda pair: poses[pair[0]].keys() & poses[pair[1]].keys()
         best = max(pairs, key=lambda pair: len(common(pair)))
         shared = [key for key in poses[best[0]] if key in common(best)]
-        if len(shared) < min(FEWEST, len(poses[best[1]])) or not shared:
+        if len(shared) < min(MIN_SHARED_EPOCHS, len(poses[best[1]])) or not shared:
             raise InputError(
-                f"camera {best[1]!r} shares {len(shared)} epochs with the others; {FEWEST} "
-                "photographs must be simultaneous"
+                f"camera {best[1]!r} shares {len(shared)} epochs with the others; "
+                f"{MIN_SHARED_EPOCHS} photographs must be simultaneous"
             )
         placed, name = best
         both = [(poses[placed][key], poses[name][key]) for key in shared]
@@ -154,7 +160,14 @@ def _start_of_mountings(names, poses):
     return base, turn
 
 
-def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
+def _start(
+    calibrations: Mapping[str, Calibration],
+    keys: Mapping[str, Sequence[str]],
+    poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    base: Mapping[str, np.ndarray],
+    turn: Mapping[str, np.ndarray],
+    epochs: Sequence[str],
+) -> Rig:
     """The rig with start values, and the image points that the calibration of each camera kept."""
     names, board = list(calibrations), next(iter(calibrations.values())).views.board
     middle = board.points.mean(0)
@@ -190,11 +203,13 @@ def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
 
 
 @partial(compile_once, static=())
-def _quaternions(matrices):
+def _quaternions(matrices: Float[AnyArray, "n 3 3"]) -> Float[Array, "n 4"]:
     return jax.vmap(quaternion_from_matrix)(matrices)
 
 
-def _rays(calibration: Calibration, keys, epochs):
+def _rays(
+    calibration: Calibration, keys: Sequence[str], epochs: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
     network, views = calibration.adjustment.problem.network, calibration.views
     rays, kept = network.observations, kept_rays(calibration.adjustment)
@@ -209,7 +224,9 @@ def _rays(calibration: Calibration, keys, epochs):
     )
 
 
-def _contradictions(rig: Rig, found, size):
+def _contradictions(
+    rig: Rig, found: Result, size: Float[np.ndarray, "cameras 2"]
+) -> dict[int, float]:
     """Epochs seen by several cameras that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
     v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]

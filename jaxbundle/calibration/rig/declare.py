@@ -20,7 +20,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
@@ -36,7 +36,7 @@ from jaxbundle.network.tables import EXTERIOR, Camera
 POSES = ("epoch", "mounting")
 
 
-def _scale(motion, mounting: PoseValue) -> PoseValue:
+def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
     """The bases scale with the object."""
     return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
 
@@ -122,7 +122,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
     return tables, observations
 
 
-def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
+def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
     """Adjust a rig from its start values; `options` are those of the solver.
 
     **Returns:** the result; not `converged` if undetermined.
@@ -142,7 +142,9 @@ def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
     return np.all(rig.in_order(problem.data.weight), axis=1)
 
 
-def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:
+def leave_out(
+    rig: Rig, found: Result, rays: Bool[np.ndarray, " n"], max_iterations: int = 50
+) -> Result:
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
     removed = [
@@ -160,7 +162,7 @@ def snoop_rig(found: Result, test: str, significance: float, max_iterations: int
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
     minimum = found.minimum
 
-    def again(problem, values) -> Solution:
+    def again(problem: Problem, values: Any) -> Solution:
         nonlocal minimum
         minimum = find_minimum(problem, values, max_steps=max_iterations + 1)
         return Result(problem, minimum).solution
