@@ -147,6 +147,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
         )
 
     parts, done = [], 0
+    # threads, not processes: compiled code leaves Python alone, and the programs are shared
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
             parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
@@ -169,6 +170,7 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> 
         if name not in OF_A_START
     }
     camera = np.arange(len(portion.cameras))[:, None]
+    # the solver saw only views that show anything, in front; the user's numbers of views come back
     for name in {"views", "removed", *OF_A_VIEW} & {*rows}:
         values = rows[name] if name != "removed" else rows[name][:, :, :points]
         rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
@@ -181,11 +183,14 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     solved = ended == CONVERGED
     undetermined = _undetermined(model, batch, ended, rows)
-    # why the views of a camera without a solution do not determine it
+    # Singular or at the limit: mostly the geometry of the views, which is then said in words
+    # instead of a status that only tells the symptom.
     weak = np.full(len(batch), "", dtype=object)
     for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
         points = batch.point if batch.point.ndim == 2 else batch.point[i]
         weak[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
+    # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
+    # determined
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
     for name in OF_A_VIEW:
         rows[name][~rows["views"]] = np.nan
@@ -195,6 +200,7 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
     ended = np.where(weak != "", WEAK, ended)
     ended = np.where(solved & undetermined.any(1), WEAK, ended)
+    # last, since it compares the cameras that have values
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
     del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
@@ -253,12 +259,14 @@ def _snoop(
         )
         if not len(open_ones):
             break
+        # the others get no points: they end at once as "too few points", and keep their rows
         left = np.zeros_like(weight)
         left[open_ones] = [cameras[i].used for i in open_ones]
         seen = dataclasses.replace(portion.seen, weight=left)
         again = solve(dataclasses.replace(portion, seen=seen))
         for name, values in rows.items():
             values[open_ones] = again[name][open_ones]
+    # neither with nor without: nothing says that the removed points are blunders
     lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
     for name, values in rows.items():
         values[lost] = first[name][lost]
@@ -313,6 +321,8 @@ def _portion_program(
         return solved, jnp.sum(residual_lengths(model, usable, solved.at))
 
     solved, lengths = key.for_every(calibrate)((seen, interior))
+    # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
+    # redundancy, 2·points − k − 6·views.
     variance = 2 * solved.cost / solved.redundancy
     covariance = variance[:, None, None] * solved.interior_cofactors
     points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))

@@ -104,7 +104,7 @@ def solve_camera(
         N: Float[Array, "views n n"], damping: Float[Array, ""]
     ) -> tuple[tuple[Array, Array], Float[Array, ""], Float[Array, ""]]:
         d_pose, d_interior = step(factorise(N, views, damping))
-        # −gᵀδ and δᵀDδ
+        # −gᵀδ and δᵀDδ: the decrease of the linear model is ½·(−gᵀδ + λ·δᵀDδ)
         g_pose, g_interior = N[:, :POSE, -1], N[:, POSE:-1, -1].sum(0)
         decrement = -jnp.sum(g_pose * d_pose) - jnp.vdot(g_interior, d_interior)
         D = jnp.diagonal(N, axis1=1, axis2=2)
@@ -112,6 +112,7 @@ def solve_camera(
         damped += jnp.vdot(D[:, POSE:-1].sum(0), d_interior**2)
         return (d_pose, d_interior), decrement, damped
 
+    # stopped before the first step: without redundancy the residuals vanish whatever the camera
     few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
         linearise,
@@ -122,6 +123,7 @@ def solve_camera(
         max_steps,
         ~few,
     )
+    # undamped: damping would make singular equations look determined
     factor = factorise(loop.equations, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])

@@ -46,6 +46,7 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
         found = re.findall(r"\d+", whole(name))
         return found[-1].lstrip("0") or "0" if found else ""
 
+    # equal names first: numbers of two cameras may be equal by chance
     for key in (whole, number):
         keys = {camera: [key(name) for name in given] for camera, given in names.items()}
         once = all("" not in k and len({*k}) == len(k) for k in keys.values())

@@ -114,6 +114,8 @@ def _attempts(
             fisheye = get_model("kannala-brandt")
             return _attempts(fisheye, fisheye.free, size)
         return [("opencv", SIMPLE, None), ("opencv", ("fx", "fy"), None)]
+    # The principal distance is always sought. A second attempt without the higher coefficients:
+    # what does not determine them may still determine a start.
     held = tuple(n for n in model.principal_distance if n not in free)
     attempts = [(model.name, (*held, *free), None)]
     if model.name == "opencv":
@@ -153,6 +155,7 @@ def parameters_of(
     c = (found["fx"] * width + found["fy"] * height) / 2
     centre = np.array([found["cx"], found["cy"]])
     x0, y0 = in_model_units(centre, model, image_size, (width, height)).tolist()
+    # OpenCV adds k1·r² to the ideal point; corrections are applied to the measured one
     sign = -1 if model.own_formula == "to_ideal" else 1
     parameters = {"c": c, "x0": x0, "y0": y0, "K1": sign * found["k1"] / c**2}
     parameters = {
@@ -183,6 +186,8 @@ def _fit(
     core = () if model.prior else model.principal_distance
     wanted = [n for n in model.parameters if n in (*core, *free) and n not in given]
     areas = [(xy.min(0), xy.max(0))]
+    # Over the measured area: beyond it the first camera is extrapolated, and a fit would follow
+    # that. Models with priors (splines) first over the whole image, where every knot gets a value.
     for area in [None, *areas] if model.prior else areas:
         try:
             cost = convert_camera(

@@ -166,6 +166,7 @@ class Batch:
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
+        # NaN is a missing point; infinite numbers are a fault of the camera, and end in its status
         there = ~np.any(np.isnan(X), axis=-1)
         visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
         seen = np.any(visible, axis=1)
@@ -192,6 +193,7 @@ class Batch:
         """Cameras in portions, separated by planar and spatial objects, and by number of views."""
         settings = settings or PortionSettings()
         points = self.xy.shape[2]
+        # few points: to whole vectors of 8 doubles, which cost nothing
         points = bucket(points) if points > 128 else -(-points // 8) * 8
         shown = self.visible.any(2) & self.finite[:, None]
         widths = self._widths(shown.sum(1), points, settings.points_worth_compiling)
@@ -241,6 +243,7 @@ class Batch:
             xy=wide(of_views(self.xy), size, *shape),
             weight=wide(visible.astype(float), size, *shape),
         )
+        # cameras that fill up the portion have the start values of the last one, and no points
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
         return Portion(
             cameras,
@@ -358,6 +361,7 @@ def _principal_axes(
     middle = X.sum(1) / number
     centred = np.where(seen[..., None], X - middle[:, None], 0.0)
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
+    # the longest first, right-handed: a flat object lies in the plane Z = 0, as `start` needs it
     axes = vectors[:, :, ::-1].swapaxes(1, 2)
     axes = axes * np.linalg.det(axes)[:, None, None]
     # flat with a thickness below 2 % of the second extent: start values of H, which neglect it, are

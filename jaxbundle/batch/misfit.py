@@ -67,11 +67,14 @@ def misfits(
 ) -> Bool[np.ndarray, " cameras"]:
     """Which solved cameras do not fit; `mean_length` of their residuals (pixels)."""
     found = np.zeros(len(rms), bool)
+    # A few blunders raise √(mean of squares), hardly the mean: their ratio is a test of one camera
+    # by itself, without knowing the noise.
     candidates = np.flatnonzero(solved & (rms > settings.negligible))
     limit = settings.max_tail * (2 / np.sqrt(np.pi))  # of a Rayleigh distribution: 2/√π
     found[candidates] = rms[candidates] > limit * mean_length[candidates]
     factor = settings.min_ratio_of_few
     if solved.sum() >= settings.min_cameras:
+        # in the logarithm, since an RMS is positive and its scatter proportional to it
         log = np.log(np.maximum(rms[solved], settings.negligible))
         spread = MEDIAN_DEVIATION_AS_SIGMA * np.median(np.abs(log - np.median(log)))
         factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * spread))

@@ -117,6 +117,7 @@ class Population:
         middle, deviation = self.spread(values)
         if np.isfinite(values).sum() < self.settings.min_cameras or not deviation > 0:
             return np.full(len(values), np.nan)
+        # s contains the usual σ already; only what a camera has on top of it widens its limit
         usual = np.nan_to_num(self.spread(sigma)[0])
         worse = np.maximum(np.nan_to_num(sigma) ** 2 - usual**2, 0.0)
         return (values - middle) / np.sqrt(deviation**2 + worse)
@@ -271,6 +272,7 @@ def _correlation(
     n = len(values)
     r = float(np.corrcoef(_ranks(with_it), _ranks(values))[0, 1])
     square = r * r * (n - 2) / max(1 - r * r, 1e-300)
+    # a rank correlation has no unit: the change of the median says how much it matters
     upper = with_it > np.median(with_it)
     change = np.median(values[upper]) - np.median(values[~upper]) if upper.any() else np.nan
     return Correlation(column, name, n, r, f_tail(square, 1, n - 2), float(change))
@@ -301,14 +303,15 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
             raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
+    # keys are PATH#CAMERA; a table of serial numbers knows only the camera
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
-    if all(at is None for at in place):
+    if all(row is None for row in place):
         raise InputError(f"{name}: none of its ids is that of a camera or input")
-    at = np.array([-1 if row is None else row for row in place], int)
+    chosen = np.array([-1 if row is None else row for row in place], int)
     found = {}
     for column in others:
-        values = np.append(_numbers(given, column), np.nan)
-        found[column] = values[at]
+        values = np.append(_numbers(given, column), np.nan)  # row −1: missing
+        found[column] = values[chosen]
     return found
 
 

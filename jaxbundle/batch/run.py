@@ -102,6 +102,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
         lines = JsonLines(file)
+        # all inputs are checked before anything is dropped: an error leaves the file as it was
         again = [
             key
             for work, share in zip(works, ours)
@@ -110,6 +111,7 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0
+        # by key, not by position, so that inputs may be added, left out, and reordered between runs
         have = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
         for work, share in zip(works, ours) if compute else ():
             chosen = np.array([i for i in share if work.keys[i] not in have], int)
@@ -144,6 +146,7 @@ def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict
 def key_of(path: str | Path, file: str | Path) -> str:
     """The path of an input relative to the folder of the result file, with / between folders."""
     folder, name = os.path.split(os.path.abspath(path))
+    # the folder without links, but not the input itself, whose name the user gave
     path = os.path.join(os.path.realpath(folder), name)
     try:
         path = os.path.relpath(path, os.path.dirname(os.path.realpath(file)))
@@ -163,6 +166,8 @@ def check_part(part: Sequence[int]) -> None:
 def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
     """Which cameras or networks of each input belong to a part."""
     ends = [0, *itertools.accumulate(numbers)]
+    # every N-th, not a block: inputs of similar size are often neighbours, and the parts take
+    # equally long
     ranges = [range(first, last) for first, last in zip(ends, ends[1:])]
     return [[i - r.start for i in r if i % part[1] == part[0] - 1] for r in ranges]
 

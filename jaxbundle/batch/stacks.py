@@ -157,6 +157,8 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
 
 def _rows(path: str | Path, name: str, file: Mapping[str, Any]) -> Any:
     """An array, or on demand the rows of a large uncompressed one with one row per camera."""
+    # a stack may exceed the memory: rows of an uncompressed array are read from the file when
+    # needed
     found = find_stored_rows(path, name) if name in BY_CAMERA else None
     cameras = found is not None and found.ndim in BY_CAMERA[name]
     truths = name == "visible"

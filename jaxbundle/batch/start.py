@@ -94,6 +94,7 @@ def start_values(
         given = (fx, fy) if len(names) == 2 else (0.5 * (fx + fy),)
         for name, f in zip(names, given):
             interior = interior.at[model.parameters.index(name)].set(f)
+    # K⁻¹·H or K⁻¹·P; excluded views get the pose R = 1 at a distance, whose image exists
     a = [(c[0] / fx, c[1] / fy, c[2]) for c in columns]
     axes, shift = (_pose_of_flat if flat else _pose_of_solid)(a)
     # rows of M, a view each
@@ -185,6 +186,7 @@ def _focal_of_flat(columns: Sequence[Column], usable: Bool[Array, " views"]) -> 
     """fx, fy by least squares of two equations a view (Zhang 2000)."""
     h, v = _unit(columns[0]), _unit(columns[1])
     d, e = (_unit([a + s * b for a, b in zip(*columns[:2])]) for s in (1, -1))
+    # h ⟂ v and, as |h| = |v|, (h + v) ⟂ (h − v): both linear in 1/fx², 1/fy²
     rows = [(p[0] * q[0], p[1] * q[1], -p[2] * q[2]) for p, q in ((h, v), (d, e))]
     total = lambda i, j: sum(jnp.sum(jnp.where(usable, r[i] * r[j], 0.0)) for r in rows)
     a, b, c, p, q = total(0, 0), total(0, 1), total(1, 1), total(0, 2), total(1, 2)
@@ -203,6 +205,7 @@ def _focal_of_solid(
     length = _norm(rows[2])
 
     def median(row: Column) -> Array:
+        # the third row of P is that of R, so the rest of the first has the length f
         along = _dot(row, third)
         f = _norm([a - along * b for a, b in zip(row, third)]) / length
         return jnp.nanmedian(jnp.where(usable, f, jnp.nan))

@@ -35,6 +35,7 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     """Parameters with part in the null space of the scaled reduced normal matrix."""
     finite = np.all(np.isfinite(reduced), axis=(1, 2))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
+    # before the elimination the diagonal is 1, so that an eigenvalue is the part that remains
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
     # a twentieth of the square of the direction: of those that nothing determines, the ones that

@@ -171,6 +171,7 @@ def plan_works(
         else:
             works[name] = _network(path, name, settings)
     if settings.board is not None and folders:
+        # corners are kept beside the results, except where these are no file (/dev/stdout)
         regular = os.path.isfile(file) or not os.path.exists(file)
         kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
         # the photographs of a folder are of one size
@@ -232,6 +233,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
             rows[i] |= of_photographs(views[i], brief)
         return [rows[i] for i in chosen]
 
+    # the board is a setting of the lines: other corners are found with another one
     lines = settings.of_cameras() | {"board": repr(found.board)}
     portion = sys.maxsize if settings.are_plain() else RIGS_A_WRITE
     return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=portion)
@@ -287,5 +289,6 @@ def network_row(path: str, overrides: Sequence[str] = (), **options: Any) -> dic
     except (InputError, NotSolvedError) as error:
         status = "bad input" if isinstance(error, InputError) else "not solved"
         return {"status": status, "error": str(error)}
+    # one broken network must not end a night of others
     except UNEXPECTED as error:
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}

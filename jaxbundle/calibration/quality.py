@@ -25,8 +25,8 @@ from jaxbundle.statistics.projection import (
 )
 
 GRID = (11, 9)
-"""Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ is
-smooth, and changes little between neighbours."""
+"""Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ
+is smooth, and changes little between neighbours."""
 DRAWN = (21, 17)
 """Those of the grid of a figure, half as far apart, with σ interpolated in between."""
 
