@@ -129,8 +129,8 @@ def _geometry(
         yield (
             f"only {steep} of {number} photographs look at the board from more than "
             f"{settings.min_tilt:.0f}° aside, fewer than {settings.min_tilted}: the principal "
-            "distance can hardly be separated from the distance of the board; take some tilted by 20° to "
-            "45°, to the left, to the right, up and down"
+            "distance can hardly be separated from the distance of the board; take some tilted by "
+            "20° to 45°, to the left, to the right, up and down"
         )
     turn = turns(rotation)
     apart = np.abs(turn[:, None] - turn) % 180

@@ -62,6 +62,8 @@ def find_missing_affinity(adjustment: Adjustment) -> MissingAffinity | None:
     columns = tuple(model.parameters.index(name) for name in names)
     found = linearise_image_points(adjustment.problem, adjustment.values, columns)
     score, S = lagrange_multipliers(adjustment, found, found.by_columns)
+    # S is the normal matrix of b after the elimination of all other unknowns (Schur): its inverse
+    # is the cofactor matrix of b as if it had been estimated with them
     cofactor = np.linalg.inv(S)
     b = -cofactor @ score
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))

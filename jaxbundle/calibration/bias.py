@@ -152,6 +152,9 @@ def find_bias(
         return None
     found = linearise_image_points(problem, adjustment.values)
     t, A = _equations(adjustment, found, cells)
+    # An orthonormal basis of what camera and board can move in all t: the projection needs no
+    # normal equations, whose condition is the square of that of A. Columns to the length 1, since
+    # k3 and f differ by ten powers of ten.
     U, size, _ = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), False)
     U = U[:, size > len(A) * np.finfo(float).eps * size[0]]
     left, degrees = t - U @ (U.T @ t), len(t) - U.shape[1]
@@ -192,6 +195,8 @@ def _gain(
 ) -> tuple[float, int]:
     """The decrease of vᵀPv by the parameters of B, and the number of independent ones."""
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
+    # Along the eigenvectors of S the coefficients are independent; a small eigenvalue is a field
+    # that the unknowns absorb, of which only the rest would be tested, that is rounding.
     score, S = lagrange_multipliers(adjustment, found, B)
     size, V = np.linalg.eigh(S)
     new = size > min_remainder
@@ -238,6 +243,7 @@ def cells_of_four(problem: Problem, grid: tuple[int, int]) -> Int[np.ndarray, "c
     used = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).all(1))
     place = np.full((len(problem.network.images), rows * columns), -1)
     place[problem.image[used], problem.point[used]] = used
+    # cells share no corner, so that their t are independent; an odd last row or column is not used
     place = place.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
     corners = [place[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
     place = np.stack(corners, 1)
@@ -252,9 +258,11 @@ def _equations(
     problem = adjustment.problem
     (name,) = (table.name for table in problem.layout.cameras)
     cut = lambda x: x[cells].reshape(len(cells), 8, -1)
+    # the last left singular vectors of J [8, 6] span what no pose of the cell can move
     N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
     t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
     of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
+    # a free or weighted board: its coordinates are columns of A, too
     free = problem.system.table("point").free.astype(bool)
     of_points = np.zeros((len(cells), 2, *free.shape))
     if free.any():

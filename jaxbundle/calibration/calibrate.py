@@ -97,6 +97,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     _check_given(camera_model, given)
     text("camera", camera)
     text("object_unit", object_unit)
+    # either downweighted or removed: a test of residuals that robust weights changed has no level
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
@@ -104,6 +105,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
+    # held parameters need no prior
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
         camera,
@@ -174,6 +176,7 @@ def board_network(
     board = views.board
     view, point = np.nonzero(views.visible)
     xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
+    # image coordinates in the unit of the model, σ in pixels: a pixel is not square in every camera
     sx, sy = (sigma_image or UNSTATED_BOARD_SIGMA) * np.array(unit_size(model, camera.pixel_size))
     role = "tie" if board_free else "fixed" if board_sigma is None else "control"
     X, Y, Z = board.points.T
@@ -197,6 +200,7 @@ def board_network(
         },
         sigma_origin=UNIT if sigma_image is None else STATED,
         datum="inner" if board_free else "control",
+        # residuals where noise arises: in the photograph, not in the ideal image without distortion
         residuals="measured",
         angle_unit="deg",
         image_unit=model.unit,

@@ -118,6 +118,8 @@ class ModelComparison:
         self.failed: dict[str, str] = dict(failed)
         self.folds, self.views, self.gross = folds, tuple(views), tuple(gross)
         self.best = min(self.candidates, key=lambda one: one.left_out)
+        # one standard error (Breiman et al.): between models that the scatter of the photographs
+        # cannot separate, the simpler one
         enough = [one for one in self.candidates if self.excess(one)[0] <= self.excess(one)[1]]
         self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
 
@@ -219,6 +221,8 @@ def compare_models(
             "not solved: none of the models: "
             + "; ".join(f"{name}: {why}" for name, why in failed.items())
         )
+    # Models are compared on the same observations: a photograph, or a point, that one of them could
+    # not use would make its residuals smaller. A point is gross if no model explains it.
     together = set.intersection(*({*one.views.names} for one in found.values()))
     common = [name for name in views.names if name in together]
     needed = folds + 4  # so that about four remain for the camera of a fold
@@ -227,7 +231,7 @@ def compare_models(
             f"{len(common)} photographs can be used by all models; {folds} folds need "
             f"{needed} at least: give more, or fewer folds"
         )
-    gross = set.intersection(*(_removed_points(one) for one in found.values()))
+    gross = set.intersection(*map(_removed_points, found.values()))
     candidates = []
     for name, one in found.items():
         candidate = _candidate(name, one, common, gross, folds)
@@ -270,6 +274,8 @@ def _candidate(
     if not again.converged:
         return f"{name}: all observations together: {again.termination}"
     squares = np.zeros(len(network.observations))
+    # every fold-th view, not a block: neighbouring photographs are alike, and a block would leave a
+    # part of the poses out
     turns = np.arange(len(network.images)) % folds
     for fold in range(folds):
         left = turns[network.observations.image] == fold
@@ -277,6 +283,8 @@ def _candidate(
         if not one.converged:
             return f"{name}: the photographs without those of fold {fold + 1}: {one.termination}"
         squares[left] = _squares(one, camera)[left]
+    # v is over σ, and the redundancy that of the image coordinates alone: k counts an unknown with
+    # a prior by the part that the image determines
     v = again.inspection.residuals.image
     redundancy = float(again.reliability.redundancy.image.sum())
     n, S = v.size, float(np.square(v).sum())

@@ -146,6 +146,7 @@ def _fill(
     write_text(folder / REPORT, head_line(origin) + calibration.report())
     write_text(folder / PAGE, compose_calibration(calibration, origin, choice))
     write_text(folder / RESULT, json_text(calibration.to_dict()))
+    # the report says why; files of a camera that is none would be used
     if not calibration.converged:
         return
     network = adjusted_network(calibration.adjustment)
@@ -224,6 +225,7 @@ def fill_rig(network: Network, folder: Path) -> None:
         if len(network.cameras) > 2 and kind.endswith("stereo"):
             continue
         target, refused = TARGETS[kind], ""
+        # as it is, else with the models that the format has, its best one first
         for model in (None, *target.models[:2]):
             try:
                 fitted, costs = network, {}

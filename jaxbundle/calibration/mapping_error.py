@@ -96,6 +96,7 @@ def _weights(H: Float[np.ndarray, "k k"], C: Float[np.ndarray, "k k"]) -> Float[
     """λ, by a root of H, in units of σ: C may be numerically singular, as for tied parameters."""
     sigma = np.sqrt(np.diagonal(C))
     unit = np.where(sigma > 0, sigma, 1.0)
+    # λ of C^½·H·C^½ are those of H^½ᵀ·C·H^½
     size, V = np.linalg.eigh(H * np.outer(unit, unit))
     root = V * np.sqrt(np.clip(size, 0, None))
     return np.clip(np.linalg.eigvalsh(root.T @ (C / np.outer(unit, unit)) @ root), 0, None)

@@ -71,6 +71,8 @@ def lagrange_multipliers(
         part = np.einsum("nrw,nrk->nkw", found.slopes[t], B)
         np.add.at(rows[t].swapaxes(0, 1), i, part)
     flat = B.reshape(-1, k)
+    # (JᵀB)ᵀ·Q·(JᵀB) by the factor that the adjustment holds: Q itself, thousands squared, is never
+    # made
     S = flat.T @ flat - adjustment.inspection.solution.propagate_rows(rows)
     return flat.T @ found.v.ravel(), S
 
@@ -98,6 +100,7 @@ def _linearise(
             )
             p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
             residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
+            # returned twice: value and derivatives in one pass
             residual = jnp.where(weight > 0, weight * residual, 0.0)
             return residual, residual
 

@@ -121,6 +121,8 @@ def uncertainty_map(
         views = np.flatnonzero(network.images.camera == c)
         p = np.array(list(adjustment.camera_parameters(camera).values()))
         there = np.flatnonzero(have_rays(model, p, xy))
+        # fixed in the scene, a point moves with the pose of each view as well, and poses are
+        # correlated with the camera: the whole covariance, by propagation through a function
         function = images_through_scene(model, c, views, adjustment.values, xy[there], distance)
         Q = adjustment.covariance_of(function).reshape(len(there), 2, len(there), 2)
         n = np.arange(len(there))
@@ -196,6 +198,7 @@ def coverage(
     counts, *_ = np.histogram2d(
         uv[:, 1], uv[:, 0], (rows, columns), ((-0.5, h - 0.5), (-0.5, w - 0.5))
     )
+    # a corner is about a quarter of the height and a sixth of the width: nearly a square
     top, left = max(rows // 4, 1), max(columns // 6, 1)
     corners = {
         "upper left": counts[:top, :left],
@@ -251,6 +254,7 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
     if len(network.images) < 8:  # four photographs are few for a camera, fewer none
         return None
     network = start_at_result(network, result)
+    # every other photograph, so that both halves have poses from all around
     turns = np.arange(len(network.images)) % 2
     try:
         again = partial(adjust, robust=result.robust)
@@ -267,12 +271,16 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         return None
     if not all(other.converged for other in held):
         return None
+    # independent halves: Σ(p₁ − p₂) = C₁ + C₂, scaled to σ before the solution, as f and k3 differ
+    # by ten powers of ten
     names, C = halves[0].camera_covariance(name)
     C = C + halves[1].camera_covariance(name)[1]
     d = np.array([own[0][n] - own[1][n] for n in names])
     scale = np.sqrt(np.diagonal(C))
     test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
-    rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
+    v = lambda half: residuals_in_pixels(half, half.problem.network.cameras[0])[0]
+    rms_of = lambda half: float(np.sqrt(np.nanmean((v(half) ** 2).sum(1))))
+    rms = lambda parts: float(np.sqrt(np.mean([rms_of(p) ** 2 for p in parts])))
     return CrossValidation(
         rms(halves),
         rms(held),
@@ -302,6 +310,7 @@ def start_at_result(
     which the prior refers. `keep`: remaining rays, by default those not removed."""
     camera, exterior = network.cameras[0], result.image_values
     parameters = result.camera_parameters(camera.id)
+    # a prior is an observation of the value it was stated for
     parameters |= {name: camera.parameters.get(name, 0.0) for name in camera.sigma}
     return network.replace(
         cameras=(dataclasses.replace(camera, parameters=parameters),),
@@ -337,13 +346,6 @@ def take_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
 def _with_fixed_camera(network: Network, parameters: Mapping[str, float]) -> Network:
     camera = dataclasses.replace(network.cameras[0], parameters=parameters, free=())
     return network.replace(cameras=(camera,))
-
-
-def _rms(adjustment: Adjustment) -> float:
-    """√(Σ|v|²/points) in pixels."""
-    camera = adjustment.problem.network.cameras[0]
-    v, _ = residuals_in_pixels(adjustment, camera)
-    return float(np.sqrt(np.nanmean((v**2).sum(1))))
 
 
 def residuals_in_pixels(

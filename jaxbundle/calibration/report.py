@@ -76,6 +76,7 @@ def _camera(calibration: "Calibration") -> list[str]:
     lines = heading(f"Camera ({calibration.adjustment.network.cameras[0].model})")
     free = calibration.sigma
     rows = []
+    # parameters held at zero are not part of the camera, to a reader
     for name, value in calibration.parameters.items():
         if name in free:
             rows.append((name, *estimate(value, free[name])))

@@ -155,6 +155,7 @@ class Calibration:
             self.rms,
             self._significance,
             get_model(self.camera.model),
+            # only if it was made: four more adjustments are not made for an advice
             self.__dict__.get("cross_validation"),
         )
         missed = find_missing_affinity(self.adjustment)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,6 @@ class Calibrations:
         return "\n\n".join([*parts, *(one.report() for one in self.cameras.values())])
 
 
-def _tell(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
-    progress(f"{stage} of {name}", done, total)
-
-
 def calibrate_cameras(
     photographs: Mapping[str, Sequence[str | Path] | BoardViews],
     board: Board | None = None,
@@ -71,7 +66,7 @@ def calibrate_cameras(
         tell = (
             progress
             if progress is None or len(photographs) == 1
-            else partial(_tell, progress, name)
+            else lambda stage, *numbers, name=name: progress(f"{stage} of {name}", *numbers)
         )
         try:
             found[name] = calibrate(given, board, camera=name, progress=tell, **options)

@@ -138,7 +138,8 @@ def stability(
     cameras = [camera for camera, _ in calibrations]
     names = _check(calibrations, at)
     p = np.array([[camera.parameters[name] for name in names] for camera in cameras])
-    C = np.array([_order(covariance, names) for _, covariance in calibrations])
+    orders = [[list(free).index(name) for name in names] for _, (free, _) in calibrations]
+    C = np.array([np.asarray(c[1])[np.ix_(i, i)] for i, (_, c) in zip(orders, calibrations)])
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
@@ -146,6 +147,7 @@ def stability(
     whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
     given = np.array([whole[name] for name in model.parameters])
     G, H = (mapping_form(cameras[0], given, names, frame=f) for f in ("camera", "rotation"))
+    # images by H, without rotation: what matters to a user who orients each photograph anew
     F = _without_rotation(G, H, sigma.mean(0))
     d = p - p.mean(0)
     found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
@@ -199,11 +201,6 @@ def _check(
     return tuple(names)
 
 
-def _order(covariance: Covariance, names: Sequence[str]) -> Float[np.ndarray, "k k"]:
-    order = [list(covariance[0]).index(name) for name in names]
-    return np.asarray(covariance[1])[np.ix_(order, order)]
-
-
 def _homogeneity(
     p: Float[np.ndarray, "epochs k"], C: Float[np.ndarray, "epochs k k"]
 ) -> Homogeneity:
@@ -237,6 +234,7 @@ def _line_of(
     x: Float[np.ndarray, " epochs"] | None = None,
 ) -> tuple[float, float, float, float]:
     """Mean, or slope against x, and its σ; τ about it, and the probability of χ² without τ."""
+    # about the mean of x, mean and slope are nearly independent
     A = np.ones((len(p), 1)) if x is None else np.stack([np.ones(len(p)), x - x.mean()], 1)
     degrees = len(p) - A.shape[1]
 
@@ -246,6 +244,7 @@ def _line_of(
         found = Q @ A.T @ (w * p)
         return found[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ found) ** 2)
 
+    # τ² is 0 if the epochs scatter no more than their σ, and at most the whole variance
     low, high = 0.0, float(np.var(p, ddof=1) * len(p))
     chi2 = fit(0.0)[2]
     if chi2 <= degrees:

@@ -55,8 +55,9 @@ def start_values(
     """
     while True:
         if len(views) < 2:
+            why = f" ({views.failed[0][0]}: {views.failed[0][1]})" if views.failed else ""
             raise InputError(
-                f"only {count(len(views), 'photograph')} can be used{_why(views)}; a camera needs "
+                f"only {count(len(views), 'photograph')} can be used{why}; a camera needs "
                 "several, 8 or more, from different directions"
             )
         solved = _solve(views, model, free)
@@ -64,6 +65,8 @@ def start_values(
         if not used.all():
             views = views.take(used, "its points are too few or lie on a line")
             continue
+        # Seen from behind in some views only: their numbering is wrong. In all views: the
+        # photographs may be mirrored, which is said but changes no residual.
         behind = solved.position[:, 2] < views.board.points[:, 2].mean()
         if behind.any() and not behind.all():
             views = views.take(~behind, MIRRORED)
@@ -71,6 +74,7 @@ def start_values(
         gross = _gross_views(views, solved)
         if not gross.any():
             break
+        # most views bad: nothing says which are right
         if gross.sum() > len(views) - 2:
             raise NotSolvedError(
                 "not solved: the photographs contradict one another: the points of "
@@ -82,10 +86,6 @@ def start_values(
         solved, views.xy[views.visible], views.image_size, model, free, pixel_size, given
     )
     return CalibrationStart(views, parameters, solved.position, solved.angles, bool(behind.all()))
-
-
-def _why(views: BoardViews) -> str:
-    return f" ({views.failed[0][0]}: {views.failed[0][1]})" if views.failed else ""
 
 
 def _solve(views: BoardViews, model: CameraModel, free: Sequence[str]) -> FirstCamera:
@@ -105,7 +105,12 @@ def _solve(views: BoardViews, model: CameraModel, free: Sequence[str]) -> FirstC
 
 def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " views"]:
     """Views with more than a third of gross residuals."""
-    v = _residuals(views, solved)
+    model, interior = solved.model, np.array(list(solved.interior.values()))
+    computed = images_of_board(
+        model, interior, solved.position, solved.rotation, views.board.points
+    )
+    # lengths of the residuals, pixels; NaN for missing points
+    v = np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
     typical = 1.4826 * np.nanmedian(v)
     # Gross: above 12 times the typical size (1.4826·median, as σ) and 3 pixels. The camera of the
     # start may have fewer coefficients than its model, and what they leave grows towards the
@@ -113,12 +118,3 @@ def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " v
     # Single blunders are left to data snooping.
     gross = v > max(12.0 * typical, 3.0)
     return gross.sum(1) > views.visible.sum(1) / 3
-
-
-def _residuals(views: BoardViews, solved: FirstCamera) -> Float[np.ndarray, "views points"]:
-    """Lengths of the residuals, pixels; NaN for missing points."""
-    model, interior = solved.model, np.array(list(solved.interior.values()))
-    computed = images_of_board(
-        model, interior, solved.position, solved.rotation, views.board.points
-    )
-    return np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)

@@ -75,23 +75,21 @@ def calibrate_rig(
             raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
     keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
     epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
-    poses = _poses(calibrations, keys)
+    # M and X0 of every camera at every epoch it saw
+    poses = {
+        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
+        for name, one in calibrations.items()
+    }
     base, turn = _start_of_mountings(list(calibrations), poses)
     rig = _start(calibrations, keys, poses, base, turn, epochs)
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
-    size = {
-        name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
-        for name, one in calibrations.items()
-    }
+    cameras = [one.camera for one in calibrations.values()]
+    size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
     left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
-    while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
-        left_out += [
-            (
-                rig.epochs[e],
-                f"does not fit the mounting (RMS {rms:.1f} px): photographs not simultaneous?",
-            )
-            for e, rms in bad.items()
-        ]
+    # each time from the start values: a wrong epoch may have led the adjustment far away
+    while (bad := _contradictions(rig, found, size)) and snooping:
+        why = "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
+        left_out += [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
@@ -122,16 +120,6 @@ def require_solved(found: Result) -> Result:
     return found
 
 
-def _poses(
-    calibrations: Mapping[str, Calibration], keys: Mapping[str, Sequence[str]]
-) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """M and X0 of every camera at every epoch it saw."""
-    return {
-        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
-        for name, one in calibrations.items()
-    }
-
-
 def _start_of_mountings(
     names: Sequence[str], poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -140,6 +128,8 @@ def _start_of_mountings(
     while len(base) < len(names):
         pairs = [(placed, name) for placed in base for name in names if name not in base]
         common = lambda pair: poses[pair[0]].keys() & poses[pair[1]].keys()
+        # the pair with most common epochs next (a maximal spanning tree): the start values of a
+        # camera may come through another one
         best = max(pairs, key=lambda pair: len(common(pair)))
         shared = [key for key in poses[best[0]] if key in common(best)]
         if len(shared) < min(MIN_SHARED_EPOCHS, len(poses[best[1]])) or not shared:
@@ -151,6 +141,7 @@ def _start_of_mountings(
         both = [(poses[placed][key], poses[name][key]) for key in shared]
         R = np.array([M2 @ M1.T for (M1, _), (M2, _) in both])
         b = np.array([M1 @ (X2 - X1) for (M1, X1), (_, X2) in both])
+        # the medoid, not a mean: a wrong epoch does not move it, and it needs no mean of rotations
         size = np.median(np.linalg.norm(b, axis=1)) + 1e-12
         apart = np.linalg.norm(R[:, None] - R, axis=(2, 3))
         apart += np.linalg.norm(b[:, None] - b, axis=2) / size

@@ -127,7 +127,9 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
 
     **Returns:** the result; not `converged` if undetermined.
     """
+    # only points that are seen carry the datum; the bases scale with them (`FLOATING`)
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
+    # the epochs, with six unknowns each and by far the most, are eliminated
     return adjust(
         *declare_rig(rig),
         eliminate="epoch",

@@ -234,6 +234,8 @@ class RigCalibration:
             for start, width, (k, table, row) in zip(starts, widths, places):
                 rows["mounting"][start : start + POSE, k] = np.eye(POSE)
                 rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
+            # unit rows for the wanted unknowns: only these columns of the cofactor matrix are
+            # computed
             Q = self.result.solution.propagate_rows(rows)
             self._covariances[names] = self.sigma0**2 * Q
         return self._covariances[names]
@@ -330,6 +332,7 @@ def _mounting(at: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
     R, angles, J = map(np.asarray, _to_angles(at))
     base = np.asarray(at.position)
     J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
+    # σ of |b|: the variance along b
     along = base / length if length else np.zeros(3)
     return Mounting(
         base,
