@@ -100,23 +100,11 @@ def solve_camera(
         N = normal_equations(model, free, seen, at)
         return N, jnp.where(jnp.all(jnp.isfinite(N)), 0.5 * jnp.sum(N[:, -1, -1]), jnp.nan)
 
-    def change(
-        N: Float[Array, "views n n"], damping: Float[Array, ""]
-    ) -> tuple[tuple[Array, Array], Float[Array, ""], Float[Array, ""]]:
-        d_pose, d_interior = step(factorise(N, views, damping))
-        # −gᵀδ and δᵀDδ: the decrease of the linear model is ½·(−gᵀδ + λ·δᵀDδ)
-        g_pose, g_interior = N[:, :POSE, -1], N[:, POSE:-1, -1].sum(0)
-        decrement = -jnp.sum(g_pose * d_pose) - jnp.vdot(g_interior, d_interior)
-        D = jnp.diagonal(N, axis1=1, axis2=2)
-        damped = jnp.sum(D[:, :POSE] * d_pose**2)
-        damped += jnp.vdot(D[:, POSE:-1].sum(0), d_interior**2)
-        return (d_pose, d_interior), decrement, damped
-
     # stopped before the first step: without redundancy the residuals vanish whatever the camera
     few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
         linearise,
-        change,
+        lambda N, damping: _change(N, views, damping),
         lambda at, d: retract(free, at, *d),
         start,
         lambda _: tolerance,
@@ -140,3 +128,16 @@ def solve_camera(
         jnp.where(lost, SINGULAR, status),
         loop.steps,
     )
+
+
+def _change(
+    N: Float[Array, "views n n"], views: Bool[Array, " views"], damping: Float[Array, ""]
+) -> tuple[tuple[Array, Array], Float[Array, ""], Float[Array, ""]]:
+    """The damped step δ, −gᵀδ and δᵀDδ: the linear model decreases by ½·(−gᵀδ + λ·δᵀDδ)."""
+    d_pose, d_interior = step(factorise(N, views, damping))
+    g_pose, g_interior = N[:, :POSE, -1], N[:, POSE:-1, -1].sum(0)
+    decrement = -jnp.sum(g_pose * d_pose) - jnp.vdot(g_interior, d_interior)
+    D = jnp.diagonal(N, axis1=1, axis2=2)
+    damped = jnp.sum(D[:, :POSE] * d_pose**2)
+    damped += jnp.vdot(D[:, POSE:-1].sum(0), d_interior**2)
+    return (d_pose, d_interior), decrement, damped

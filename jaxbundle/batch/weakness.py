@@ -66,24 +66,10 @@ def weak_geometry(
     X = centred @ axes[:2].T / size[0] * np.sqrt(len(points))
     tilts, middles, extents = [], [], []
     for view, seen in zip(xy, visible):
-        if seen.sum() < 6:
+        if seen.sum() < 6:  # four points determine a homography, two control it
             continue
-        middle = view[seen].mean(0)
-        extent = np.sqrt(((view[seen] - middle) ** 2).sum(1).mean())
-        x, ones = (view[seen] - middle) / extent, np.ones((int(seen.sum()), 1))
-        # the direct linear transformation of the plane (Hartley, 1997): four points, and two that
-        # control it
-        from_plane, zero = np.concatenate([X[seen], ones], 1), np.zeros((int(seen.sum()), 3))
-        A = np.concatenate(
-            [
-                np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
-                np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
-            ]
-        )
-        H = np.linalg.svd(A)[2][-1].reshape(3, 3)
-        line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
-        with np.errstate(all="ignore"):
-            tilts.append(line[:2] / line[2])
+        tilt, middle, extent = _find_tilt(X[seen], view[seen])
+        tilts.append(tilt)
         middles.append(middle)
         extents.append(extent)
     if len(tilts) < 2 or not np.isfinite(tilts).all():
@@ -105,3 +91,25 @@ def weak_geometry(
             "point from the tilt"
         )
     return ""
+
+
+def _find_tilt(
+    X: Float[np.ndarray, "n 2"], xy: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], float]:
+    """l of a view (`weak_geometry`), about the middle of its points and in units of their extent;
+    this middle and extent, pixels."""
+    middle = xy.mean(0)
+    extent = np.sqrt(((xy - middle) ** 2).sum(1).mean())
+    x, ones, zero = (xy - middle) / extent, np.ones((len(xy), 1)), np.zeros((len(xy), 3))
+    # the direct linear transformation of the plane (Hartley, 1997); its least singular vector
+    from_plane = np.concatenate([X, ones], 1)
+    A = np.concatenate(
+        [
+            np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
+            np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
+        ]
+    )
+    H = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
+    with np.errstate(all="ignore"):
+        return line[:2] / line[2], middle, extent

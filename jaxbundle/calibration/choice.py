@@ -205,17 +205,7 @@ def compare_models(
     folds = integer("folds", folds, 2)
     names = [check_model(model).name for model in models]
     views = views_of(photographs, board, progress)
-    found, failed = {}, {}
-    for name, model in zip(names, models):
-        try:
-            one = calibrate(views, model=model, cross_validation=False, **options)
-        except (InputError, NotSolvedError) as error:
-            failed[name] = str(error)
-            continue
-        if one.converged:
-            found[name] = one
-        else:
-            failed[name] = f"not solved: {one.adjustment.termination}"
+    found, failed = _calibrate_all(views, dict(zip(names, models)), options)
     if not found:
         raise NotSolvedError(
             "not solved: none of the models: "
@@ -242,6 +232,24 @@ def compare_models(
     if not candidates:
         raise NotSolvedError(f"not solved: {'; '.join(failed.values())}")
     return ModelComparison(candidates, failed, folds, common, sorted(gross))
+
+
+def _calibrate_all(
+    views: BoardViews, models: Mapping[str, str | CameraModel], options: Mapping[str, Any]
+) -> tuple[dict[str, Calibration], dict[str, str]]:
+    """The calibrations by the names of the models, and why others failed."""
+    found, failed = {}, {}
+    for name, model in models.items():
+        try:
+            calibration = calibrate(views, model=model, cross_validation=False, **options)
+        except (InputError, NotSolvedError) as error:
+            failed[name] = str(error)
+            continue
+        if calibration.converged:
+            found[name] = calibration
+        else:
+            failed[name] = f"not solved: {calibration.adjustment.termination}"
+    return found, failed
 
 
 def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:

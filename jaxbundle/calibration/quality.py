@@ -180,7 +180,7 @@ class Coverage:
     reach: float
 
     @property
-    def take_images(self) -> float:
+    def part(self) -> float:
         return float((self.counts > 0).mean())
 
 

@@ -159,8 +159,8 @@ def match_least_squares(
     # unknowns scaled by their effect at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
     computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
-    begin = size * _with_radiometry(start, other, x, y)
-    p, N, square, moving = _minimise(computed, grey, begin, steps, settings)
+    p = size * _with_radiometry(start, other, x, y)
+    p, N, square, moving = _minimise(computed, grey, p, steps, settings)
     Q, determined = _inverse(N, settings.min_pivot)
     contrast2 = (p[7] / size[7]) ** 2
     if blur > 0:
@@ -168,15 +168,14 @@ def match_least_squares(
         variance = square / (n * n - jnp.trace(Q @ M))
         N = N - variance * _expect_noise(contrast2, size, x, y, blur)
         Q, real = _inverse(N, settings.min_pivot)
-        determined, C = determined & real, variance * Q @ M @ Q
+        determined, C, drawn = determined & real, variance * Q @ M @ Q, 0
     else:
         variance = square / (n * n - UNKNOWNS)
         C, drawn = _white_noise(p, Q, determined, variance, contrast2, (size, x, y))
         if reach:
             J, v = jax.jacfwd(computed)(p), computed(p) - grey
             p, C = _bend(p, J, v, variance, bend, x, y, reach, settings.min_pivot)
-        p = p + drawn
-    p = p / size
+    p = (p + drawn) / size
     known = textured & determined & (p[7] > 0)
     return LeastSquaresMatch(
         affine=p[:6].reshape(2, 3),

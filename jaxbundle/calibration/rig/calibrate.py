@@ -57,22 +57,7 @@ def calibrate_rig(
     `NotSolvedError` if an adjustment does not converge.
     """
     check_test(snooping, significance)
-    if not isinstance(calibrations, Mapping):
-        raise InputError(
-            f"calibrations are {show(calibrations)}; expected a mapping from the "
-            "name of each camera to its Calibration"
-        )
-    if len(calibrations) < 2:
-        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
-    for name, one in calibrations.items():
-        if not isinstance(one, Calibration):
-            raise InputError(
-                f"calibrations: {name!r} is {show(one)}; expected the Calibration "
-                "that calibrate returns for this camera"
-            )
-        if not one.converged:
-            why = one.adjustment.termination
-            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    _check(calibrations)
     keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
     epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
     # M and X0 of every camera at every epoch it saw
@@ -93,16 +78,28 @@ def calibrate_rig(
         found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
     if snooping:
         found = snoop_rig(found, snooping, significance, max_iterations)
-    return RigCalibration(
-        dict(calibrations),
-        rig,
-        found,
-        left_out,
-        [
-            (rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
-            for e, rms in bad.items()
-        ],
-    )
+    why = "kept, but does not fit the mounting (RMS {:.1f} px)"
+    tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
+    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated)
+
+
+def _check(calibrations: Mapping[str, Calibration]) -> None:
+    if not isinstance(calibrations, Mapping):
+        raise InputError(
+            f"calibrations are {show(calibrations)}; expected a mapping from the "
+            "name of each camera to its Calibration"
+        )
+    if len(calibrations) < 2:
+        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
+    for name, one in calibrations.items():
+        if not isinstance(one, Calibration):
+            raise InputError(
+                f"calibrations: {name!r} is {show(one)}; expected the Calibration "
+                "that calibrate returns for this camera"
+            )
+        if not one.converged:
+            why = one.adjustment.termination
+            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
 
 
 def require_solved(found: Result) -> Result:
