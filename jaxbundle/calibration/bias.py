@@ -51,6 +51,7 @@ from jaxbundle.calibration.observation_equations import (
     linearise_image_points,
 )
 from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.calibration.quality import used_rays
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.distributions import f_tail, normal_quantile
 
@@ -240,7 +241,7 @@ def _board_fields(
 def cells_of_four(problem: Problem, grid: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
     """The image points of every complete cell of 2 × 2 points, in all photographs."""
     rows, columns = grid
-    used = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).all(1))
+    used = np.flatnonzero(used_rays(problem))
     place = np.full((len(problem.network.images), rows * columns), -1)
     place[problem.image[used], problem.point[used]] = used
     # cells share no corner, so that their t are independent; an odd last row or column is not used

@@ -37,10 +37,10 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import (
-    kept_rays,
     residuals_in_pixels,
     start_at_result,
     take_images,
+    used_rays,
 )
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.cameras import CameraModel, Comparison, compare_cameras, get_model
@@ -256,7 +256,7 @@ def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
     """Image and point of removed gross errors."""
     adjustment = calibration.adjustment
     ids = _ids(adjustment.problem.network)
-    return {ids[i] for i in np.flatnonzero(~kept_rays(adjustment))}
+    return {ids[i] for i in np.flatnonzero(~used_rays(adjustment.problem))}
 
 
 def _ids(network: Network) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
@@ -236,10 +237,9 @@ class CrossValidation:
     comparison: Comparison | None
 
 
-def kept_rays(adjustment: Adjustment) -> Bool[np.ndarray, " rays"]:
-    """Which observations of the adjusted network were not removed as gross errors."""
-    weight = np.asarray(adjustment.problem.data.image_weight)
-    return (weight > 0).all(1)
+def used_rays(problem: Problem) -> Bool[np.ndarray, " rays"]:
+    """Which image points have weight: those that were not removed as gross errors."""
+    return (np.asarray(problem.data.image_weight) > 0).all(1)
 
 
 def cross_validation(result: Adjustment) -> CrossValidation | None:
@@ -317,7 +317,7 @@ def start_at_result(
         images=dataclasses.replace(
             network.images, position=exterior[:, :3], angles=exterior[:, 3:]
         ),
-        observations=network.observations.take(kept_rays(result) if keep is None else keep),
+        observations=network.observations.take(used_rays(result.problem) if keep is None else keep),
         warnings=(),
         notes=(),
     )
@@ -356,7 +356,7 @@ def residuals_in_pixels(
     problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)
     weight = np.asarray(data.image_weight)
     v = adjustment.inspection.residuals.image
-    used = np.all(weight > 0, axis=1)
+    used = used_rays(problem)
     v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
     own = problem.camera == c

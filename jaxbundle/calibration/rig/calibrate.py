@@ -21,8 +21,8 @@ from jaxtyping import Array, Float
 
 from jaxbundle.arguments import show
 from jaxbundle.batch.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
+from jaxbundle.calibration import quality
 from jaxbundle.calibration.pixels import unit_size
-from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
 from jaxbundle.calibration.rig.result import RigCalibration
@@ -200,15 +200,15 @@ def _rays(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
     network, views = calibration.adjustment.problem.network, calibration.views
-    rays, kept = network.observations, kept_rays(calibration.adjustment)
+    rays, used = network.observations, quality.used_rays(calibration.adjustment.problem)
     row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
     epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
-    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[kept]]
+    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[used]]
     return (
         epoch,
-        np.array([point[id] for id in network.points.id])[rays.point[kept]],
-        rays.xy[kept],
-        rays.sigma[kept],
+        np.array([point[id] for id in network.points.id])[rays.point[used]],
+        rays.xy[used],
+        rays.sigma[used],
     )
 
 
