@@ -307,6 +307,7 @@ def _candidate(
         float(np.sqrt(_squares(again, camera).mean())),
         float(np.sqrt(squares.mean())),
         sums / counts,
+        # σ is estimated, so that −2·ln of the likelihood is n·ln(S/n) and a constant
         n * np.log(S / n) + 2 * k,
         n * np.log(S / n) + k * np.log(n),
     )
@@ -338,6 +339,7 @@ def _difference(best: Candidate, one: Candidate) -> Difference | None:
     covariances = covariance(best), covariance(one)
     C = expected_difference(comparison, *mappings, covariances, **sizes)
     size = unit_size(mappings[0][0], camera.pixel_size)[0]
+    # lengths over the σ of a length: √ of the trace
     sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
     ratio = comparison.length / sigma
     return Difference(

@@ -82,11 +82,13 @@ def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> st
 
 def file_name(name: str) -> str:
     """A name that is valid in a file system."""
+    # ASCII, not hidden, and short: camera names are free text, and folders go to other systems
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
 
 
 def files_of(names: Sequence[str]) -> list[str]:
     """Files that a calibration of these cameras may write, figures as patterns."""
+    # what may be replaced in a folder that is written again; anything else in it is somebody's
     found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
@@ -164,6 +166,7 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     model = get_model(network.cameras[0].model)
     if model.name not in FOREIGN:
         try:
+            # beyond 90° a perspective model has no image
             nearest = "kannala-brandt" if model.wide else "opencv"
             network, cost = convert_cameras(network, nearest)
         except InputError as error:
@@ -280,6 +283,7 @@ def fill_comparison(
 
 def save_plots(calibration: "Calibration", folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
+    # drawn when needed: most of the time of a figure is matplotlib's
     near = float(np.median(calibration.distances))
     drawings = {
         "coverage": ((7, 5.6), None, calibration.plot_coverage),
@@ -318,6 +322,7 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
+    # JSON has neither NaN nor infinity, and readers refuse what Python writes for them
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

@@ -82,6 +82,7 @@ def mapping_error(
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
+    # "measured": up to the farthest point from the distortion's centre, since distortion is radial
     farthest = farthest_measurements(problem, adjustment.values)[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]

@@ -152,6 +152,7 @@ def over_distance(
     so its variance is a quadratic polynomial in 1/d, found exactly by Lagrange interpolation of
     `maps` at three distances.
     """
+    # infinity is the point 0 of 1/d, and as good a node as any other
     near = np.array([1 / m.distance for m in maps])
     variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
@@ -262,6 +263,8 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
+        # each half with the camera of the other, whose poses alone are estimated: the residuals
+        # grow by what the camera does not know of unseen photographs
         own = [half.camera_parameters(name) for half in halves]
         held = [
             again(_with_fixed_camera(take_images(network, turns == 1 - half), own[half]))
@@ -357,6 +360,7 @@ def residuals_in_pixels(
     weight = np.asarray(data.image_weight)
     v = adjustment.inspection.residuals.image
     used = used_rays(problem)
+    # v is over σ in the adjustment
     v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
     own = problem.camera == c

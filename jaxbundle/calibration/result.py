@@ -48,6 +48,8 @@ class Calibration:
         self.views = views
         self.validated = validated
         self.adjustment = adjustment
+        # report, page, JSON and figures use the same maps, each a propagation of the whole
+        # covariance
         self._maps: dict[tuple, UncertaintyMap] = {}
 
     @property
@@ -181,6 +183,8 @@ class Calibration:
     def reported_maps(self) -> list[UncertaintyMap]:
         """Near (the median distance of the board), at ten times that, at infinity; and without the
         scene."""
+        # near the board the poses dominate, at infinity the camera; three distances also determine
+        # the whole curve (`quality.over_distance`)
         near = float(np.median(self.distances))
         chosen = (
             ("scene", near),

@@ -144,6 +144,7 @@ def stability(
     columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
+    # the derivatives of the image at the mean camera
     whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
     given = np.array([whole[name] for name in model.parameters])
     G, H = (mapping_form(cameras[0], given, names, frame=f) for f in ("camera", "rotation"))
@@ -217,6 +218,8 @@ def _without_rotation(
 ) -> Float[np.ndarray, "m k"]:
     """Functions F·p of the parameters that are invariant to rotation-like changes."""
     unit = np.outer(scale, scale)
+    # H·s = μ·G·s with a root of G, which is singular where changes of parameters cancel in the
+    # image
     size, U = np.linalg.eigh(G * unit)
     # changes that move no image are dropped: rounding of the squares in G
     seen = size > 1e-12 * size[-1]
@@ -261,6 +264,7 @@ def _trend(
     slope: float, sigma: float, tau: float, epochs: int
 ) -> tuple[float, float, float, float]:
     """Slope, σ, probability, τ; by Student's t where τ was estimated, else by the normal one."""
+    # t² ~ F(1, f): two-sided
     square = (slope / sigma) ** 2
     by_chance = f_tail(square, 1, epochs - 2) if tau else chi2_tail(square, 1)
     return slope, sigma, by_chance, tau

@@ -167,6 +167,8 @@ def _start(
         rotation.append(turn[name].T @ M)
         centre.append(X0 - M.T @ turn[name] @ base[name] - middle)
     place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
+    # points that the calibration of a camera removed as gross stay out: data snooping of the rig
+    # finds only what the mounting reveals
     rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
     epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
     free = {
@@ -222,5 +224,6 @@ def _contradictions(
     np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
+    # only epochs that several cameras saw can contradict the mounting
     bad = contradicting(rms, rays > 0, (number > 0).sum(1) > 1)
     return {int(e): float(rms[e]) for e in bad}

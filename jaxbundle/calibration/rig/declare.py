@@ -162,6 +162,7 @@ def snoop_rig(found: Result, test: str, significance: float, max_iterations: int
     """The result without blunders found by a test.
 
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
+    # each round from the last solution: a removed blunder moves it little
     minimum = found.minimum
 
     def again(problem: Problem, values: Any) -> Solution:

@@ -323,6 +323,7 @@ def _to_angles(mounting: PoseValue) -> tuple[Array, Array, Array]:
     """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
     block = Pose().prepare(mounting)
     R = block.rotation.matrix()
+    # angles near the given ones, so that κ does not jump by a full turn in the derivatives
     given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
     change = lambda d: exterior(Pose().move(block, tuple(d)), given)
     return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
