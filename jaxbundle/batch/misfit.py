@@ -22,6 +22,8 @@ from jaxbundle.cameras import CameraModel
 
 MEDIAN_DEVIATION_AS_SIGMA = 1.4826
 """The standard deviation of a normal distribution over its median absolute deviation, 1/Φ⁻¹(¾)."""
+NORMAL = 2 / np.sqrt(np.pi)
+"""√(mean of squares)/mean of the lengths of normal residuals (Rayleigh's distribution)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +72,7 @@ def misfits(
     # A few blunders raise √(mean of squares), hardly the mean: their ratio is a test of one camera
     # by itself, without knowing the noise.
     candidates = np.flatnonzero(solved & (rms > settings.negligible))
-    limit = settings.max_tail * (2 / np.sqrt(np.pi))  # of a Rayleigh distribution: 2/√π
-    found[candidates] = rms[candidates] > limit * mean_length[candidates]
+    found[candidates] = rms[candidates] > settings.max_tail * NORMAL * mean_length[candidates]
     factor = settings.min_ratio_of_few
     if solved.sum() >= settings.min_cameras:
         # in the logarithm, since an RMS is positive and its scatter proportional to it

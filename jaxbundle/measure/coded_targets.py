@@ -37,11 +37,12 @@ class RingSettings:
 
     **Fields:**
 
-    - `min_pixels`: area of a disc, pixels. A radius of 2.5; smaller ones have a ring of 2.5 pixels
-      or less, whose sectors blur into each other.
-    - `max_area_misfit`: of the area of a blob relative to the ellipse through its outline, which
-      is off by its raster too. Larger: letters and branches are tried as discs, which takes time
-      and is refused later by the ring; smaller: small discs are lost.
+    - `min_pixels`: area within the outline of a disc, pixels: a radius of 3; the sectors of smaller
+      ones, of 3 pixels, blur into each other.
+    - `max_area_misfit`: of the area of a blob relative to the ellipse through its outline. By the
+      raster alone discs are off by up to 0.09 at a radius of 3 and 0.03 at 5. Larger: letters and
+      branches are tried as discs, which takes time, and are refused by their ring; half: small
+      discs are lost.
     - `level_tolerance`: of the grey value of a sector or of the gap, in contrasts of the disc.
       Above 0.5 a sector is neither light nor dark; the smaller, the more blurred rings are refused.
     - `samples`: in every sector; a fifth at both of its ends is not used.

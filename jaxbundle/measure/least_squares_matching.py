@@ -74,7 +74,7 @@ class LeastSquaresSettings:
     **Fields:**
 
     - `last_step`: pixels; steps below this, anywhere in the window, end the iterations. A match of
-      good texture has a σ of 0.02 to 0.05, and the next step is far smaller.
+      good texture has a σ of 0.016, and the next step is far smaller.
     - `max_shift`: the centre may move from its start by this part of the side of the window: beyond
       half of it, nothing of the expected window is seen.
     - `min_scale`: smallest determinant of A relative to its start; below 0 it is mirrored.

@@ -37,21 +37,27 @@ Strips = Float[np.ndarray, "n 2 2 2"]
 class SaddleSettings:
     """How corners of four squares are fitted, and which are refused.
 
+    Half and double were tried on the rendered boards of `tests/measure/test_corner_accuracy.py`, 79
+    corners with an RMS error of 0.0051 pixel. What is not mentioned below changes nothing there: it
+    guards against dirt, blur and wrong detections, and is not critical.
+
     **Fields:**
 
     - `max_half`: most pixels from the corner: the lens bends lines; 10 make σ smaller by a fifth
-      and take twice the time.
+      and take twice the time (half: RMS 0.0091, double: 0.0050).
     - `complete`: pixels from the corner, in τ, for a blurred image, to separate edges from uneven
       light.
     - `part`: pixels used, from the corner, in distances to the nearest other corner; the rest is
-      room for the blur of the next edges, and for perspective.
+      room for the blur of the next edges, and for perspective (half: 0.0105, a quarter of the
+      corners lost; double: 0.0048).
     - `first_blur`: τ before it is estimated.
     - `min_blur`, `max_blur`: limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29.
     - `blur_to_reduce`, `min_rows_to_reduce`: τ from which the image is halved, and the rows or
       columns that it must have.
     - `min_strip`: narrowest strip or window, in τ: below, blurred edges are one.
     - `wide_strip`: a strip of this width, in τ, determines the step without the marker beside it,
-      whose place in a printed board is known to a pixel of the print only.
+      whose place in a printed board is known to a pixel of the print only (half: 0.0055, double:
+      0.0047).
     - `neglected`, `neglected_narrow`: σ, in τ·|n₁·n₂|, of what is not modelled beside markers under
       oblique lines, to whose sides they are not parallel; the second decreases by
       exp(−(width/τ)²/2). Found on rendered boards tilted by 50° and 65°.

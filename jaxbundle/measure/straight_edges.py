@@ -39,16 +39,21 @@ UNKNOWNS = 9
 class EdgeSettings:
     """How edges are fitted to the grey values beside them.
 
+    Half and double were tried on rendered markers (`tests/measure/test_corner_accuracy.py`), 48
+    corners with an RMS error of 0.0162 pixel and error/σ 1.04; what has no figures below hardly
+    changes either.
+
     **Fields:**
 
     - `blur_in_focus`: τ of a lens in focus, and the pixel: expected with a σ of a factor of e.
     - `min_blur`, `max_blur`: limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29, and the
       step of a blur of 4 is 30 pixels wide.
     - `max_columns`: rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a
-      quarter and take twice the time.
+      quarter and take twice the time (half: RMS 0.0178, double: 0.0158).
     - `reach`: pixels are used to this distance from the edge, in τ, and one pixel more: Φ(−3.5) =
       0.02 %, the step is complete.
-    - `clearance`: distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is left.
+    - `clearance`: distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is
+      left (half: RMS 0.0246, error/σ 1.58; double: 0.0300, for fewer pixels).
     - `parts`: of an edge that are compared, and left out singly: two or three pixels each at
       `max_columns`.
     - `max_part_shift`: of a part in its standard deviations: 2·Φ(−3.5) is once in 180 edges.

@@ -38,6 +38,10 @@ Pixels = Float[np.ndarray, " pixels"]
 class DiscSettings:
     """How a blurred disc is fitted to the rim of a target.
 
+    Half and double were tried on rendered discs (`tests/measure/test_corner_accuracy.py`), 48 with
+    an RMS error of 0.0075 pixel: no difference, but for half of `reach`, 0.0079, and of
+    `max_sector_shift`, 0.0077.
+
     **Fields:**
 
     - `reach`: pixels are used to this distance from the rim, in τ, and one more, but not beyond
