@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real
 
 from jaxbundle.measure.corner_quality import MAX_SIGMA, NO_EDGE, TOO_SMALL
-from jaxbundle.measure.straight_edges import EdgeFits, Edges, EdgeSettings, fit_edges, take
+from jaxbundle.measure.straight_edges import EdgeFits, EdgeSettings, StraightEdges, fit_edges, take
 
 Grey = Real[np.ndarray, "rows columns"]
 Quadrilaterals = Float[np.ndarray, "markers 4 2"]
@@ -134,7 +134,7 @@ def fit_marker_corners(
 
 
 def _find_reasons(
-    edges: Edges,
+    edges: StraightEdges,
     fits: EdgeFits,
     covariance: Float[np.ndarray, "markers 4 2 2"],
     settings: MarkerSettings,
@@ -169,7 +169,7 @@ def _fit_sides(
     cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
     blur: Float[np.ndarray, "markers 4"],
     coarse: bool,
-) -> tuple[Edges, EdgeFits, Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
+) -> tuple[StraightEdges, EdgeFits, Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
     """The sides of markers whose corners are expected at `xy`: edges, fits, corners, covariance."""
     edges, settings = _sides_of(xy, cells, fitting.border), fitting.settings
     # in groups of similar length, so that arrays have little padding
@@ -193,7 +193,11 @@ def _fit_sides(
     return edges, fits, *_intersect(edges, _with_model_errors(edges, fits, settings), len(xy))
 
 
-def _put(whole: Edges | EdgeFits, rows: Bool[np.ndarray, " sides"], part: Edges | EdgeFits) -> None:
+def _put(
+    whole: StraightEdges | EdgeFits,
+    rows: Bool[np.ndarray, " sides"],
+    part: StraightEdges | EdgeFits,
+) -> None:
     """Replace some rows of the arrays of a dataclass."""
     for field in dataclasses.fields(whole):
         getattr(whole, field.name)[rows] = getattr(part, field.name)
@@ -235,7 +239,7 @@ def edge_shift(
     along = end - start
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     ends = np.zeros((len(start), 2))
-    inside = Edges(
+    inside = StraightEdges(
         start,
         end,
         np.stack([start, -across], 1),
@@ -283,7 +287,7 @@ def _inner_edges(
     H: Float[np.ndarray, "markers 3 3"],
     bend: Float[np.ndarray, "4"],
 ) -> tuple[np.ndarray, ...]:
-    """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
+    """StraightEdges between light and dark cells of a marker, with the dark cell on the inner side: marker,
     start, end, factor 1 − s·(1 − 2·x/n), the part of a by the lens, narrowest cell.
 
     `bend`: c of the upper, right, lower and left side, which is how far they bulge. With x, y = −1
@@ -331,7 +335,7 @@ def _inner_edges(
     )
 
 
-def _with_model_errors(edges: Edges, fits: EdgeFits, settings: MarkerSettings) -> EdgeFits:
+def _with_model_errors(edges: StraightEdges, fits: EdgeFits, settings: MarkerSettings) -> EdgeFits:
     """The fits with the σ of what the model neglects in narrow strips added to a."""
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
     oblique = np.abs(
@@ -347,7 +351,7 @@ def _sides_of(
     xy: Quadrilaterals,
     cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
     border: int,
-) -> Edges:
+) -> StraightEdges:
     """The sides of markers as edges: upper, right, lower, left; each from corner k to k + 1."""
     n = cells.shape[1]
     following = np.roll(xy, -1, axis=1)
@@ -388,7 +392,7 @@ def _sides_of(
         far.append(along_and_inside(ticks, border)[0])
         level.append(turned[:, border].astype(float))
     flat = lambda x: np.stack(x, 1).reshape(4 * len(xy), -1)
-    return Edges(
+    return StraightEdges(
         xy.reshape(-1, 2),
         following.reshape(-1, 2),
         before.reshape(-1, 2, 2),
@@ -431,7 +435,7 @@ def _image(
 
 
 def _intersect(
-    edges: Edges, fits: EdgeFits, number: int
+    edges: StraightEdges, fits: EdgeFits, number: int
 ) -> tuple[Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
     """Corners [markers, 4, 2], corner k between the sides k − 1 and k, and their covariance."""
     side = np.arange(4 * number).reshape(number, 4)

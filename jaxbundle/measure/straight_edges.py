@@ -74,7 +74,7 @@ class EdgeSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Edges:
+class StraightEdges:
     """The expected edges: what is known of `n` of them before the fit.
 
     **Fields:** `start`, `end`, pixels, the inner side to the right of their direction as seen in
@@ -124,9 +124,11 @@ class EdgeFits:
     solved: Bool[np.ndarray, " n"]
 
 
-def take(edges: Edges, rows: Int[np.ndarray, " rows"]) -> Edges:
+def take(edges: StraightEdges, rows: Int[np.ndarray, " rows"]) -> StraightEdges:
     """Some of the edges."""
-    return Edges(*(getattr(edges, field.name)[rows] for field in dataclasses.fields(Edges)))
+    return StraightEdges(
+        *(getattr(edges, field.name)[rows] for field in dataclasses.fields(StraightEdges))
+    )
 
 
 def _right_of(along: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -136,13 +138,13 @@ def _right_of(along: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
 
 def fit_edges(
     grey: Real[np.ndarray, "rows columns"],
-    edges: Edges,
+    edges: StraightEdges,
     blur: Float[np.ndarray, " n"],
     curvature: float,
     settings: EdgeSettings,
     coarse: bool = False,
 ) -> EdgeFits:
-    """Edges in a photograph.
+    """StraightEdges in a photograph.
 
     **Arguments:** `grey` [rows, columns]; `blur`: expected τ, which chooses the pixels;
     `curvature`: prior σ of it, 1/pixels; `coarse`: the edges are only known to a few pixels.
@@ -206,7 +208,7 @@ class _Pixels:
     def choose(
         cls,
         grey: Real[np.ndarray, "rows columns"],
-        edges: Edges,
+        edges: StraightEdges,
         blur: Float[np.ndarray, " n"],
         settings: EdgeSettings,
     ) -> "_Pixels":
@@ -285,7 +287,7 @@ def _start(pixels: _Pixels, blur: Float[np.ndarray, " n"], coarse: bool) -> Thet
 
 
 def _pseudo_observations(
-    edges: Edges, curvature: float, settings: EdgeSettings
+    edges: StraightEdges, curvature: float, settings: EdgeSettings
 ) -> tuple[Theta, Theta]:
     """Weights 1/σ² and values of weak pseudo-observations, for where the pixels say nothing: c =
     curvature·half²/2 by the lens, the change of a level along the edge ±20 grey values, V ±100, τ
