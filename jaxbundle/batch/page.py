@@ -44,7 +44,10 @@ def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarra
         *_correlations(found, against),
         *_outlying(found),
     ]
-    first = give_verdict(_judge(found), (), "<h3>Status</h3>\n", _states(found))
+    counts = Counter(found.status.tolist()).most_common()
+    states = [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
+    shown = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
+    first = give_verdict(_judge(found), (), *shown)
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
     return Page(title, [first, *sections], origin, tables={"results": listed})
@@ -64,13 +67,6 @@ def _judge(found: Population) -> list[Finding]:
         )
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
-
-
-def _states(found: Population) -> str:
-    counts = Counter(found.status.tolist()).most_common()
-    return grid(
-        ("status", "number", "%"), [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
-    )
 
 
 def _rms(found: Population) -> list[Section]:

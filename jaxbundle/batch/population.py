@@ -333,10 +333,7 @@ def number_or_days(cell: str, where: str) -> float:
     try:
         return float(cell)
     except ValueError:
-        return _days(cell, where)
-
-
-def _days(cell: str, where: str) -> float:
+        pass
     try:
         date = datetime.fromisoformat(cell)
     except ValueError:

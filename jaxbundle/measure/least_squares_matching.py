@@ -147,8 +147,7 @@ def match_least_squares(
     **Returns:** `status` gives the reason of a failure; the covariance is infinite if undetermined.
     """
     settings = settings or LeastSquaresSettings()
-    n, dtype = template.shape[0], template.dtype
-    start = start.astype(dtype)
+    n, dtype, start = template.shape[0], template.dtype, start.astype(template.dtype)
     mean, contrast = jnp.mean(template), jnp.std(template)
     textured = contrast > settings.min_contrast * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
@@ -164,7 +163,8 @@ def match_least_squares(
     Q, determined = _inverse(N, settings.min_pivot)
     contrast2 = (p[7] / size[7]) ** 2
     if blur > 0:
-        M = _correlate(jax.jacfwd(computed)(p), n, blur)
+        J = jax.jacfwd(computed)(p)
+        M = _sum_over_pairs(J, n, lambda d: np.exp(-(d**2) / (4 * blur**2)))
         variance = square / (n * n - jnp.trace(Q @ M))
         N = N - variance * _expect_noise(contrast2, size, x, y, blur)
         Q, real = _inverse(N, settings.min_pivot)
@@ -294,25 +294,21 @@ def _bend(
     weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
     Q, _ = _inverse(J.T @ J + weight, min_pivot)
     step = Q @ (J.T @ v)
-    C = Q @ (_gather(J * (v - J @ step)[:, None], reach) + weight**2) @ Q
+    g, n = J * (v - J @ step)[:, None], round(len(v) ** 0.5)
+    K = lambda d: np.maximum(1 - np.abs(d) / reach, 0)
+    C = Q @ (_sum_over_pairs(g, n, K) + weight**2) @ Q
     return p - step[:UNKNOWNS], C[:UNKNOWNS, :UNKNOWNS]
 
 
-def _gather(g: Float[Array, "n*n k"], reach: int) -> Float[Array, "k k"]:
-    """Σ K(d)·g(x)·g(x + d)ᵀ over a square window."""
-    n = round(len(g) ** 0.5)
+def _sum_over_pairs(
+    g: Float[Array, "n*n k"], n: int, K: Callable[[np.ndarray], np.ndarray]
+) -> Float[Array, "k k"]:
+    """Σ K(dx)·K(dy)·g(x)·g(x + d)ᵀ over a window of n × n pixels; K separates, so that it takes 2·n
+    products a pixel instead of n²."""
     k = np.arange(n)
-    K = jnp.asarray(np.maximum(1 - np.abs(k[:, None] - k) / reach, 0), g.dtype)
-    near = jnp.einsum("ab,cd,bdp->acp", K, K, g.reshape(n, n, -1))
+    weight = jnp.asarray(K(k[:, None] - k), g.dtype)
+    near = jnp.einsum("ab,cd,bdp->acp", weight, weight, g.reshape(n, n, -1))
     return g.T @ near.reshape(g.shape)
-
-
-def _correlate(J: Float[Array, "n*n 8"], n: int, blur: float) -> Normal:
-    """JᵀRJ of a window of n × n pixels."""
-    k = np.arange(n)
-    K = jnp.asarray(np.exp(-((k[:, None] - k) ** 2) / (4 * blur**2)), J.dtype)
-    smooth = jnp.einsum("ab,cd,bdp->acp", K, K, J.reshape(n, n, UNKNOWNS))
-    return J.T @ smooth.reshape(J.shape)
 
 
 def _expect_noise(contrast2: Scalar, size: Unknowns, x: Pixels, y: Pixels, blur: float) -> Normal:

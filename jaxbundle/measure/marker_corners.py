@@ -287,7 +287,7 @@ def _inner_edges(
     H: Float[np.ndarray, "markers 3 3"],
     bend: Float[np.ndarray, "4"],
 ) -> tuple[np.ndarray, ...]:
-    """StraightEdges between light and dark cells of a marker, with the dark cell on the inner side: marker,
+    """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
     start, end, factor 1 − s·(1 − 2·x/n), the part of a by the lens, narrowest cell.
 
     `bend`: c of the upper, right, lower and left side, which is how far they bulge. With x, y = −1

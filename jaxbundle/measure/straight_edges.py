@@ -144,7 +144,7 @@ def fit_edges(
     settings: EdgeSettings,
     coarse: bool = False,
 ) -> EdgeFits:
-    """StraightEdges in a photograph.
+    """Edges in a photograph.
 
     **Arguments:** `grey` [rows, columns]; `blur`: expected τ, which chooses the pixels;
     `curvature`: prior σ of it, 1/pixels; `coarse`: the edges are only known to a few pixels.

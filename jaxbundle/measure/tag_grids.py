@@ -53,7 +53,9 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
             f"({board.dictionary}), or only of one row, found"
         )
     for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
-        corners = _corners_of_tags(board, place, columns)
+        # points of the board that are the corners of the tags, by their row from the top
+        i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
+        corners = i * 2 * board.columns + j
         near = _places(cv2, board.points[corners, :2], seen)
         if near is not None:
             break
@@ -89,14 +91,6 @@ def _read_tags(
     once = (ids < board.columns * board.rows) & (np.bincount(ids, minlength=1)[ids] == 1)
     seen = np.array([four[0] for four in corners], float).reshape(-1, 4, 2)
     return ids[once], seen[once]
-
-
-def _corners_of_tags(
-    board: Board, rows: Int[np.ndarray, " tags"], columns: Int[np.ndarray, " tags"]
-) -> Int[np.ndarray, "tags 4"]:
-    """The points of the board that are the corners of tags, by their row from the top."""
-    i, j = (2 * rows[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0])
-    return i * 2 * board.columns + j
 
 
 def _places(
