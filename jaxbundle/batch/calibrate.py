@@ -357,8 +357,8 @@ def _exterior_orientation(
     quaternion: Float[Array, "4"],
     shift: Float[Array, "3"],
     Q: Float[Array, "6 6"],
-    axes: Float[Array, "3 3"],
-    middle: Float[Array, "3"],
+    axes: Float[AnyArray, "3 3"],
+    middle: Float[AnyArray, "3"],
 ) -> tuple[Array, Array, Array, Array]:
     """M, X0, (ω, φ, κ) and their σ for σ₀ = 1 of one view, from the cofactors Q of (δt, δθ).
 

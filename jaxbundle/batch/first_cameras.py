@@ -23,6 +23,8 @@ from jaxbundle.errors import NotSolvedError
 SOLVED = ("opencv", "kannala-brandt", "snavely")
 """Models in pixels that `calibrate_batch` solves without start values."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
+Attempt = tuple[str, tuple[str, ...], dict[str, float] | None]
+"""Model, free parameters and start values."""
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
 """Fields of view tried if the views give no start values for a fisheye; between them every
 principal distance is within a third of one."""
@@ -107,7 +109,7 @@ def first_cameras(
 
 def _attempts(
     model: CameraModel, free: tuple[str, ...], size: tuple[float, float]
-) -> list[tuple[str, tuple[str, ...], dict[str, float] | None]]:
+) -> list[Attempt]:
     """Model, free parameters and start values of the attempts."""
     if _by_fit(model) or model.unit != "px":
         if _by_fit(model) and model.wide:
@@ -117,7 +119,7 @@ def _attempts(
     # The principal distance is always sought. A second attempt without the higher coefficients:
     # what does not determine them may still determine a start.
     held = tuple(n for n in model.principal_distance if n not in free)
-    attempts = [(model.name, (*held, *free), None)]
+    attempts: list[Attempt] = [(model.name, (*held, *free), None)]
     if model.name == "opencv":
         attempts.append(("opencv", (*held, *(n for n in free if n in SIMPLE)), None))
     if model.name == "kannala-brandt":
@@ -177,7 +179,7 @@ def _fit(
     model: CameraModel,
     free: Sequence[str],
     pixel_size: tuple[float, float] | None,
-    given: Mapping[str, float],
+    given: dict[str, float],
 ) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""

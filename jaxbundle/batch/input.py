@@ -103,7 +103,7 @@ def check_shapes(
     for number, thing in zip(xy.shape, ("camera", "view", "point")):
         if not number:
             raise InputError(f"image_points has no {thing}: its shape is {xy.shape}")
-    if visible.dtype.kind != "b" and not np.isin(visible, (0, 1)).all():
+    if visible.dtype.kind != "b" and not np.isin(np.asarray(visible), (0, 1)).all():
         raise InputError("visible must be true or false, or 1 or 0")
     if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(

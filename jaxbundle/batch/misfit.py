@@ -132,7 +132,7 @@ def _beyond(
 ) -> Bool[np.ndarray, "*points"]:
     """Which points are outside the image by more than `margin` times its size."""
     low = _corner(size, down)
-    return ((xy < low - margin * size) | (xy > low + (1 + margin) * size)).any(-1)
+    return np.any((xy < low - margin * size) | (xy > low + (1 + margin) * size), axis=-1)
 
 
 def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool) -> str:

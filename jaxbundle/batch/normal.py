@@ -37,7 +37,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 POSE = 6
 """Unknowns of a view: δt (3), δθ (3)."""
-ByPoint = Float[Array, "views points"]
+ByPoint = Float[AnyArray, "views points"]
 
 
 class Sightings(eqx.Module):
@@ -56,9 +56,9 @@ class Sightings(eqx.Module):
 class CameraUnknowns(eqx.Module):
     """The unknowns: all interior parameters; unit quaternion of M and t of every view."""
 
-    interior: Float[Array, " parameters"]
-    rotation: Float[Array, "views 4"]
-    shift: Float[Array, "views 3"]
+    interior: Float[AnyArray, " parameters"]
+    rotation: Float[AnyArray, "views 4"]
+    shift: Float[AnyArray, "views 3"]
 
 
 def normal_equations(

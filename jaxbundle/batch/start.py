@@ -120,8 +120,8 @@ def _ideal(
     u, v = seen.xy[..., 0], seen.xy[..., 1]
     if known:
         r, s, q = cameras.image_ray(model, tuple(interior), u, v)
-        front = q < steepest
-        return *(jnp.where(front, c, 0.0) for c in (-r / q, s / q)), front
+        front = jnp.less(q, steepest)
+        return jnp.where(front, -r / q, 0.0), jnp.where(front, s / q, 0.0), front
     x0, y0 = [interior[model.parameters.index(name)] for name in model.principal_point] or (0, 0)
     x, y = u - x0, v - y0
     return x, y if model.axes == "down" else -y, jnp.isfinite(x)
@@ -129,7 +129,7 @@ def _ideal(
 
 def _fit(
     seen: Sightings, x: ByPoint, y: ByPoint, axes: int, settings: StartSettings
-) -> tuple[list[Column], Bool[Array, " views"]]:
+) -> tuple[Sequence[Column], Bool[Array, " views"]]:
     """Columns (arrays of a view each) of H (2 axes) or P (3), w > 0 at the points; usable views."""
     nil = jnp.zeros_like(seen.weight)
     X, middle, size = _normalise(seen.weight, [seen.point[:, i] + nil for i in range(axes)])

@@ -10,6 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import SECTIONS, rig_settings
@@ -195,7 +197,7 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
 
     def cameras(chosen: Sequence[int], _: Tell) -> list[dict]:
         batch = calibrate_batch(
-            **stack.arguments(chosen),
+            **stack.arguments(np.asarray(chosen)),
             model=settings.model,
             free=settings.free,
             **settings.adjusting,

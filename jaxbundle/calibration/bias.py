@@ -278,7 +278,7 @@ def _equations(
     place = np.full(free.shape, -1)
     place[free] = width + np.arange(free.sum())
     of_table = np.full(v.interior.shape, -1)
-    moving = list(problem.system.table(name).space.moving)
+    moving = list(problem.system.table(name).vector.moving)
     of_table[:, moving] = np.arange(width)
     for x, weight, column in (
         (v.control, data.control_weight, place[problem.layout.given["control"]]),

@@ -35,6 +35,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.projection import have_rays, slopes_of_images
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
+from jaxbundle.types import present
 
 
 @print_in_one_screen
@@ -78,7 +79,7 @@ def mapping_error(
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     model = get_model(given.model)
-    uv = grid_of(given.image_size, *grid).reshape(-1, 2)
+    uv = grid_of(present(given.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
@@ -113,7 +114,7 @@ def mapping_form(
     """H of the named parameters of a camera at the values `p` of all: pixels²; `frame` "camera":
     that of A, without a rotation."""
     model = get_model(camera.model)
-    uv = grid_of(camera.image_size, *grid).reshape(-1, 2)
+    uv = grid_of(present(camera.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, camera.image_size, camera.pixel_size)
     return _form(camera, p, names, xy, frame)
 

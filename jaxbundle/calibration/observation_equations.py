@@ -91,7 +91,7 @@ def _linearise(
     ends = np.cumsum([s.width for s in spaces])
 
     def linearise_point(
-        touched: tuple[Any, ...], xy: Float[Array, "2"], weight: Float[Array, "2"]
+        touched: tuple[Any, ...], xy: Float[AnyArray, "2"], weight: Float[AnyArray, "2"]
     ) -> tuple[Array, Array]:
         def v(change: Float[Array, " directions"]) -> tuple[Array, Array]:
             *changes, b = jnp.split(change, ends)

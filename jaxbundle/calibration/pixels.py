@@ -36,7 +36,7 @@ def _images(
     points: Float[AnyArray, "points 3"],
 ) -> Float[Array, "views points 2"]:
     def image(
-        X0: Float[Array, "3"], M: Float[Array, "3 3"], X: Float[Array, "3"]
+        X0: Float[AnyArray, "3"], M: Float[AnyArray, "3 3"], X: Float[AnyArray, "3"]
     ) -> Float[Array, "2"]:
         return jnp.stack(project(model, tuple(p), *(M @ (X - X0))))
 

@@ -240,7 +240,7 @@ class CrossValidation:
 
 def used_rays(problem: Problem) -> Bool[np.ndarray, " rays"]:
     """Which image points have weight: those that were not removed as gross errors."""
-    return (np.asarray(problem.data.image_weight) > 0).all(1)
+    return np.all(np.asarray(problem.data.image_weight) > 0, axis=1)
 
 
 def cross_validation(result: Adjustment) -> CrossValidation | None:

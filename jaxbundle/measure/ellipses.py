@@ -52,7 +52,7 @@ def fit_ellipse(
 
     **Returns:** NaN if the points determine no ellipse.
     """
-    p = jnp.ones(xy.shape[0]) if weights is None else weights
+    p = jnp.ones(xy.shape[0]) if weights is None else jnp.asarray(weights)
     xy = jnp.where(p[:, None] > 0, xy, 0.0)
     middle = p @ xy / jnp.sum(p)
     size = jnp.sqrt(p @ jnp.sum((xy - middle) ** 2, 1) / jnp.sum(p))

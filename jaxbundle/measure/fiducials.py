@@ -164,7 +164,7 @@ def _in_source_units(
 ) -> tuple[Float[Array, " u"], Float[Array, "u u"]]:
     """Parameters for (x, y) from those for (x − middle)/size, and their derivatives."""
 
-    def convert(q: Float[Array, " u"]) -> Float[Array, " u"]:
+    def convert(q: Float[AnyArray, " u"]) -> Float[Array, " u"]:
         (mx, my), k = middle, size
         if kind == "similarity":
             a, b = q[0] / k, q[1] / k

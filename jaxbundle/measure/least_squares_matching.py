@@ -50,6 +50,7 @@ Optical Engineering 39(11); Unser (1999), Splines, IEEE Signal Processing Magazi
 import dataclasses
 from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -64,7 +65,7 @@ UNKNOWNS = 8
 """A [2, 3], row by row, h0, h1."""
 Unknowns = Float[Array, "8"]
 Normal = Float[Array, "8 8"]
-Pixels = Float[Array, " n*n"]
+Pixels = Float[AnyArray, " n*n"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +190,7 @@ def match_least_squares(
 
 def _status(
     p: Unknowns,
-    start: Float[Array, "2 3"],
+    start: Float[AnyArray, "2 3"],
     shape: tuple[int, ...],
     n: int,
     textured: Bool[Array, ""],
@@ -230,7 +231,7 @@ def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, 
 
 def grey_value(
     coefficients: Float[AnyArray, "rows columns"], u: Scalar, v: Scalar
-) -> Float[Array, ""]:
+) -> Float[AnyArray, ""]:
     """The grey value of an image at (u, v), by its `spline_coefficients`."""
     rows, columns = coefficients.shape
     i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
@@ -353,7 +354,7 @@ def _compute(
 
 
 def _with_radiometry(
-    start: Float[Array, "2 3"], image: Float[Array, "rows columns"], x: Pixels, y: Pixels
+    start: Float[AnyArray, "2 3"], image: Float[Array, "rows columns"], x: Pixels, y: Pixels
 ) -> Unknowns:
     """The eight unknowns: A, and h0, h1 from the mean and the variance of the covered pixels."""
     u, v = start @ jnp.stack([x, y, jnp.ones_like(x)])
@@ -386,7 +387,7 @@ def _minimise(
         J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
         return J.T @ J, J.T @ v, v @ v
 
-    def improve(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
         count, p, N, g, square, damping, moving = state
         # undetermined unknowns do not change: a unit diagonal, and a small addition
         scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)

@@ -136,6 +136,8 @@ def _correlations(
     return jax.lax.map(correlate, Z, batch_size=16)
 
 
-def _sample(grey: Float[Array, "rows columns"], places: Float[Array, "n 2"]) -> Float[Array, " n"]:
+def _sample(
+    grey: Float[AnyArray, "rows columns"], places: Float[AnyArray, "n 2"]
+) -> Float[Array, " n"]:
     """Grey values between the pixels, bilinear."""
     return jax.scipy.ndimage.map_coordinates(grey, [places[:, 1], places[:, 0]], order=1)

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.statistics.projection import interior_covariance_of_images
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray, Scalar
+from jaxbundle.types import AnyArray, Scalar, present
 
 if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
@@ -50,7 +50,7 @@ def _slopes(
     # Relative to the camera, in units of the distance.
     block = space.prepare(mounting._replace(position=jnp.zeros(3)))
 
-    def derive(xy: Float[Array, "2"]) -> Float[Array, "2 k"]:
+    def derive(xy: Float[AnyArray, "2"]) -> Float[Array, "2 k"]:
         ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
 
         def image(
@@ -83,10 +83,10 @@ def rig_uncertainty(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: a positive distance is expected")
     k = _index(rig, name)
-    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).space
+    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).vector
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
-    uv = grid_of(given.image_size, *grid)
+    uv = grid_of(present(given.image_size), *grid)
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
     C = rig.covariance(name)
     if frame == "rig":
@@ -111,7 +111,7 @@ def rig_points(rig: "RigCalibration", name: str) -> Float[np.ndarray, "n 2"]:
 
 def rig_coverage(rig: "RigCalibration", name: str) -> Coverage:
     """Coverage of the image of a camera by points of the rig."""
-    return coverage(rig_points(rig, name), rig.camera(name).image_size)
+    return coverage(rig_points(rig, name), present(rig.camera(name).image_size))
 
 
 def _index(rig: "RigCalibration", name: str) -> int:
