@@ -286,7 +286,7 @@ def _tests_program(
 ) -> Float[Array, "cameras views points"]:
     def test(
         arguments: tuple[Sightings, Array, CameraUnknowns, Array],
-    ) -> Float[Array, "views points"]:
+    ) -> Float[AnyArray, "views points"]:
         seen, used, at, views = arguments
         seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
         return point_tests(key.model, key.free, seen, seen.weight * used, at)

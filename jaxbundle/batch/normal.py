@@ -209,7 +209,7 @@ def retract(
 ) -> CameraUnknowns:
     """The unknowns after a change; every view rotates about the centre of the object."""
     return CameraUnknowns(
-        interior=at.interior.at[jnp.array(free)].add(d_interior),
+        interior=jnp.asarray(at.interior).at[jnp.array(free)].add(d_interior),
         rotation=jax.vmap(retract_quaternion)(at.rotation, d_pose[:, 3:]),
         shift=at.shift + d_pose[:, :3],
     )

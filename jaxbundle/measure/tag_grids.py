@@ -55,7 +55,7 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
         # points of the board that are the corners of the tags, by their row from the top
         i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
-        corners = i * 2 * board.columns + j
+        corners: Int[np.ndarray, "tags 4"] = i * 2 * board.columns + j
         near = _places(cv2, board.points[corners, :2], seen)
         if near is not None:
             break
