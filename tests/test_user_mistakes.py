@@ -8,10 +8,16 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
+from jaxbundle.bundle.mirrored import name_mirrored, name_other_side
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.control import read_control, with_control
-from jaxbundle.network.unit_mistakes import name_degrees, name_sigma_unit
+from jaxbundle.network.unit_mistakes import (
+    name_degrees,
+    name_sigma_unit,
+    name_unit_of_positions,
+)
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+from jaxbundle.orientation.network import without_placeholders
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -165,6 +171,25 @@ def test_a_sigma_that_is_only_poor_is_in_no_other_unit():
     assert name_sigma_unit(given.replace(observations=weights), 0.0015) == ""
 
 
+# --- start values that say nothing ----------------------------------------------------------
+
+
+def test_columns_of_zeros_are_no_start_values():
+    given = network()
+    assert without_placeholders(given) is given
+    images, points = given.images, given.points
+    zeros = given.replace(
+        images=dataclasses.replace(images, position=np.zeros((4, 3)), angles=np.zeros((4, 3))),
+        points=dataclasses.replace(points, position=np.zeros((25, 3))),
+    )
+    found = without_placeholders(zeros)
+    assert np.isnan(found.images.position).all() and np.isnan(found.points.position).all()
+    words = " ".join(found.warnings)
+    assert "all 25 tie points have one" in words and "all 4 images have one" in words
+    panorama = given.replace(images=dataclasses.replace(images, position=np.zeros((4, 3))))
+    assert without_placeholders(panorama) is panorama
+
+
 # --- names ----------------------------------------------------------------------------------
 
 
@@ -221,6 +246,51 @@ def test_flipped_images_without_start_values_are_named():
     given = with_xy(network(FREE, **CONTROL), lambda xy: xy * [1, -1])
     said = said_of(without_start_values(given))
     assert "y (or x) of the image coordinates (expected: mm" in said
+
+
+ALL_CONTROL = {"control": range(25), "control_sigma": 0.002, "datum": "control"}
+
+
+def start_of_images(given):
+    return dict(zip(given.images.id, given.images.position))
+
+
+def test_control_in_mm_beside_images_in_m_is_named_although_all_fits():
+    """Without tie points nothing contradicts it: the images move to where they see it."""
+    given = network(**ALL_CONTROL)
+    found = start_of_images(given)
+    assert name_unit_of_positions(given, found) == name_unit_of_positions(given, {}) == ""
+    said = name_unit_of_positions(given, {id: 999.7 * X for id, X in found.items()})
+    assert "are 999.7 times their start values: is the control in mm" in said
+
+
+def test_images_that_went_to_the_other_side_of_the_control_are_named():
+    """Of an object that is nearly a plane the mirror image fits about as well."""
+    given = network(FREE, **ALL_CONTROL)
+    found = start_of_images(given)
+    assert name_other_side(given, found) == ""
+    below = {id: X * [1, 1, -1] for id, X in found.items()}
+    said = name_other_side(given, below)
+    assert "4 images of 4 moved" in said and "exchange X and Y of the control" in said
+    nothing = {id: np.zeros(3) for id in found}  # start values that say nothing
+    images = dataclasses.replace(given.images, position=np.zeros((4, 3)))
+    assert name_other_side(given.replace(images=images), below) == ""
+    assert name_other_side(given, nothing) == ""
+
+
+def test_poor_start_values_are_not_taken_for_a_mirror_image():
+    """The mirrored images fit better than a solution that went astray, but as given they fit as
+    well from computed start values."""
+    given, sigma0 = network(FREE, **CONTROL), iter((3.0, 2.9))
+    assert name_mirrored(given, 1700.0, lambda network: next(sigma0)) == ""
+    assert next(sigma0, None) is None
+
+
+def test_coordinates_from_a_corner_are_named_without_the_size_of_the_image():
+    camera = dataclasses.replace(MM, image_size=None, pixel_size=None)
+    given = network().replace(cameras=(camera,))
+    assert name_image_extent(given) == ""
+    assert "counted from a corner?" in name_image_extent(with_xy(given, lambda xy: xy + HALF))
 
 
 def test_control_in_mm_beside_start_values_in_m_is_named_where_nothing_is_solved():

@@ -43,6 +43,8 @@ class MisfitSettings:
     - `negligible`: a smaller RMS is never a misfit, pixels; that of measured corners is larger.
     - `far_outside`: points farther outside the image, in image sizes, are not measurements.
     - `min_extent`: if the image points span less of the image, they are probably no pixels.
+    - `max_outside_of_good`: if a larger fraction is outside although the camera fits, its image has
+      another size: points found by correlation are never outside, and blunders are fewer.
     - `max_outside`: if a larger fraction of image points is outside the image, their axes are
       probably wrong.
     """
@@ -55,6 +57,7 @@ class MisfitSettings:
     negligible: float = 0.01
     far_outside: float = 1.0
     min_extent: float = 0.05
+    max_outside_of_good: float = 0.01
     max_outside: float = 0.5
 
 
@@ -185,6 +188,14 @@ def remarks(
         middle = rows["interior"][:, columns]
         good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
     remark = [""] * len(batch)
+    outside = (batch.visible & _beyond(batch.xy, frame, model.axes == "down", 0)).sum((1, 2))
+    part = outside / np.maximum(batch.visible.sum((1, 2)), 1)
+    for camera in np.flatnonzero(good & (part > DEFAULTS.max_outside_of_good)):
+        remark[camera] = (
+            f"{100 * part[camera]:.0f} % of the image points are outside the image of "
+            f"{frame[0]:g} × {frame[1]:g} pixels: is image_size right (width, height), or are x "
+            "and y exchanged?"
+        )
     beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))
     vague = rows["undetermined"].any(1)
     for camera in np.flatnonzero(~good & batch.finite):

@@ -32,7 +32,7 @@ from jaxbundle.bundle.minimum import (
     start_with,
     weakness_without_solution,
 )
-from jaxbundle.bundle.mirrored import name_mirrored
+from jaxbundle.bundle.mirrored import name_mirrored, name_other_side
 from jaxbundle.bundle.orient import orient, orient_again, screen
 from jaxbundle.bundle.readjust import (
     adjust_robustly,
@@ -53,15 +53,20 @@ from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.network.unit_mistakes import name_lengths, name_pixels, name_sigma_unit
+from jaxbundle.network.unit_mistakes import (
+    name_lengths,
+    name_pixels,
+    name_sigma_unit,
+    name_unit_of_positions,
+)
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
-from jaxbundle.orientation.network import Oriented, lacks_start_values
+from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
 from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.misfit import doubt_of_robust
+from jaxbundle.statistics.misfit import contradicts, doubt_of_robust
 from jaxbundle.types import Progress, present
 
 LARGEST_START_MISFIT = 0.1
@@ -143,7 +148,7 @@ def adjust(
         estimate_components=estimate_components,
         progress=progress,
     )
-    given = require_network(network)
+    given = without_placeholders(require_network(network))
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     mirror = partial(name_mirrored, given, try_again=partial(_try_mirrored, reduction, options))
     oriented = None
@@ -176,12 +181,25 @@ def adjust(
             found.eliminate_parameters(again, critical_t)
     result = found.adjustment(check)
     sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
+    if found.inspection:
+        result.findings += _compare_with_start(given, result)
     misfit = sigma0 is None or sigma0 > MISFIT
     # Only guesses so far: a mirrored system is not found by a look at the start values.
     if misfit and not also and not _name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0=sigma0):
             result.findings = (mirrored,)
     return result
+
+
+def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
+    """What start values of images show about units and axes of a solution, in words."""
+    images = result.problem.network.images
+    known = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
+    free = {id for id, free in zip(given.images.id, known) if free}
+    found = {id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free}
+    return tuple(
+        filter(None, (name_unit_of_positions(given, found), name_other_side(given, found)))
+    )
 
 
 def _try_mirrored(reduction: str | None, options, network: Network) -> float | None:
@@ -424,7 +442,12 @@ def _likely_causes(
         start = np.sqrt(2 * np.asarray(minimum.history.cost)[0] / problem.counts.observations)
         far = start * noise_of_rays(problem) > LARGEST_START_MISFIT
         sigma0 = _sigma0(problem, minimum)
-        causes = name_image_convention(network) if far else "", name_sigma_unit(network, sigma0)
+        poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
+        causes = (
+            name_image_convention(network) if far else "",
+            name_image_extent(network) if poor else "",
+            name_sigma_unit(network, sigma0),
+        )
         return tuple(filter(None, causes))
     told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
     conventions = _name_conventions(problem, minimum, inspection)

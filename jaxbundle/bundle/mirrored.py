@@ -10,15 +10,25 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.columns import count
 from jaxbundle.network.sightings import count_controlled_axes
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.conventions import EXPECTED, image_frame
+from jaxbundle.orientation.network import lacks_start_values
 
 MUCH_BETTER = 5.0
 """Least ratio of σ0 of the given images and of the mirrored ones; below, control is no witness."""
+SAME_DISTANCE = 2.0
+"""Largest ratio of the distances of an image and its mirror image from the points: start values of
+a block are good to a few percent, and those that say nothing (0, 0, 0) are seldom as far."""
+REMEDY = (
+    "exchange X and Y of the control (lists often give northing first), or reverse one of its axes "
+    "(a right-handed system is expected)"
+)
 FEWEST_AXES = 9
 """Controlled coordinates: those of three points, of which seven hold a similarity and two can
 contradict it."""
@@ -34,34 +44,69 @@ def name_mirrored(
     given = np.isfinite(network.images.sigma).any()
     if network.further or given or count_controlled_axes(network.points).sum() < FEWEST_AXES:
         return ""
-    try:
-        mirrored = try_again(_mirror(network))
-    except (InputError, NotSolvedError):
-        return ""
+    mirrored = _try(_without_start_values(_mirror(network)), try_again)
     if mirrored is None or MUCH_BETTER * mirrored > (sigma0 or MUCH_BETTER**2):
         return ""
+    # As given, from computed start values as well: else poor start values look like a mirror.
+    if not lacks_start_values(network):
+        plain = _try(_without_start_values(network), try_again)
+        if plain is not None and MUCH_BETTER * mirrored > plain:
+            return ""
     instead = f" instead of {sigma0:.3g}" if sigma0 else ""
     unit = get_model(network.cameras[0].model).unit
     axes = "v (or u)" if unit == "px" else "y (or x)"
     return (
         f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
-        "exchange X and Y of the control (lists often give northing first), or reverse "
-        f"one of its axes (a right-handed system is expected) or {axes} of the image coordinates "
-        f"(expected: {EXPECTED[unit]})"
+        f"{REMEDY} or {axes} of the image coordinates (expected: {EXPECTED[unit]})"
     )
 
 
+def name_other_side(network: Network, images: dict[str, Float[np.ndarray, "3"]]) -> str:
+    """That adjusted images are on the other side of the known points than their start values, at
+    about the same distance, in words; else empty. Images of a nearly plane object fit its mirror
+    image almost as well.
+
+    **Arguments:** `images`: adjusted projection centres by id."""
+    points = network.points
+    known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
+    rows = [k for k, id in enumerate(network.images.id) if id in images]
+    if known.sum() < 3 or not rows:
+        return ""
+    X = points.position[known]
+    normal = np.linalg.svd(X - X.mean(0))[2][2]
+    given = (network.images.position[rows] - X.mean(0)) @ normal
+    found = (np.array([images[network.images.id[k]] for k in rows]) - X.mean(0)) @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = -found / given
+    other = (ratio > 1 / SAME_DISTANCE) & (ratio < SAME_DISTANCE)
+    if 2 * other.sum() <= len(rows):
+        return ""
+    return (
+        f"{count(int(other.sum()), 'image')} of {len(rows)} moved from the start value to the "
+        f"other side of the control points, where their mirror image is seen: {REMEDY}"
+    )
+
+
+def _try(network: Network, try_again: Callable[[Network], float | None]) -> float | None:
+    try:
+        return try_again(network)
+    except (InputError, NotSolvedError):
+        return None
+
+
 def _mirror(network: Network) -> Network:
-    """The network with the second axis of its images in the other direction, without start
-    values."""
+    """The network with the second axis of its images in the other direction."""
     rays = network.observations
     centre = np.array([image_frame(camera)[0] for camera in network.cameras])
     middle = centre[network.images.camera[rays.image], 1]
     xy = np.stack([rays.xy[:, 0], 2 * middle - rays.xy[:, 1]], 1)
+    return network.replace(observations=dataclasses.replace(rays, xy=xy))
+
+
+def _without_start_values(network: Network) -> Network:
     images, points = network.images, network.points
     unknown, ties = np.full_like(images.position, np.nan), points.has_role("tie")[:, None]
     return network.replace(
-        observations=dataclasses.replace(rays, xy=xy),
         images=dataclasses.replace(images, position=unknown, angles=unknown),
         points=dataclasses.replace(points, position=np.where(ties, np.nan, points.position)),
     )

@@ -41,7 +41,6 @@ from jaxbundle.report.page import (
     Origin,
     Page,
     Section,
-    find,
     give_verdict,
 )
 from jaxbundle.report.page.markup import facts, grid, paragraph, text
@@ -322,7 +321,9 @@ class NetworkView:
         drawings = {"network-data": self._scene, "frames": describe_frames(found)}
         title = f"{clean(found.network.name) or 'network'}: explorer"
         shown_first = give_verdict(
-            find(found), found.warnings, facts(row for row in summary(found) if row[0] != "Note")
+            found.verdict.findings,
+            found.warnings,
+            facts(row for row in summary(found) if row[0] != "Note"),
         )
         sections = [
             shown_first,

@@ -8,6 +8,7 @@ confirms it, else as a likely cause if the adjustment fails.
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -64,6 +65,23 @@ def name_lengths(network: Network) -> list[str]:
     """Lengths that seem to be in mm and in m in one network, in words."""
     said = _control_against_ties(network), _distances_against_control(network)
     return [line for line in said if line]
+
+
+def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray, "3"]]) -> str:
+    """Whether all adjusted projection centres (by id) are a thousand times their start values, or a
+    thousandth, about the common origin: images in m beside control in mm, in words; else empty."""
+    rows = [k for k, id in enumerate(network.images.id) if id in images]
+    if not rows:
+        return ""
+    given = np.linalg.norm(network.images.position[rows], axis=1)
+    found = np.linalg.norm([images[network.images.id[k]] for k in rows], axis=1)
+    if not all(_thousand(a, b) for a, b in zip(given, found)):
+        return ""
+    return (
+        f"the adjusted projection centres are {found[0] / given[0]:.4g} times their start values: "
+        f"is the control in mm, or the start values in m? Expected is one unit of object "
+        f"coordinates, {network.object_unit}"
+    )
 
 
 def _check_field(camera: Camera, xy) -> str:

@@ -30,6 +30,8 @@ MOST_RAYS = 2000
 OUTSIDE_SHARE = 0.25
 """Part of the image points outside the image from which another origin is suspected: of centred
 coordinates three quarters are outside, of a few blunders less."""
+FEWEST_POINTS = 6
+"""Points that are all in one quadrant of an image by chance once in 4⁵ = 1000 times."""
 SMALL_PART = 0.02
 """Part of an image, about its first pixel, in which all points lie if they are in mm: sensors of 36
 mm have 2000 columns and more."""
@@ -124,10 +126,18 @@ def name_image_extent(network: Network) -> str:
     for c, given in enumerate(network.cameras):
         xy = network.observations.xy[camera == c]
         centre, half = image_frame(given)
-        if not len(xy) or not np.isfinite(half).all():
+        if not len(xy):
             continue
         unit = get_model(given.model).unit
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
+        if not np.isfinite(half).all():
+            if unit == "mm" and len(xy) >= FEWEST_POINTS and ((low > 0).all() or (high < 0).all()):
+                return (
+                    f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, "
+                    f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} mm, all on one side of the "
+                    f"image centre: are they counted from a corner? Expected are {EXPECTED[unit]}"
+                )
+            continue
         said = (
             f"camera {given.id!r}: the image coordinates run from {low[0]:.4g}, {low[1]:.4g} to "
             f"{high[0]:.4g}, {high[1]:.4g} {unit}, where the image is from "

@@ -112,6 +112,33 @@ def lacks_start_values(network: Network) -> bool:
     )
 
 
+def without_placeholders(network: Network) -> Network:
+    """The network without start values that say nothing, with a warning: of two and more tie points
+    that are all at one place, or images that all have one orientation, as of columns of zeros."""
+    images, points = network.images, network.points
+    position, angles, X = images.position, images.angles, points.position
+    said = []
+    tie = points.has_role("tie")
+    if tie.sum() > 1 and (X[tie] == X[tie][0]).all():
+        said.append(f"all {int(tie.sum())} tie points have one start value, {_numbers(X[tie][0])}")
+        X = np.where(tie[:, None], np.nan, X)
+    pose = np.concatenate([position, angles], 1)
+    if len(pose) > 1 and np.isnan(images.sigma).all() and (pose == pose[0]).all():
+        said.append(f"all {len(pose)} images have one start value, {_numbers(pose[0])}")
+        position, angles = np.full_like(position, np.nan), np.full_like(angles, np.nan)
+    if not said:
+        return network
+    computed = "; start values are computed: leave such columns empty"
+    return network.warn(*(f"{line}{computed}" for line in said)).replace(
+        images=dataclasses.replace(images, position=position, angles=angles),
+        points=dataclasses.replace(points, position=X),
+    )
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
 def find_start_values(
     network: Network, improve: Callable | None = None, tolerance: float = TOLERANCE
 ) -> Oriented:

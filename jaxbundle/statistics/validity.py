@@ -60,7 +60,7 @@ def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray,
     used = (np.asarray(data.image_weight) > 0).any(1)
     away = np.linalg.norm(np.asarray(data.image_xy) - centre[camera], axis=1)
     farthest = np.zeros(len(cameras))
-    np.maximum.at(farthest, camera[used], away[used])
+    np.fmax.at(farthest, camera[used], away[used])  # NaN: a camera without a solution
     return farthest
 
 
