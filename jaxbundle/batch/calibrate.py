@@ -12,14 +12,15 @@ cameras.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.camera import (
@@ -30,13 +31,14 @@ from jaxbundle.batch.camera import (
     SINGULAR,
     STATUS,
     WEAK,
+    CameraSolution,
     solve_camera,
 )
 from jaxbundle.batch.input import Batch, Portion
 from jaxbundle.batch.misfit import far_outside, misfits, remarks
-from jaxbundle.batch.normal import POSE, Calibration, Sightings, residual_lengths
+from jaxbundle.batch.normal import POSE, CameraUnknowns, Sightings, residual_lengths
 from jaxbundle.batch.result import BatchCalibration as BatchCalibration
-from jaxbundle.batch.snooping import ROUNDS, TESTS, Snooping
+from jaxbundle.batch.snooping import MAX_ROUNDS, TESTS, Snooping
 from jaxbundle.batch.start import start_values
 from jaxbundle.batch.test_values import point_tests
 from jaxbundle.batch.weakness import is_vague, vanishing, weak_geometry
@@ -51,19 +53,34 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.devices import on_accelerator
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Progress
+from jaxbundle.types import AnyArray, Progress
 
 OF_A_START = ("quaternion", "shift")
 """Poses in the form of the solver, only for data snooping."""
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+Rows = dict[str, Shaped[np.ndarray, "cameras *axes"]]
+"""Fields of a `BatchCalibration`, and what it is made of, by name."""
 
 TESTED = (CONVERGED, LIMIT, SINGULAR)
 """Statuses of cameras with residuals that data snooping can test."""
-MOST_FAILED = 60
-"""Data snooping of a camera ends after this number of rounds without a solution."""
 
 
-def calibrate_batch(
+class ProgramKey(NamedTuple):
+    """What is compiled into the programs of a call: the camera model, the columns of its free
+    parameters, whether the start values have focal lengths, and whether the cameras of a portion
+    come one after the other or all at once."""
+
+    model: CameraModel
+    free: tuple[int, ...]
+    known: bool
+    on_cpu: bool
+
+    def for_every(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """The function of one camera for all of a portion (see the module)."""
+        return partial(jax.lax.map, function) if self.on_cpu else jax.vmap(function)
+
+
+def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     object_points: Float[np.ndarray, "*cameras points 3"],
     image_points: Float[np.ndarray, "cameras views points 2"],
     image_size: tuple[int, int],
@@ -112,7 +129,7 @@ def calibrate_batch(
     one_of("snooping", snooping, TESTS, none=True)
     check_test(snooping, significance)
     threads = available_cores() if threads is None else integer("threads", threads)
-    batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
+    batch = Batch.check(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     if snooping is not None:
         down = camera_model.axes == "down"
@@ -120,13 +137,17 @@ def calibrate_batch(
         batch = dataclasses.replace(batch, visible=batch.visible & ~far)
     on_cpu = not on_accelerator()
     portions = list(batch.portions(on_cpu))
-    fixed = camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu
+    key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
 
-    def run(portion):
-        rows = _solve_portion(*fixed, portion)
-        return rows if snooping is None else _snoop(*fixed, portion, rows, snooping, significance)
+    def run(portion: Portion) -> Rows:
+        solve = partial(_solve_portion, key, max_iterations, batch.size)
+        rows = solve(portion)
+        return (
+            rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
+        )
 
     parts, done = [], 0
+    # threads, not processes: compiled code leaves Python alone, and the programs are shared
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
             parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
@@ -140,7 +161,7 @@ def calibrate_batch(
     return _result(camera_model, batch, rows)
 
 
-def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
+def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
     """The rows of the cameras of a portion, views at their original positions."""
     views, points = shape
     rows = {
@@ -149,6 +170,7 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> 
         if name not in OF_A_START
     }
     camera = np.arange(len(portion.cameras))[:, None]
+    # the solver saw only views that show anything, in front; the user's numbers of views come back
     for name in {"views", "removed", *OF_A_VIEW} & {*rows}:
         values = rows[name] if name != "removed" else rows[name][:, :, :points]
         rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
@@ -156,12 +178,19 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> 
     return rows
 
 
-def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
+def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     """Rows in the order of the cameras; NaN for no result."""
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
     solved = ended == CONVERGED
     undetermined = _undetermined(model, batch, ended, rows)
-    weak = _weak_geometry(batch, ended)
+    # Singular or at the limit: mostly the geometry of the views, which is then said in words
+    # instead of a status that only tells the symptom.
+    weak = np.full(len(batch), "", dtype=object)
+    for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
+        points = batch.point if batch.point.ndim == 2 else batch.point[i]
+        weak[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
+    # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
+    # determined
     rms = np.where(ended == LIMIT, rows["rms"], np.nan)
     for name in OF_A_VIEW:
         rows[name][~rows["views"]] = np.nan
@@ -171,6 +200,7 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
     ended = np.where(weak != "", WEAK, ended)
     ended = np.where(solved & undetermined.any(1), WEAK, ended)
+    # last, since it compares the cameras that have values
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
     del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
@@ -180,16 +210,9 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
-def _weak_geometry(batch: Batch, ended) -> np.ndarray:
-    """Why the views of cameras do not determine them, of those without a solution; ""."""
-    found = np.full(len(batch), "", dtype=object)
-    for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
-        points = batch.point if batch.point.ndim == 2 else batch.point[i]
-        found[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
-    return found
-
-
-def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:
+def _undetermined(
+    model: CameraModel, batch: Batch, ended: Int[np.ndarray, " cameras"], rows: Rows
+) -> Bool[np.ndarray, "cameras k"]:
     """Undetermined parameters, of cameras for which they can be found."""
     sigma = rows["sigma"]
     null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
@@ -199,104 +222,107 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
 
 
 def _snoop(
-    model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
-) -> dict:
+    key: ProgramKey,
+    solve: Callable[[Portion], Rows],
+    portion: Portion,
+    rows: Rows,
+    test: str,
+    significance: float,
+) -> Rows:
     """The rows of a portion without blunders; only cameras with removed points are solved again.
 
     A camera without a solution is tested where its iterations ended, since blunders may be the
     cause. If it has no solution without them either, it is unchanged.
     """
     weight = np.asarray(portion.seen.weight)
-    found = [Snooping(seen > 0, test, significance) for seen in weight]
+    cameras = [Snooping(seen > 0, test, significance) for seen in weight]
     open_ones = np.arange(len(portion.cameras))
     first = {name: values.copy() for name, values in rows.items()}
     failed = np.zeros(len(weight), int)
-    for _ in range(ROUNDS):
-        used = np.stack([camera.used for camera in found]).astype(float)
-        tests = np.asarray(
-            _tests_program(
-                model,
-                free,
-                on_cpu,
-                portion.seen,
-                used,
-                rows["interior"],
-                rows["quaternion"],
-                rows["shift"],
-                rows["views"],
-            )
-        )
+    for _ in range(MAX_ROUNDS):
+        used = np.stack([camera.used for camera in cameras]).astype(float)
+        at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+        tests = np.asarray(_tests_program(key, portion.seen, used, at, rows["views"]))
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
         failed += rows["status"] != CONVERGED
+        # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
+        # point of every view; larger or smaller: the time until it is given up.
         open_ones = np.array(
             [
                 i
                 for i in open_ones
                 if tested[i]
-                and failed[i] <= MOST_FAILED
-                and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
+                and failed[i] <= 60
+                and cameras[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
             ],
             int,
         )
         if not len(open_ones):
             break
+        # the others get no points: they end at once as "too few points", and keep their rows
         left = np.zeros_like(weight)
-        left[open_ones] = [found[i].used for i in open_ones]
+        left[open_ones] = [cameras[i].used for i in open_ones]
         seen = dataclasses.replace(portion.seen, weight=left)
-        again = dataclasses.replace(portion, seen=seen)
-        again = _solve_portion(model, free, known, max_steps, size, on_cpu, again)
+        again = solve(dataclasses.replace(portion, seen=seen))
         for name, values in rows.items():
             values[open_ones] = again[name][open_ones]
+    # neither with nor without: nothing says that the removed points are blunders
     lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
     for name, values in rows.items():
         values[lost] = first[name][lost]
     for i in np.flatnonzero(lost):
-        found[i].used = found[i].seen
-    rows["removed"] = np.stack([camera.seen & ~camera.used for camera in found])
+        cameras[i].used = cameras[i].seen
+    rows["removed"] = np.stack([camera.seen & ~camera.used for camera in cameras])
     return rows
 
 
-@partial(compile_once, static=range(3))
-def _tests_program(model, free, on_cpu, seen, used, interior, quaternion, shift, views):
-    def one(arguments):
+@partial(compile_once, static=0)
+def _tests_program(
+    key: ProgramKey,
+    seen: Sightings,
+    used: Float[AnyArray, "cameras views points"],
+    at: CameraUnknowns,
+    views: Bool[AnyArray, "cameras views"],
+) -> Float[Array, "cameras views points"]:
+    def test(
+        arguments: tuple[Sightings, Array, CameraUnknowns, Array],
+    ) -> Float[AnyArray, "views points"]:
         seen, used, at, views = arguments
         seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
-        return point_tests(model, free, seen, seen.weight * used, at)
+        return point_tests(key.model, key.free, seen, seen.weight * used, at)
 
-    every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
-    return every((seen, used, Calibration(interior, quaternion, shift), views))
+    return key.for_every(test)((seen, used, at, views))
 
 
-def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
+def _solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
     """The rows of a `BatchCalibration`, with the status as its number."""
-    result = _portion_program(
-        model,
-        free,
-        known,
-        portion.flat,
-        on_cpu,
-        max_steps,
-        size,
-        portion.seen,
-        portion.interior,
-        portion.axes,
-        portion.middle,
-    )
+    data = portion.seen, portion.interior, portion.axes, portion.middle
+    result = _portion_program(key, portion.flat, max_steps, size, *data)
     return jax.tree.map(np.array, result)
 
 
-@partial(compile_once, static=range(5))
+@partial(compile_once, static=(0, 1))
 def _portion_program(
-    model, free, known, flat, on_cpu, max_steps, size, seen, interior, axes, middle
-):
-    def one(arguments):
+    key: ProgramKey,
+    flat: bool,
+    max_steps: int,
+    size: float,
+    seen: Sightings,
+    interior: Float[AnyArray, "cameras parameters"],
+    axes: Float[AnyArray, "cameras 3 3"],
+    middle: Float[AnyArray, "cameras 3"],
+) -> dict[str, Array]:
+    model, free = key.model, key.free
+
+    def calibrate(arguments: tuple[Sightings, Array]) -> tuple[CameraSolution, Float[Array, ""]]:
         seen, interior = arguments
-        usable, start = start_values(model, flat, known, seen, interior, size)
+        usable, start = start_values(model, flat, key.known, seen, interior, size)
         solved = solve_camera(model, free, max_steps, size, usable, start)
         return solved, jnp.sum(residual_lengths(model, usable, solved.at))
 
-    every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
-    solved, lengths = every((seen, interior))
+    solved, lengths = key.for_every(calibrate)((seen, interior))
+    # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
+    # redundancy, 2·points − k − 6·views.
     variance = 2 * solved.cost / solved.redundancy
     covariance = variance[:, None, None] * solved.interior_cofactors
     points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
@@ -327,13 +353,19 @@ def _portion_program(
     )
 
 
-def _exterior_orientation(quaternion, shift, Q, axes, middle):
+def _exterior_orientation(
+    quaternion: Float[Array, "4"],
+    shift: Float[Array, "3"],
+    Q: Float[Array, "6 6"],
+    axes: Float[AnyArray, "3 3"],
+    middle: Float[AnyArray, "3"],
+) -> tuple[Array, Array, Array, Array]:
     """M, X0, (ω, φ, κ) and their σ for σ₀ = 1 of one view, from the cofactors Q of (δt, δθ).
 
     ray = M'·A·(X − X̄) + t, so that M = M'·A and X0 = X̄ − Mᵀ·t; A: the object's principal axes.
     """
 
-    def pose(change):
+    def pose(change: Float[Array, "6"]) -> tuple[Array, Array]:
         M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
         X0 = middle - M.T @ (shift + change[:3])
         return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M

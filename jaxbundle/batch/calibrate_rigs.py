@@ -5,19 +5,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from jaxbundle.arguments import integer, numeric_array, one_of, positive, show, vector
 from jaxbundle.batch.camera import SOLVED
 from jaxbundle.batch.input import any_model, free_parameters
 from jaxbundle.batch.population import Population
-from jaxbundle.batch.rigs import Rig, RigSettings, solve_rigs, with_free
+from jaxbundle.batch.rigs import RigSettings, RigViews, solve_rigs, with_free
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
+from jaxbundle.io.text.stored_rows import StoredRows
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.build import make_further
 from jaxbundle.network.columns import did_you_mean
@@ -63,7 +64,7 @@ class RigBatch:
         return Population({"key": str(id)} | row for id, row in zip(ids, self.rows))
 
 
-def calibrate_rigs(
+def calibrate_rigs(  # noqa: PLR0913 keyword arguments of a public function
     object_points: Float[np.ndarray, "*rigs points 3"],
     image_points: Float[np.ndarray, "rigs cameras epochs points 2"],
     image_size: tuple[int, int] | Sequence[tuple[int, int]],
@@ -135,9 +136,9 @@ def calibrate_rigs(
 
 def rig_settings(
     model: str | CameraModel,
-    free,
+    free: Sequence[str] | None,
     sections: Mapping[str, Any],
-    pixel_size=None,
+    pixel_size: float | tuple[float, float] | None = None,
     sigma_image: float | None = None,
     max_iterations: int = 100,
     snooping: str | None = None,
@@ -180,7 +181,13 @@ def rig_settings(
     )
 
 
-def rigs_of_arrays(points, xy, image_size, visible=None, cameras=None) -> list[Rig]:
+def rigs_of_arrays(
+    points: Float[np.ndarray, "*rigs points 3"],
+    xy: Float[np.ndarray, "rigs cameras epochs points 2"],
+    image_size: Any,
+    visible: Shaped[np.ndarray, "rigs cameras epochs points"] | None = None,
+    cameras: Sequence[str] | None = None,
+) -> list[RigViews]:
     """The rigs of checked arrays of numbers.
 
     **Raises:** `InputError`."""
@@ -193,13 +200,17 @@ def rigs_of_arrays(points, xy, image_size, visible=None, cameras=None) -> list[R
     if visible is not None:
         xy = np.where(np.asarray(visible, bool)[..., None], xy, np.nan)
     return [
-        Rig(names, sizes, images, epochs, points if points.ndim == 2 else points[i], xy[i])
+        RigViews(names, sizes, images, epochs, points if points.ndim == 2 else points[i], xy[i])
         for i in range(len(xy))
     ]
 
 
 def check_rigs(
-    points, xy, image_size, visible, cameras
+    points: np.ndarray | StoredRows,
+    xy: np.ndarray | StoredRows,
+    image_size: Any,
+    visible: np.ndarray | StoredRows | None,
+    cameras: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], tuple[tuple[int, int], ...]]:
     """Names and image sizes of the cameras of rigs whose arrays, or what has their shapes, fit.
 
@@ -209,11 +220,11 @@ def check_rigs(
             "image_points of rigs must have the shape [rigs, cameras, epochs, points, "
             f"2], but has {xy.shape}"
         )
-    rigs, number, _, of, _ = xy.shape
-    if points.shape not in ((of, 3), (rigs, of, 3)):
+    rigs, number, _, n, _ = xy.shape
+    if points.shape not in ((n, 3), (rigs, n, 3)):
         raise InputError(
-            f"object_points must have the shape [{of}, 3] or [{rigs}, {of}, 3], as image_points "
-            f"has {of} points a view, but has {points.shape}"
+            f"object_points must have the shape [{n}, 3] or [{rigs}, {n}, 3], as image_points "
+            f"has {n} points a view, but has {points.shape}"
         )
     if visible is not None and visible.shape != xy.shape[:4]:
         raise InputError(

@@ -5,7 +5,7 @@ right_017.jpg).
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,14 +13,9 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import list_some
 
-FEWEST = 3
-"""Minimum number of epochs shared by two cameras."""
-CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
-"""An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
-pixels."""
-WORST_SHARE = 0.5
-"""One round excludes epochs with an RMS above this fraction of the largest: the worst affect
-others."""
+MIN_SHARED_EPOCHS = 3
+"""Minimum number of epochs shared by two cameras: of two mountings that differ, nothing says which
+is wrong; of three, two agree."""
 
 
 def contradicting(
@@ -32,9 +27,12 @@ def contradicting(
     several."""
     if not shared.any():
         return np.zeros(0, int)
-    limit = max(CONTRADICTS * float(np.median(rms[seen])), LEAST_CONTRADICTION)
+    # An epoch contradicts from three times the median RMS of all, and from a pixel. Larger: small
+    # movements between the exposures remain; smaller: epochs of blurred photographs are lost.
+    limit = max(3.0 * float(np.median(rms[seen])), 1.0)
     rms = np.where(shared, rms, 0.0)
-    return np.flatnonzero(rms > max(limit, WORST_SHARE * rms.max()))
+    # at once only those above half of the worst, which affects the others through the mounting
+    return np.flatnonzero(rms > max(limit, 0.5 * rms.max()))
 
 
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
@@ -44,15 +42,18 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
     """
     whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
 
-    def number(name):
+    def number(name: str) -> str:
         found = re.findall(r"\d+", whole(name))
         return found[-1].lstrip("0") or "0" if found else ""
 
+    # equal names first: numbers of two cameras may be equal by chance
     for key in (whole, number):
         keys = {camera: [key(name) for name in given] for camera, given in names.items()}
         once = all("" not in k and len({*k}) == len(k) for k in keys.values())
         first, *others = ({*k} for k in keys.values())
-        if once and all(len(first & other) >= min(FEWEST, len(first)) for other in others):
+        if once and all(
+            len(first & other) >= min(MIN_SHARED_EPOCHS, len(first)) for other in others
+        ):
             return keys
         if once and len(keys) > 2 and _connected(keys):
             return keys
@@ -63,7 +64,7 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
     )
 
 
-def _connected(keys) -> bool:
+def _connected(keys: Mapping[str, Sequence[str]]) -> bool:
     """Whether every camera shares epochs with the first, directly or through others."""
     sets = {name: {*k} for name, k in keys.items()}
     reached = [next(iter(sets))]
@@ -71,6 +72,6 @@ def _connected(keys) -> bool:
         reached += [
             other
             for other in sets
-            if other not in reached and len(sets[name] & sets[other]) >= FEWEST
+            if other not in reached and len(sets[name] & sets[other]) >= MIN_SHARED_EPOCHS
         ]
     return len(reached) == len(sets)

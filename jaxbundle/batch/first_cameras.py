@@ -23,8 +23,11 @@ from jaxbundle.errors import NotSolvedError
 SOLVED = ("opencv", "kannala-brandt", "snavely")
 """Models in pixels that `calibrate_batch` solves without start values."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
+Attempt = tuple[str, tuple[str, ...], dict[str, float] | None]
+"""Model, free parameters and start values."""
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
-"""Fields of view tried if the views give no start values for a fisheye."""
+"""Fields of view tried if the views give no start values for a fisheye; between them every
+principal distance is within a third of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,15 +107,19 @@ def first_cameras(
     return [found[i] for i in range(len(xy))]
 
 
-def _attempts(model: CameraModel, free: tuple[str, ...], size):
+def _attempts(
+    model: CameraModel, free: tuple[str, ...], size: tuple[float, float]
+) -> list[Attempt]:
     """Model, free parameters and start values of the attempts."""
     if _by_fit(model) or model.unit != "px":
         if _by_fit(model) and model.wide:
             fisheye = get_model("kannala-brandt")
             return _attempts(fisheye, fisheye.free, size)
         return [("opencv", SIMPLE, None), ("opencv", ("fx", "fy"), None)]
+    # The principal distance is always sought. A second attempt without the higher coefficients:
+    # what does not determine them may still determine a start.
     held = tuple(n for n in model.principal_distance if n not in free)
-    attempts = [(model.name, (*held, *free), None)]
+    attempts: list[Attempt] = [(model.name, (*held, *free), None)]
     if model.name == "opencv":
         attempts.append(("opencv", (*held, *(n for n in free if n in SIMPLE)), None))
     if model.name == "kannala-brandt":
@@ -150,6 +157,7 @@ def parameters_of(
     c = (found["fx"] * width + found["fy"] * height) / 2
     centre = np.array([found["cx"], found["cy"]])
     x0, y0 = in_model_units(centre, model, image_size, (width, height)).tolist()
+    # OpenCV adds k1·r² to the ideal point; corrections are applied to the measured one
     sign = -1 if model.own_formula == "to_ideal" else 1
     parameters = {"c": c, "x0": x0, "y0": y0, "K1": sign * found["k1"] / c**2}
     parameters = {
@@ -164,7 +172,15 @@ def parameters_of(
     return parameters | given
 
 
-def _fit(first, xy, image_size, model, free, pixel_size, given) -> dict[str, float]:
+def _fit(
+    first: FirstCamera,
+    xy: Float[np.ndarray, "n 2"],
+    image_size: tuple[float, float],
+    model: CameraModel,
+    free: Sequence[str],
+    pixel_size: tuple[float, float] | None,
+    given: dict[str, float],
+) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
     if {*given} - {*model.principal_distance}:
@@ -172,6 +188,8 @@ def _fit(first, xy, image_size, model, free, pixel_size, given) -> dict[str, flo
     core = () if model.prior else model.principal_distance
     wanted = [n for n in model.parameters if n in (*core, *free) and n not in given]
     areas = [(xy.min(0), xy.max(0))]
+    # Over the measured area: beyond it the first camera is extrapolated, and a fit would follow
+    # that. Models with priors (splines) first over the whole image, where every knot gets a value.
     for area in [None, *areas] if model.prior else areas:
         try:
             cost = convert_camera(

@@ -2,33 +2,45 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.batch.normal import Sightings
 from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_model, is_own
 from jaxbundle.errors import InputError
-
-FLAT_THICKNESS = 0.02
-"""Objects with a smaller thickness, relative to the second extent, start as flat."""
+from jaxbundle.io.text.stored_rows import StoredRows
 
 LARGEST_NUMBER = 1e100
-"""Larger numbers count as infinite, because their products overflow."""
+"""Larger numbers count as infinite: products of more than three of them overflow 64 bits."""
 
-ON_CPU = 32
-"""Cameras of a portion on a processor."""
-POINTS_ON_ACCELERATOR = 1 << 23
-"""Padded image points of a portion on an accelerator: their Jacobian is 2.3 GB."""
 
-WORTH_COMPILING = 4_000_000
-"""Padded points that cost as much as compiling for another number of views: 2 to 3 s."""
+@dataclasses.dataclass(frozen=True)
+class PortionSettings:
+    """How cameras are cut into portions, calls of one compiled program.
+
+    **Fields:**
+
+    - `cameras_on_cpu`: of a portion on a processor, which takes them one after the other: enough to
+      hide the call, few enough to share the work among the cores.
+    - `points_on_accelerator`: padded image points of a portion on an accelerator: their Jacobian is
+      2.3 GB.
+    - `points_worth_compiling`: padded points that cost as much as compiling for another number of
+      views: 2 to 3 s.
+    """
+
+    cameras_on_cpu: int = 32
+    points_on_accelerator: int = 1 << 23
+    points_worth_compiling: int = 4_000_000
 
 
 def bucket(n: int) -> int:
-    """The next size to pad to: 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, …"""
+    """The next size to pad to: 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, …
+
+    Four for a factor of two: at most a quarter more, and a batch has a few programs."""
     step = 2 ** max(0, math.ceil(math.log2(max(n, 4))) - 3)
     return max(4, math.ceil(n / step) * step)
 
@@ -65,7 +77,12 @@ def single_list(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return X
 
 
-def check_shapes(X, xy, size: np.ndarray, visible) -> None:
+def check_shapes(
+    X: np.ndarray | StoredRows,
+    xy: np.ndarray | StoredRows,
+    size: np.ndarray,
+    visible: np.ndarray | StoredRows,
+) -> None:
     """Refuse the arrays of a batch, or what has their shapes, where these do not fit each other.
 
     **Raises:** `InputError`."""
@@ -86,7 +103,7 @@ def check_shapes(X, xy, size: np.ndarray, visible) -> None:
     for number, thing in zip(xy.shape, ("camera", "view", "point")):
         if not number:
             raise InputError(f"image_points has no {thing}: its shape is {xy.shape}")
-    if visible.dtype.kind != "b" and not np.isin(visible, (0, 1)).all():
+    if visible.dtype.kind != "b" and not np.isin(np.asarray(visible), (0, 1)).all():
         raise InputError("visible must be true or false, or 1 or 0")
     if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(
@@ -122,7 +139,19 @@ class Batch:
         return len(self.xy)
 
     @classmethod
-    def of(cls, object_points, image_points, image_size, model, visible, free, start):
+    def check(
+        cls,
+        object_points: Any,
+        image_points: Any,
+        image_size: Any,
+        model: str | CameraModel,
+        visible: Any,
+        free: Any,
+        start: Any,
+    ) -> "Batch":
+        """The arguments of `calibrate_batch`.
+
+        **Raises:** `InputError`."""
         model = pixel_model(model)
         xy = numeric_array("image_points", image_points, "numbers [cameras, views, points, 2]")
         X = single_list(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
@@ -137,18 +166,17 @@ class Batch:
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
+        # NaN is a missing point; infinite numbers are a fault of the camera, and end in its status
         there = ~np.any(np.isnan(X), axis=-1)
         visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
         seen = np.any(visible, axis=1)
         X = np.where(seen[..., None], X, 0.0)
         xy = np.where(visible[..., None], xy, 0.0)
-        finite = np.all(
-            [
-                np.all(_usable(numbers), axis=tuple(range(1, numbers.ndim)))
-                for numbers in (X, xy, interior)
-            ],
-            axis=0,
+        # finite, and so are sums of their squares
+        usable = lambda numbers: np.all(
+            np.abs(numbers) < LARGEST_NUMBER, axis=tuple(range(1, numbers.ndim))
         )
+        finite = usable(X) & usable(xy) & usable(interior)
         X[~finite], xy[~finite] = 0.0, 0.0
         return cls(
             finite,
@@ -161,15 +189,18 @@ class Batch:
             image_size=size.astype(float),
         )
 
-    def portions(self, on_cpu: bool) -> Iterator[Portion]:
+    def portions(self, on_cpu: bool, settings: PortionSettings | None = None) -> Iterator[Portion]:
         """Cameras in portions, separated by planar and spatial objects, and by number of views."""
+        settings = settings or PortionSettings()
         points = self.xy.shape[2]
+        # few points: to whole vectors of 8 doubles, which cost nothing
         points = bucket(points) if points > 128 else -(-points // 8) * 8
         shown = self.visible.any(2) & self.finite[:, None]
-        widths = self._widths(shown.sum(1), points)
-        size = ON_CPU
+        widths = self._widths(shown.sum(1), points, settings.points_worth_compiling)
+        size = settings.cameras_on_cpu
         if not on_cpu:
-            power = math.log2(max(POINTS_ON_ACCELERATOR / (max(widths, default=1) * points), 1))
+            most = settings.points_on_accelerator / (max(widths, default=1) * points)
+            power = math.log2(max(most, 1))
             size = 2 ** min(math.floor(power), math.ceil(math.log2(max(len(self), 1))))
         for flat in (True, False):
             for width in np.unique(widths):
@@ -179,20 +210,29 @@ class Batch:
                     views = np.argsort(~shown[some], axis=1, kind="stable")[:, :width]
                     yield self._portion(some, np.sort(views), flat, size, (width, points))
 
-    def _widths(self, views: np.ndarray, points: int) -> np.ndarray:
+    def _widths(
+        self, views: Int[np.ndarray, " cameras"], points: int, worth_compiling: int
+    ) -> Int[np.ndarray, " cameras"]:
         """The padded number of views of each camera: cameras with fewer views are separated if this
         saves more than the compilation of another program costs."""
         need = np.array([bucket(number) for number in views])
         width = bucket(self.xy.shape[1])
         widths = np.full(len(need), width)
         for fewer in np.unique(need)[::-1]:
-            if (need <= fewer).sum() * (width - fewer) * points > WORTH_COMPILING:
+            if (need <= fewer).sum() * (width - fewer) * points > worth_compiling:
                 width = fewer
             widths[need <= fewer] = width
         return widths
 
-    def _portion(self, cameras, views, flat, size, shape) -> Portion:
-        def wide(rows, *axes):
+    def _portion(
+        self,
+        cameras: Int[np.ndarray, " some"],
+        views: Int[np.ndarray, "some width"],
+        flat: bool,
+        size: int,
+        shape: tuple[int, int],
+    ) -> Portion:
+        def wide(rows: np.ndarray, *axes: int) -> np.ndarray:
             missing = [n - old for n, old in zip(axes, rows.shape)]
             return np.pad(rows, [(0, n) for n in missing] + [(0, 0)] * (rows.ndim - len(axes)))
 
@@ -203,6 +243,7 @@ class Batch:
             xy=wide(of_views(self.xy), size, *shape),
             weight=wide(visible.astype(float), size, *shape),
         )
+        # cameras that fill up the portion have the start values of the last one, and no points
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
         return Portion(
             cameras,
@@ -213,11 +254,6 @@ class Batch:
             wide(self.axes[cameras], size),
             wide(self.middle[cameras], size),
         )
-
-
-def _usable(numbers: np.ndarray) -> np.ndarray:
-    """Finite, and so are sums of their squares."""
-    return np.abs(numbers) < LARGEST_NUMBER
 
 
 def any_model(name: str | CameraModel) -> CameraModel:
@@ -243,7 +279,7 @@ def is_plain(model: CameraModel) -> bool:
 
 
 def pixel_model(name: str | CameraModel) -> CameraModel:
-    """The same, if `calibrate_batch` has its layout.
+    """The camera model with this name, or a user-defined one, if `calibrate_batch` has its layout.
 
     **Raises:** `InputError`."""
     model = any_model(name)
@@ -279,15 +315,17 @@ def free_parameters(model: CameraModel, free: Any) -> tuple[str, ...]:
     return tuple(free)
 
 
-def _middle_of(model: CameraModel) -> tuple[str, ...]:
-    """The principal point, if it is at the image centre and not at zero."""
-    return model.principal_point if model.axes == "down" else ()
-
-
-def _interior(model: CameraModel, free, start, size, cameras):
+def _interior(
+    model: CameraModel,
+    free: Sequence[str],
+    start: Any,
+    size: Float[np.ndarray, "2"],
+    cameras: int,
+) -> tuple[Float[np.ndarray, "cameras parameters"], bool]:
     """Start values [cameras, parameters]; are the focal lengths among them?"""
     values = {name: 1.0 for name in model.principal_distance} | default_parameters(model)
-    values |= {name: (n - 1) / 2 for name, n in zip(_middle_of(model), size)}
+    if model.axes == "down":  # else the principal point is near zero
+        values |= {name: (n - 1) / 2 for name, n in zip(model.principal_point, size)}
     start = {} if start is None else start
     if not isinstance(start, Mapping):
         raise InputError(f"start must be like {{'fx': 900.0, 'fy': 900.0}}, but is {start!r:.80}")
@@ -314,14 +352,20 @@ def _interior(model: CameraModel, free, start, size, cameras):
     return np.stack(columns, 1), bool(given)
 
 
-def _principal_axes(X, seen):
+def _principal_axes(
+    X: Float[np.ndarray, "*cameras points 3"], seen: Bool[np.ndarray, "*cameras points"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points [cameras, points, 3] about the mean of those seen, along their principal axes; the
     mean; the axes as rows [cameras, 3, 3]; is the object flat?"""
     number = np.maximum(seen.sum(1), 1)[:, None]
     middle = X.sum(1) / number
     centred = np.where(seen[..., None], X - middle[:, None], 0.0)
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
+    # the longest first, right-handed: a flat object lies in the plane Z = 0, as `start` needs it
     axes = vectors[:, :, ::-1].swapaxes(1, 2)
     axes = axes * np.linalg.det(axes)[:, None, None]
-    flat = values[:, 0] <= np.maximum(FLAT_THICKNESS**2 * values[:, 1], 1e-12 * values[:, 2])
+    # flat with a thickness below 2 % of the second extent: start values of H, which neglect it, are
+    # then nearer than those of P, which hardly follow from it; larger or smaller: not critical,
+    # both are adjusted. Or on a line, to rounding.
+    flat = values[:, 0] <= np.maximum(0.02**2 * values[:, 1], 1e-12 * values[:, 2])
     return centred @ axes.swapaxes(1, 2), middle, axes, flat

@@ -1,15 +1,18 @@
 """Cameras of a batch with a bad fit, and the likely cause.
 
 A camera is a misfit on its own if few points contribute most of vᵀv. The lengths of normal
-residuals have √(mean of squares)/mean = 2/√π = 1.128; beyond `TAIL` times that they are not normal.
-It is a misfit compared with others if its RMS is above `FARTHER` times their median, and above it,
-in the logarithm, by more than `DEVIATIONS` times their spread (1.4826 times the median deviation).
-With fewer than `FEWEST` cameras there is no spread: then its RMS is above `FARTHER_OF_FEW` times
-the smallest of the others.
+residuals have √(mean of squares)/mean = 2/√π = 1.128; beyond 1.5 times that they are not normal.
+It is a misfit compared with others if its RMS is above 3 times their median, and above it, in the
+logarithm, by more than 5 times their spread (1.4826 times the median deviation). With fewer than 5
+cameras there is no spread: then its RMS is above 10 times the smallest of the others
+(`MisfitSettings`).
 
 Not detected are errors spread so evenly that the residuals look normal, in a single camera,
 in all cameras alike, or below these factors.
 """
+
+import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,54 +20,81 @@ from jaxtyping import Bool, Float
 from jaxbundle.batch.input import Batch
 from jaxbundle.cameras import CameraModel
 
-TAIL = 1.5
-"""1 for normal residuals, 1.2 if half the views are five times as noisy as the others."""
+MEDIAN_DEVIATION_AS_SIGMA = 1.4826
+"""The standard deviation of a normal distribution over its median absolute deviation, 1/Φ⁻¹(¾)."""
 NORMAL = 2 / np.sqrt(np.pi)
-OF_DEVIATION = 1.4826
-"""The standard deviation of a normal distribution over its median absolute deviation."""
-FARTHER, DEVIATIONS = 3.0, 5.0
-FARTHER_OF_FEW = 10.0
-"""Lenses, boards and focus of two good cameras may differ by less than this."""
-FEWEST = 5
-"""Minimum number of solved cameras for a population."""
-NEGLIGIBLE = 0.01
-"""A smaller RMS is never a misfit, pixels."""
-FAR_OUTSIDE = 1.0
-"""Points farther outside the image, in image sizes, are not measurements."""
-SMALLEST_EXTENT = 0.05
-"""If the image points span less of the image, they are probably no pixels."""
-OUTSIDE_OF_GOOD = 0.01
-"""If a larger fraction is outside although the camera fits, its image has another size: points
-found by correlation are never outside, and blunders are fewer."""
-LARGEST_OUTSIDE = 0.5
-"""If a larger fraction of image points is outside the image, their axes are probably wrong."""
+"""√(mean of squares)/mean of the lengths of normal residuals (Rayleigh's distribution)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MisfitSettings:
+    """From where residuals are too large, and image points are suspicious.
+
+    **Fields:**
+
+    - `max_tail`: of the ratio √(mean of squares)/mean of residual lengths, in that of normal ones:
+      1 for normal residuals, 1.2 if half the views are five times as noisy as the others.
+    - `min_ratio`, `max_deviations`: of the RMS to the median of the cameras, and of its logarithm
+      from the median in robust standard deviations; both must be exceeded. The second alone
+      would find cameras in a batch of equal ones, the first alone in a batch of unequal ones.
+    - `min_ratio_of_few`: the same with fewer than `min_cameras`, where there is no spread: lenses,
+      boards and focus of two good cameras may differ by less than this.
+    - `min_cameras`: solved cameras of a population.
+    - `negligible`: a smaller RMS is never a misfit, pixels; that of measured corners is larger.
+    - `far_outside`: points farther outside the image, in image sizes, are not measurements.
+    - `min_extent`: if the image points span less of the image, they are probably no pixels.
+    - `max_outside_of_good`: if a larger fraction is outside although the camera fits, its image has
+      another size: points found by correlation are never outside, and blunders are fewer.
+    - `max_outside`: if a larger fraction of image points is outside the image, their axes are
+      probably wrong.
+    """
+
+    max_tail: float = 1.5
+    min_ratio: float = 3.0
+    max_deviations: float = 5.0
+    min_ratio_of_few: float = 10.0
+    min_cameras: int = 5
+    negligible: float = 0.01
+    far_outside: float = 1.0
+    min_extent: float = 0.05
+    max_outside_of_good: float = 0.01
+    max_outside: float = 0.5
+
+
+DEFAULTS = MisfitSettings()
 
 
 def misfits(
     rms: Float[np.ndarray, " cameras"],
     mean_length: Float[np.ndarray, " cameras"],
     solved: Bool[np.ndarray, " cameras"],
+    settings: MisfitSettings = DEFAULTS,
 ) -> Bool[np.ndarray, " cameras"]:
     """Which solved cameras do not fit; `mean_length` of their residuals (pixels)."""
     found = np.zeros(len(rms), bool)
-    candidates = np.flatnonzero(solved & (rms > NEGLIGIBLE))
-    found[candidates] = rms[candidates] > TAIL * NORMAL * mean_length[candidates]
-    factor = FARTHER_OF_FEW
-    if solved.sum() >= FEWEST:
-        log = np.log(np.maximum(rms[solved], NEGLIGIBLE))
-        spread = OF_DEVIATION * np.median(np.abs(log - np.median(log)))
-        factor = np.exp(max(np.log(FARTHER), DEVIATIONS * spread))
-    return found | (rms > factor * rms_beside(rms, solved))
+    # A few blunders raise √(mean of squares), hardly the mean: their ratio is a test of one camera
+    # by itself, without knowing the noise.
+    candidates = np.flatnonzero(solved & (rms > settings.negligible))
+    found[candidates] = rms[candidates] > settings.max_tail * NORMAL * mean_length[candidates]
+    factor = settings.min_ratio_of_few
+    if solved.sum() >= settings.min_cameras:
+        # in the logarithm, since an RMS is positive and its scatter proportional to it
+        log = np.log(np.maximum(rms[solved], settings.negligible))
+        spread = MEDIAN_DEVIATION_AS_SIGMA * np.median(np.abs(log - np.median(log)))
+        factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * spread))
+    return found | (rms > factor * rms_beside(rms, solved, settings))
 
 
 def rms_beside(
-    rms: Float[np.ndarray, " cameras"], solved: Bool[np.ndarray, " cameras"]
+    rms: Float[np.ndarray, " cameras"],
+    solved: Bool[np.ndarray, " cameras"],
+    settings: MisfitSettings = DEFAULTS,
 ) -> Float[np.ndarray, " cameras"]:
     """The reference of the RMS of each solved camera: the median of all, for few cameras the
     smallest of the others; NaN for a single camera, and one without a solution."""
     beside = np.full(len(rms), np.nan)
-    some = np.maximum(rms[solved], NEGLIGIBLE)
-    if len(some) >= FEWEST:
+    some = np.maximum(rms[solved], settings.negligible)
+    if len(some) >= settings.min_cameras:
         beside[solved] = np.median(some)
     elif len(some) > 1:
         least, second = np.sort(some)[:2]
@@ -74,7 +104,7 @@ def rms_beside(
 
 def rms_remark(rms: float, beside: float) -> str:
     """A remark if the RMS is far above that of the other cameras."""
-    if not rms > FARTHER * beside:
+    if not rms > DEFAULTS.min_ratio * beside:
         return ""
     return (
         f"RMS {rms:.2g} px against {beside:.2g} px of the others: wrong points may be why "
@@ -90,20 +120,22 @@ def far_outside(
 ) -> Bool[np.ndarray, "cameras views points"]:
     """Which visible points are so far outside the image that they cannot be measurements; none for
     a camera with most points outside, since then the axes or the size are wrong."""
-    far = visible & _beyond(xy, size, down, FAR_OUTSIDE)
-    most = far.sum((1, 2)) > LARGEST_OUTSIDE * visible.sum((1, 2))
+    far = visible & _beyond(xy, size, down, DEFAULTS.far_outside)
+    most = far.sum((1, 2)) > DEFAULTS.max_outside * visible.sum((1, 2))
     return far & ~most[:, None, None]
 
 
-def _corner(size, down: bool):
+def _corner(size: Float[np.ndarray, "2"], down: bool) -> Float[np.ndarray, "2"]:
     """The smallest coordinates in an image."""
     return np.full(2, -0.5) if down else -size / 2
 
 
-def _beyond(xy, size, down: bool, margin: float):
+def _beyond(
+    xy: Float[np.ndarray, "*points 2"], size: Float[np.ndarray, "2"], down: bool, margin: float
+) -> Bool[np.ndarray, "*points"]:
     """Which points are outside the image by more than `margin` times its size."""
     low = _corner(size, down)
-    return ((xy < low - margin * size) | (xy > low + (1 + margin) * size)).any(-1)
+    return np.any((xy < low - margin * size) | (xy > low + (1 + margin) * size), axis=-1)
 
 
 def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool) -> str:
@@ -115,16 +147,17 @@ def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"],
     """
     low = _corner(size, down)
     part = _beyond(xy, size, down, 0).mean() if len(xy) else 0.0
-    if len(xy) and np.ptp(xy, axis=0).max() < SMALLEST_EXTENT * size.max():
+    if len(xy) and np.ptp(xy, axis=0).max() < DEFAULTS.min_extent * size.max():
         wide, high = np.ptp(xy, axis=0)
         return (
             f"the image points of all views span {wide:.3g} × {high:.3g} of {size[0]:g} × "
             f"{size[1]:g} pixels: are they in pixels, and is image_size right?"
         )
-    if part <= LARGEST_OUTSIDE:
-        far = int(_beyond(xy, size, down, FAR_OUTSIDE).sum())
+    if part <= DEFAULTS.max_outside:
+        far = int(_beyond(xy, size, down, DEFAULTS.far_outside).sum())
         points = "image point is" if far == 1 else "image points are"
         return f"{far} {points} far outside the image: data snooping removes them" * (far > 0)
+    # nine points in ten decide about a wrong axis: the others may be blunders
     if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
         return (
             "the image points seem to be counted from a corner of the image: in this model (0, 0) "
@@ -145,7 +178,7 @@ def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"],
 
 
 def remarks(
-    model: CameraModel, batch: Batch, rows: dict, good: Bool[np.ndarray, " cameras"]
+    model: CameraModel, batch: Batch, rows: dict[str, Any], good: Bool[np.ndarray, " cameras"]
 ) -> np.ndarray:
     """A remark about suspicious image points, if the principal point is outside the image or there
     is no good result; for an undetermined camera, about its RMS."""
@@ -157,7 +190,7 @@ def remarks(
     remark = [""] * len(batch)
     outside = (batch.visible & _beyond(batch.xy, frame, model.axes == "down", 0)).sum((1, 2))
     part = outside / np.maximum(batch.visible.sum((1, 2)), 1)
-    for camera in np.flatnonzero(good & (part > OUTSIDE_OF_GOOD)):
+    for camera in np.flatnonzero(good & (part > DEFAULTS.max_outside_of_good)):
         remark[camera] = (
             f"{100 * part[camera]:.0f} % of the image points are outside the image of "
             f"{frame[0]:g} × {frame[1]:g} pixels: is image_size right (width, height), or are x "

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from jaxbundle.batch.population import FEWEST, LEVEL, OUTLIER_LIMIT, Population
+from jaxbundle.batch.population import Population
 from jaxbundle.network.columns import count
 from jaxbundle.report.layout import WITHOUT_SIGMA, digits_of, estimate, fixed, significant
 from jaxbundle.report.page import (
@@ -24,9 +24,6 @@ from jaxbundle.report.page.columns import Column, estimates
 from jaxbundle.report.page.document import NOTHING
 from jaxbundle.report.page.markup import figure, grid, paragraph
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD
-
-MOST_OUTLYING = 30
-"""Number of cameras listed as outlying; the table has all."""
 
 
 def compose_batch(
@@ -47,7 +44,10 @@ def _describe(found: Population, origin: Origin, against: Mapping[str, np.ndarra
         *_correlations(found, against),
         *_outlying(found),
     ]
-    first = give_verdict(_judge(found), (), "<h3>Status</h3>\n", _states(found))
+    counts = Counter(found.status.tolist()).most_common()
+    states = [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
+    shown = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
+    first = give_verdict(_judge(found), (), *shown)
     title = f"{count(len(found), 'input')}: batch"
     listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
     return Page(title, [first, *sections], origin, tables={"results": listed})
@@ -59,21 +59,14 @@ def _judge(found: Population) -> list[Finding]:
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
     words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
-    far = int((np.nan_to_num(found.farthest) > OUTLIER_LIMIT).sum())
+    limit = found.settings.outlier_limit
+    far = int((np.nan_to_num(found.farthest) > limit).sum())
     if np.isfinite(found.farthest).any():
         words = (
-            f"{far} with a parameter more than {OUTLIER_LIMIT:g} robust standard "
-            "deviations from the median"
+            f"{far} with a parameter more than {limit:g} robust standard deviations from the median"
         )
         findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
     return findings
-
-
-def _states(found: Population) -> str:
-    counts = Counter(found.status.tolist()).most_common()
-    return grid(
-        ("status", "number", "%"), [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
-    )
 
 
 def _rms(found: Population) -> list[Section]:
@@ -86,6 +79,7 @@ def _rms(found: Population) -> list[Section]:
     if not len(values):
         return []
     middle = float(np.median(values))
+    # from 0, so that heights of two batches compare, and without the tail of a few misfits
     top = max(min(3 * middle, float(values.max())), 1e-12)
     edges = np.linspace(0, top, 25)
     above = (values > top).any()
@@ -123,7 +117,8 @@ def _parameters(found: Population) -> list[Section]:
 def _histograms(found: Population) -> Iterator[str]:
     for name, values in found.values.items():
         edges, counted = found.histogram(values)
-        if counted.sum() >= FEWEST and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
+        enough = counted.sum() >= found.settings.min_cameras
+        if enough and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
             yield figure(
                 draw_histogram(edges, counted, name, "number of cameras"),
                 f"{name} of {counted.sum()} converged cameras",
@@ -135,7 +130,7 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
     told = found.correlations(against)
     if not told:
         return []
-    level = LEVEL / len(told)
+    level = found.settings.level / len(told)
     rows = [
         (
             f"{one.parameter} with {one.column}",
@@ -149,8 +144,8 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
     ]
     note = paragraph(
         "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
-        f"large by chance; significant at {100 * LEVEL:g} % for all of these together. Change: of "
-        "the median, from the lower half of the column to the upper."
+        f"large by chance; significant at {100 * found.settings.level:g} % for all of these "
+        "together. Change: of the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
     return [
@@ -170,7 +165,7 @@ def _outlying(found: Population) -> list[Section]:
         return []
     rows = [
         (found.keys[i], significant(found.numbers["rms"][i], 4), words)
-        for i, words in said[:MOST_OUTLYING]
+        for i, words in said[:30]  # a screen or two; the table has all
     ]
     more = len(said) - len(rows)
     note = paragraph(f"and {more} more: sort the table.") if more else ""

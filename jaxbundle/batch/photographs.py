@@ -70,12 +70,13 @@ class PhotographFolders:
         return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
 
     def measure(
-        self, chosen: Sequence[int], tell: Callable[[float], None] = lambda part: None
+        self, chosen: Sequence[int], tell: Callable[[float], None] = lambda _: None
     ) -> dict[int, BoardViews | str]:
         """The views of some of the folders, or why there are none.
 
         `tell(part)`: the fraction of the photographs searched."""
         files = {folder: self._files(folder) for folder in chosen}
+        # by content, not by name: a photograph copied to two folders is searched once
         contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
         tasks = {
             content: (path, self.board)
@@ -92,7 +93,13 @@ class PhotographFolders:
             tell(done / len(tasks))
         return {folder: self._views(folder, files[folder], contents, died) for folder in chosen}
 
-    def _views(self, folder, files, contents, died) -> BoardViews | str:
+    def _views(
+        self,
+        folder: int,
+        files: Mapping[str, Path],
+        contents: Mapping[Path, str],
+        died: Mapping[str, str],
+    ) -> BoardViews | str:
         if not files:
             return _why_empty(self.folders[folder])
         looks: dict[str, Look] = {}
@@ -119,7 +126,7 @@ class PhotographFolders:
             return {}
 
 
-def _why_empty(folder) -> str:
+def _why_empty(folder: str | Path) -> str:
     inside = [one.name for one in camera_folders(folder)]
     if not inside:
         return "no photographs in this folder"

@@ -1,6 +1,6 @@
 """The population of a batch: distribution of its cameras, outliers, correlations of parameters.
 
-A parameter of a camera is outlying if it is more than `OUTLIER_LIMIT` robust standard deviations
+A parameter of a camera is outlying if it is more than `outlier_limit` robust standard deviations
 from the median of the converged cameras; likewise a high RMS. The robust standard deviation s is
 1.4826 times the median absolute deviation; for a camera known worse than most it is
 √(s² + σ² − σ_m²), with its σ and their median σ_m: it may be as far off by its measurements.
@@ -20,23 +20,36 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS, WEAK
-from jaxbundle.batch.misfit import OF_DEVIATION
+from jaxbundle.batch.misfit import MEDIAN_DEVIATION_AS_SIGMA
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import f_tail
 from jaxbundle.network.columns import Columns, as_columns
 from jaxbundle.report.layout import significant
 from jaxbundle.report.page.columns import numbers
 
-FEWEST = 8
-"""Minimum number of cameras of a population."""
-OUTLIER_LIMIT = 5.0
-"""Outliers are more than this number of robust standard deviations from the median."""
-LEVEL = 0.01
-"""Joint level of all correlations of a batch."""
-CLASSES, HALF_WIDTH = 24, 4.0
-"""Number of classes of a histogram, and its half width in robust standard deviations."""
 NUMBERS = ("rms", "sigma0", "redundancy", "iterations", "views", "removed")
 ID = "id"
+
+
+@dataclasses.dataclass(frozen=True)
+class PopulationSettings:
+    """What is unusual in a population, and how it is drawn.
+
+    **Fields:**
+
+    - `min_cameras`: below it a median deviation says little; not critical.
+    - `outlier_limit`: in robust standard deviations. Cameras are not normally distributed (lots,
+      focus): 5 lists what anybody would look at, not the tails.
+    - `level`: joint level of all correlations of a batch (Bonferroni), as of other tests here.
+    - `classes`, `half_width`: of a histogram: their number, and half its width in robust standard
+      deviations, so that a class is a third of one.
+    """
+
+    min_cameras: int = 8
+    outlier_limit: float = 5.0
+    level: float = 0.01
+    classes: int = 24
+    half_width: float = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,15 +70,18 @@ class Population:
     `numbers` by name; the parameters of cameras, `values`, with their `sigma`, and their deviations
     `apart` from the median, in robust standard deviations; `rms_apart`, signed."""
 
-    def __init__(self, rows: Iterable[Mapping]):
+    def __init__(self, rows: Iterable[Mapping], settings: PopulationSettings | None = None):
+        self.settings = settings or PopulationSettings()
         kept = [_row(row) for row in rows]
         words = lambda name: np.array([str(row.get(name, "")) for row in kept], dtype=object)
         self.keys, self.status, self.remark = (words(n) for n in ("key", "status", "remark"))
         self.numbers = {name: numbers(row.get(name) for row in kept) for name in NUMBERS}
         names = dict.fromkeys(name for row in kept for name in row["parameters"])
-        of = lambda name, what: numbers(row["parameters"].get(name, {}).get(what) for row in kept)
-        self.values = {name: of(name, "value") for name in names}
-        self.sigma = {name: of(name, "sigma") for name in names}
+        column = lambda name, what: numbers(
+            row["parameters"].get(name, {}).get(what) for row in kept
+        )
+        self.values = {name: column(name, "value") for name in names}
+        self.sigma = {name: column(name, "sigma") for name in names}
         self.apart = {
             name: np.abs(self._apart(values, self.sigma[name]))
             for name, values in self.values.items()
@@ -95,12 +111,13 @@ class Population:
         if not len(found):
             return np.nan, np.nan
         middle = float(np.median(found))
-        return middle, OF_DEVIATION * float(np.median(np.abs(found - middle)))
+        return middle, MEDIAN_DEVIATION_AS_SIGMA * float(np.median(np.abs(found - middle)))
 
     def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)
-        if np.isfinite(values).sum() < FEWEST or not deviation > 0:
+        if np.isfinite(values).sum() < self.settings.min_cameras or not deviation > 0:
             return np.full(len(values), np.nan)
+        # s contains the usual σ already; only what a camera has on top of it widens its limit
         usual = np.nan_to_num(self.spread(sigma)[0])
         worse = np.maximum(np.nan_to_num(sigma) ** 2 - usual**2, 0.0)
         return (values - middle) / np.sqrt(deviation**2 + worse)
@@ -121,9 +138,9 @@ class Population:
         said += [
             f"{name} {significant(far[i], 2)} robust σ from the median"
             for name, far in self.apart.items()
-            if far[i] > OUTLIER_LIMIT
+            if far[i] > self.settings.outlier_limit
         ]
-        if self.fit[i] and self.rms_apart[i] > OUTLIER_LIMIT:
+        if self.fit[i] and self.rms_apart[i] > self.settings.outlier_limit:
             said.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
         return "; ".join(said)
 
@@ -152,11 +169,11 @@ class Population:
         middle, deviation = self.spread(values)
         least, greatest = float(found.min()), float(found.max())
         if deviation > 0:
-            least = max(least, middle - HALF_WIDTH * deviation)
-            greatest = min(greatest, middle + HALF_WIDTH * deviation)
+            reach = self.settings.half_width * deviation
+            least, greatest = max(least, middle - reach), min(greatest, middle + reach)
         if not greatest > least:
             least, greatest = least - 0.5, greatest + 0.5
-        edges = np.linspace(least, greatest, CLASSES + 1)
+        edges = np.linspace(least, greatest, self.settings.classes + 1)
         edges[0] = -np.inf if found.min() < least else edges[0]
         edges[-1] = np.inf if found.max() > greatest else edges[-1]
         return edges, np.histogram(found, edges)[0]
@@ -168,7 +185,9 @@ class Population:
         for column, with_it in against.items():
             for name, values in {**self.values, "rms": self.numbers["rms"]}.items():
                 used = self.fit & np.isfinite(values) & np.isfinite(with_it)
-                if used.sum() >= FEWEST and np.ptp(with_it[used]) > 0 and np.ptp(values[used]) > 0:
+                varies = lambda x, used=used: np.ptp(x[used]) > 0
+                enough = used.sum() >= self.settings.min_cameras
+                if enough and varies(with_it) and varies(values):
                     found.append(_correlation(column, name, with_it[used], values[used]))
         return sorted(found, key=lambda one: (one.probability, -abs(one.rank_correlation)))
 
@@ -201,7 +220,8 @@ class Population:
             "parameters": parameters,
             "outlying": [{"key": self.keys[i], "why": why} for i, why in self.outlying()],
             "correlations": [
-                vars(one) | {"significant": one.probability < LEVEL / len(found)} for one in found
+                vars(one) | {"significant": one.probability < self.settings.level / len(found)}
+                for one in found
             ],
         }
 
@@ -246,10 +266,13 @@ def _of_network(row: Mapping) -> dict[str, dict]:
     return found
 
 
-def _correlation(column: str, name: str, with_it, values) -> Correlation:
+def _correlation(
+    column: str, name: str, with_it: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
+) -> Correlation:
     n = len(values)
     r = float(np.corrcoef(_ranks(with_it), _ranks(values))[0, 1])
     square = r * r * (n - 2) / max(1 - r * r, 1e-300)
+    # a rank correlation has no unit: the change of the median says how much it matters
     upper = with_it > np.median(with_it)
     change = np.median(values[upper]) - np.median(values[~upper]) if upper.any() else np.nan
     return Correlation(column, name, n, r, f_tail(square, 1, n - 2), float(change))
@@ -257,8 +280,8 @@ def _correlation(column: str, name: str, with_it, values) -> Correlation:
 
 def _ranks(values: np.ndarray) -> np.ndarray:
     """Ranks, those of equal values their mean."""
-    _, of, numbers = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(numbers) - (numbers - 1) / 2)[of]
+    _, rank, times = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(times) - (times - 1) / 2)[rank]
 
 
 def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.ndarray]:
@@ -280,14 +303,15 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
             raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
+    # keys are PATH#CAMERA; a table of serial numbers knows only the camera
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
-    if all(at is None for at in place):
+    if all(row is None for row in place):
         raise InputError(f"{name}: none of its ids is that of a camera or input")
-    at = np.array([-1 if row is None else row for row in place], int)
+    chosen = np.array([-1 if row is None else row for row in place], int)
     found = {}
     for column in others:
-        values = np.append(_numbers(given, column), np.nan)
-        found[column] = values[at]
+        values = np.append(_numbers(given, column), np.nan)  # row −1: missing
+        found[column] = values[chosen]
     return found
 
 
@@ -309,10 +333,7 @@ def number_or_days(cell: str, where: str) -> float:
     try:
         return float(cell)
     except ValueError:
-        return _days(cell, where)
-
-
-def _days(cell: str, where: str) -> float:
+        pass
     try:
         date = datetime.fromisoformat(cell)
     except ValueError:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import chain, zip_longest
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,12 +30,8 @@ from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
 from jaxbundle.leastsquares.sharding import use_own_devices
 
-ROWS_AT_ONCE = 256
-PAUSE = 0.2
-"""Seconds between checks for the files of other processes."""
 
-
-def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Counter:
+def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -> Counter:
     """As `run_batch`, in processes joined by `jaxbundle.join_processes`, which have the same
     arguments and see the same folder of results; afterwards they are no longer joined.
 
@@ -45,6 +42,7 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
     if os.path.exists(file) and not os.path.isfile(file):
         raise InputError(f"{file}: joined processes write parts beside it; a file is expected")
     number, index = jax.process_count(), jax.process_index()
+    # a name of this run, the same in all processes, so that files of an earlier one do not count
     token = int(broadcast_one_to_all(np.array(time.time_ns() % 10**9)))
     waiting = f"{file}.joined-{token}"
     own = {key: value for key, value in options.items() if key not in ("retry", "renew")}
@@ -56,6 +54,7 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
             run_batch(inputs, file, compute=False, **options)
             _tell(waiting, "begin")
         if not _wait(waiting, ["begin"])["begin"]:
+            # into a file of its own: appending to one file from several machines is not atomic
             part = f"{file}.part-{index + 1}-of-{number}"
             with use_own_devices():
                 run_batch(inputs, part, part=(index + 1, number), known=file, **own)
@@ -93,6 +92,7 @@ def _clear(file: str | Path, waiting: str) -> None:
 
 
 def _tell(waiting: str, name: str, words: str = "") -> None:
+    # renamed when complete, so that no process reads half of it
     path = Path(waiting, f".{name}")
     path.write_text(words, encoding="utf-8")
     path.rename(Path(waiting, name))
@@ -108,7 +108,7 @@ def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
         }
         if len(found) == len(names):
             return found
-        time.sleep(PAUSE)
+        time.sleep(0.2)  # seconds: far below a run, far above the look at a file
 
 
 def add_parts(file: str | Path) -> None:
@@ -130,11 +130,12 @@ def add_parts(file: str | Path) -> None:
             held.enter_context(hold_lock(path))
         parts = [JsonLines(path) for _, path in sorted(found)]
         lines, some = JsonLines(file), []
+        # parts have every N-th input: taken in turn they are in the order of the inputs
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
         for row in in_turn:
             if row is not None and row["key"] not in lines:
                 some.append(row)
-            if len(some) == ROWS_AT_ONCE:
+            if len(some) == 256:  # lines a write: bounds the memory
                 lines.append(some)
                 some = []
         lines.append(some)

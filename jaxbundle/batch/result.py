@@ -15,11 +15,6 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import data_frame
 
-MOST_ROWS = 20
-"""Cameras in the HTML table; those that need attention first."""
-MOST_REMARKS = 10
-"""Remarks that differ, in the text."""
-
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
@@ -99,8 +94,9 @@ class BatchCalibration:
             for row, remark, count in sorted(zip(first, remarks, counts))
             if remark
         ]
-        if len(lines) > MOST_REMARKS:
-            lines[MOST_REMARKS:] = [f"and {len(lines) - MOST_REMARKS} more remarks, see `remark`"]
+        shown = 10  # of remarks that differ
+        if len(lines) > shown:
+            lines[shown:] = [f"and {len(lines) - shown} more remarks, see `remark`"]
         return "\n".join(said + lines)
 
     def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
@@ -177,7 +173,7 @@ class BatchCalibration:
         table = self.table()
         if not (self.remark != "").any():
             del table["remark"]
-        rows = np.argsort(self.converged, kind="stable")[:MOST_ROWS]
+        rows = np.argsort(self.converged, kind="stable")[:20]  # a screen
         cell = 'style="text-align:left;padding:2px 12px 2px 0"'
         shown = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
         line = lambda tag, texts: (

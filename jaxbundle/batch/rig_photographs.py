@@ -11,16 +11,13 @@ import numpy as np
 
 from jaxbundle.batch.epochs import epoch_keys
 from jaxbundle.batch.photographs import PhotographFolders, camera_folders
-from jaxbundle.batch.rigs import Rig
+from jaxbundle.batch.rigs import RigViews
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.writing.fingerprints import of_words
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.system.workers import Workers
-
-FEWEST = 2
-"""Cameras of a rig."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,28 +32,29 @@ class RigFolders:
     def fingerprint(self, rig: int) -> str:
         """The fingerprint of the content of the photographs of all cameras."""
         cameras = camera_folders(self.folders[rig])
-        found = self._of([str(path) for path in cameras])
+        found = self._folders_of([str(path) for path in cameras])
         return of_words(f"{path.name} {found.fingerprint(c)}" for c, path in enumerate(cameras))
 
     def measure(
         self, chosen: Sequence[int], tell: Callable[[float], None]
-    ) -> dict[int, tuple[Rig, dict] | str]:
+    ) -> dict[int, tuple[RigViews, dict] | str]:
         """Some of the rigs, with what a line says of their photographs; or why there is none."""
         cameras = {i: camera_folders(self.folders[i]) for i in chosen}
         every = [(i, path) for i, of in cameras.items() for path in of]
-        found = self._of([str(path) for _, path in every])
+        # all folders of all rigs at once, so that the processes are never idle
+        found = self._folders_of([str(path) for _, path in every])
         views = found.measure(range(len(every)), tell) if every else {}
         of_rig: dict[int, dict[str, BoardViews | str]] = {i: {} for i in chosen}
         for (i, path), one in zip(every, views.values()):
             of_rig[i][path.name] = one
         return {i: _rig(of) for i, of in of_rig.items()}
 
-    def _of(self, folders: Sequence[str]) -> PhotographFolders:
+    def _folders_of(self, folders: Sequence[str]) -> PhotographFolders:
         return PhotographFolders(folders, self.board, self.kept, self.workers)
 
 
-def _rig(views: Mapping[str, BoardViews | str]) -> tuple[Rig, dict] | str:
-    if len(views) < FEWEST:
+def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
+    if len(views) < 2:
         said = f" (only {[*views][0]})" if views else ""
         return f"a folder of photographs for every camera of the rig is expected here{said}"
     bad = [f"camera {name}: {one}" for name, one in views.items() if isinstance(one, str)]
@@ -71,7 +69,7 @@ def _rig(views: Mapping[str, BoardViews | str]) -> tuple[Rig, dict] | str:
     return rig, {"photographs_not_used": failed} if failed else {}
 
 
-def rig_of_views(views: Mapping[str, BoardViews]) -> Rig:
+def rig_of_views(views: Mapping[str, BoardViews]) -> RigViews:
     """The rig of the views of its cameras.
 
     **Raises:** `InputError` where the photographs of two cameras cannot be paired."""
@@ -90,4 +88,4 @@ def rig_of_views(views: Mapping[str, BoardViews]) -> Rig:
         photo = dict(zip(rows, one.names))
         images.append(tuple(f"{prefix}{photo.get(e, epoch)}" for e, epoch in enumerate(epochs)))
     sizes = tuple((int(one.image_size[0]), int(one.image_size[1])) for one in views.values())
-    return Rig(tuple(views), sizes, tuple(images), epochs, board.points, xy)
+    return RigViews(tuple(views), sizes, tuple(images), epochs, board.points, xy)

@@ -37,7 +37,7 @@ UNEXPECTED = (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError)
 
 
 @dataclasses.dataclass(frozen=True)
-class Rig:
+class RigViews:
     """Views of one rig.
 
     **Fields:** `cameras`, their names; `sizes`, columns and rows of each; `images`: names [cameras]
@@ -75,7 +75,7 @@ class RigSettings:
 
 
 def solve_rigs(
-    rigs: Sequence[Rig], settings: RigSettings, tell: Callable[[float], None] = lambda part: None
+    rigs: Sequence[RigViews], settings: RigSettings, tell: Callable[[float], None] = lambda _: None
 ) -> list[tuple[dict, Adjustment | None]]:
     """The row of every rig, as a line of `jaxbundle batch`, and its adjustment, if any.
 
@@ -84,6 +84,7 @@ def solve_rigs(
     for number, (rig, first) in enumerate(zip(rigs, firsts), 1):
         solved.append(_solve(rig, first, settings))
         tell(number / len(rigs))
+    # misfits in the end, since they are found by comparison with the other rigs
     lengths = [_residual_lengths(result, settings) for _, result in solved]
     rms = np.array([np.sqrt(np.mean(v**2)) if len(v) else np.nan for v in lengths])
     mean = np.array([v.mean() if len(v) else np.nan for v in lengths])
@@ -94,19 +95,23 @@ def solve_rigs(
     return solved
 
 
-def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[FirstCamera | None]]:
+def _first_cameras(
+    rigs: Sequence[RigViews], settings: RigSettings
+) -> list[list[FirstCamera | None]]:
     """The cameras of every rig, those of one image size calibrated together; None for one without
     finite measurements."""
     found: list[list[FirstCamera | None]] = [[None] * len(rig.cameras) for rig in rigs]
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
         for c, size in enumerate(rig.sizes):
+            # one call of `calibrate_batch` has one image size and one number of points
             if not (np.abs(rig.xy[c]) > LARGEST_NUMBER).any() and np.isfinite(rig.xy[c]).any():
                 places.setdefault((size, len(rig.points)), []).append((i, c))
     for (size, points), of in places.items():
         xy = np.full((len(of), max(len(rigs[i].epochs) for i, _ in of), points, 2), np.nan)
         for row, (i, c) in enumerate(of):
             xy[row, : len(rigs[i].epochs)] = rigs[i].xy[c]
+        # one list of points if all have the same, which saves memory and keeps them exact
         X = np.array([rigs[i].points for i, _ in of])
         X = X[0] if (X == X[:1]).all() else X
         for (i, c), first in zip(of, first_cameras(X, xy, size, settings.model, settings.free)):
@@ -115,7 +120,7 @@ def _first_cameras(rigs: Sequence[Rig], settings: RigSettings) -> list[list[Firs
 
 
 def _solve(
-    rig: Rig, firsts: list[FirstCamera | None], settings: RigSettings
+    rig: RigViews, firsts: list[FirstCamera | None], settings: RigSettings
 ) -> tuple[dict, Adjustment | None]:
     """The row of a rig, without its RMS, and its adjustment."""
     try:
@@ -141,7 +146,9 @@ def _solve(
     return row, result
 
 
-def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[str, str]]:
+def _adjust(
+    rig: RigViews, firsts: Sequence[FirstCamera | None], settings: RigSettings
+) -> tuple[Adjustment, dict[str, str]]:
     """The adjustment of a rig, and what epochs were excluded, with the reason.
 
     **Raises:** `InputError`, `NotSolvedError`."""
@@ -149,6 +156,8 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
     result = adjust(network, max_iterations=settings.max_iterations)
     if settings.snooping is None:
         return result, excluded
+    # Epochs first: a board that moved shifts all points of an epoch, and point by point data
+    # snooping would remove the cameras that are right as well.
     while result.converged and (bad := _contradicting(rig, result, settings)):
         excluded |= {
             rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
@@ -172,7 +181,7 @@ def _adjust(rig: Rig, firsts, settings: RigSettings) -> tuple[Adjustment, dict[s
     ), excluded
 
 
-def _contradicting(rig: Rig, result: Adjustment, settings: RigSettings) -> dict[int, float]:
+def _contradicting(rig: RigViews, result: Adjustment, settings: RigSettings) -> dict[int, float]:
     """Epochs that contradict the mounting, and their RMS, pixels."""
     place = {id: e for of in rig.images for e, id in enumerate(of)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
@@ -207,7 +216,9 @@ def _undetermined(result: Adjustment, settings: RigSettings) -> list[str]:
     return found
 
 
-def declare_rig(rig: Rig, firsts: Sequence[FirstCamera | None], settings: RigSettings) -> Network:
+def declare_rig(
+    rig: RigViews, firsts: Sequence[FirstCamera | None], settings: RigSettings
+) -> Network:
     """The network of a rig, with start values.
 
     **Raises:** `NotSolvedError` for a camera without start values."""
@@ -248,7 +259,14 @@ def with_free(moves: Mapping[str, Any]) -> dict[str, Any]:
     return {"free": VELOCITY, **moves}
 
 
-def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -> Network:
+def _network_of(
+    rig: RigViews,
+    cameras: Sequence[Camera],
+    images: Sequence[tuple[Any, ...]],
+    rays: Float[np.ndarray, "n 4"],
+    sigma: Float[np.ndarray, "2"],
+    settings: RigSettings,
+) -> Network:
     """The network of images (camera, epoch, pose) and rays (image, point, x, y)."""
     ids = np.array([rig.images[c][e] for c, e, *_ in images], dtype=object)
     names = [rig.cameras[c] for c, *_ in images]

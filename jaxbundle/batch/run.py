@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,12 +30,9 @@ from jaxbundle.types import Progress
 
 STAGE = "calibrating"
 """The stage in reports of progress."""
-CAMERAS_A_WRITE = 256
-NETWORKS_A_CACHE = 50
-"""Compiled programs are dropped after this number of networks, to free memory."""
 
 
-def run_batch(
+def run_batch(  # noqa: PLR0913 keyword arguments of a public function
     inputs: Sequence[str | Path],
     file: str | Path,
     *,
@@ -51,10 +49,10 @@ def run_batch(
     brief: bool = False,
     retry: bool = False,
     renew: bool = False,
-    portion: int = CAMERAS_A_WRITE,
+    portion: int = 256,
     known: str | Path | None = None,
     compute: bool = True,
-    progress: Progress = lambda stage, done, total: None,
+    progress: Progress = lambda *_: None,
 ) -> Counter:
     """Calibrate the cameras and rigs of `.npz` files and of folders of photographs, and adjust all
     other inputs as networks.
@@ -76,7 +74,7 @@ def run_batch(
     - `brief`: no poses and covariances of cameras.
     - `retry`: compute inputs without a result in the file again.
     - `renew`: compute inputs with results of other settings or other data again.
-    - `portion`: cameras between two writes.
+    - `portion`: cameras between two writes: what an interruption loses, a quarter of a second.
     - `known`: another file of results; inputs in it are skipped.
     - `compute`: False: only check, drop and count the lines of the file.
     - `progress(stage, done, total)`: called after every write, and while photographs are searched;
@@ -92,7 +90,7 @@ def run_batch(
     """
     portion = integer("portion", portion)
     check_part(part)
-    asked = BatchSettings.of(
+    asked = BatchSettings.check(
         model, free, board, rig, pixel_size, settings, max_iterations, snooping, significance, brief
     )
     for path in inputs:
@@ -104,6 +102,7 @@ def run_batch(
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
         lines = JsonLines(file)
+        # all inputs are checked before anything is dropped: an error leaves the file as it was
         again = [
             key
             for work, share in zip(works, ours)
@@ -112,6 +111,7 @@ def run_batch(
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0
+        # by key, not by position, so that inputs may be added, left out, and reordered between runs
         have = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
         for work, share in zip(works, ours) if compute else ():
             chosen = np.array([i for i in share if work.keys[i] not in have], int)
@@ -126,7 +126,8 @@ def run_batch(
                 done += len(rows)
                 progress(STAGE, done, total)
                 networks += work.is_network
-                if work.is_network and networks % NETWORKS_A_CACHE == 0:
+                # networks of many sizes leave a compiled program each: dropped from time to time
+                if work.is_network and networks % 50 == 0:
                     jax.clear_caches()
     keys = (work.keys[i] for work, share in zip(works, ours) for i in share)
     heads = (lines.heads[key] for key in keys if key in lines)
@@ -145,6 +146,7 @@ def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict
 def key_of(path: str | Path, file: str | Path) -> str:
     """The path of an input relative to the folder of the result file, with / between folders."""
     folder, name = os.path.split(os.path.abspath(path))
+    # the folder without links, but not the input itself, whose name the user gave
     path = os.path.join(os.path.realpath(folder), name)
     try:
         path = os.path.relpath(path, os.path.dirname(os.path.realpath(file)))
@@ -164,11 +166,13 @@ def check_part(part: Sequence[int]) -> None:
 def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
     """Which cameras or networks of each input belong to a part."""
     ends = [0, *itertools.accumulate(numbers)]
-    own = [range(first, last) for first, last in zip(ends, ends[1:])]
-    return [[i - of.start for i in of if i % part[1] == part[0] - 1] for of in own]
+    # every N-th, not a block: inputs of similar size are often neighbours, and the parts take
+    # equally long
+    ranges = [range(first, last) for first, last in zip(ends, ends[1:])]
+    return [[i - r.start for i in r if i % part[1] == part[0] - 1] for r in ranges]
 
 
-def _tell(progress, done: int, number: int, total: int, part: float) -> None:
+def _tell(progress: Progress, done: int, number: int, total: int, part: float) -> None:
     """Report that a fraction `part` of `number` inputs is done."""
     progress(STAGE, done + int(part * number), total)
 
@@ -222,5 +226,5 @@ def _difference(head: dict, work: Work, i: int) -> str:
     return "" if head["data"] == work.data(i) else f"{work.made_of} were others"
 
 
-def _show_value(value) -> str:
+def _show_value(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)

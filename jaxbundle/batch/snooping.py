@@ -16,11 +16,9 @@ from jaxbundle.leastsquares.quality.distributions import critical_w
 from jaxbundle.leastsquares.quality.snooping import REMOVED_TOGETHER
 
 TESTS = ("pope",)
-MEDIAN = 1.0518
-"""Median of the larger of two normal |w|: (2Φ(m) − 1)² = ½."""
-ROUNDING = 1e-6
-"""A smaller σ0 is arithmetic noise, pixels."""
-ROUNDS = 200
+MAX_ROUNDS = 200
+"""Rounds of removal and adjustment. Each removes at most a point of every view; a camera that needs
+more has more blunders than a test can find. It only bounds the time."""
 
 
 class Snooping:
@@ -43,15 +41,18 @@ class Snooping:
         fitting = tests[self.used & np.isfinite(tests)]
         if not len(fitting):
             return False
-        sigma0 = max(min(sigma0, float(np.median(fitting)) / MEDIAN), ROUNDING)
+        # 1.0518: median of the larger of two normal |w|, (2Φ(m) − 1)² = ½. At least a millionth of
+        # a pixel: below is arithmetic noise.
+        sigma0 = max(min(sigma0, float(np.median(fitting)) / 1.0518), 1e-6)
         critical = critical_w(self.test, self.significance, 2 * len(fitting), redundancy, sigma0)
         tests = np.nan_to_num(tests, nan=0.0)
-        own = np.where(self.used, tests, 0.0)
-        if own.max(initial=0.0) > critical:
-            worst = own.argmax(1)
-            rows = np.flatnonzero(own.max(1) > max(critical, REMOVED_TOGETHER * own.max()))
+        included = np.where(self.used, tests, 0.0)
+        if included.max(initial=0.0) > critical:
+            worst, largest = included.argmax(1), included.max(1)
+            rows = np.flatnonzero(largest > max(critical, REMOVED_TOGETHER * largest.max()))
             self.used[rows, worst[rows]] = False
             return True
+        # each only once, so that no point alternates
         back = self.seen & ~self.used & ~self.returned & (tests < critical) & (tests > 0)
         self.used |= back
         self.returned |= back

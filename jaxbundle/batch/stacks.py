@@ -25,7 +25,7 @@ import numpy as np
 from jaxbundle.arguments import numeric_array
 from jaxbundle.batch.calibrate_rigs import check_rigs, rigs_of_arrays
 from jaxbundle.batch.input import check_shapes, single_list
-from jaxbundle.batch.rigs import Rig
+from jaxbundle.batch.rigs import RigViews
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
 from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE, largest_unpacked_size
@@ -53,7 +53,7 @@ class CameraStack:
         """Whether its rows are rigs, not cameras."""
         return self.image_points.ndim == 5
 
-    def rigs(self, chosen: Sequence[int]) -> list[Rig]:
+    def rigs(self, chosen: Sequence[int]) -> list[RigViews]:
         """Some of the rigs; a camera is a rig of one."""
         given = self.arguments(np.asarray(chosen))
         xy, visible = given["image_points"], given["visible"]
@@ -139,7 +139,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     return CameraStack(names, X, xy, size, visible, cameras)
 
 
-def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str):
+def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...] | None:
     """An array of names, if there is one.
 
     **Raises:** `InputError` for another one."""
@@ -155,8 +155,10 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str):
     return tuple(map(str, texts.tolist()))
 
 
-def _rows(path: str | Path, name: str, file) -> Any:
+def _rows(path: str | Path, name: str, file: Mapping[str, Any]) -> Any:
     """An array, or on demand the rows of a large uncompressed one with one row per camera."""
+    # a stack may exceed the memory: rows of an uncompressed array are read from the file when
+    # needed
     found = find_stored_rows(path, name) if name in BY_CAMERA else None
     cameras = found is not None and found.ndim in BY_CAMERA[name]
     truths = name == "visible"

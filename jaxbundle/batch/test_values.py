@@ -13,20 +13,25 @@ import jax.numpy as jnp
 
 from jaxbundle.batch.normal import (
     POSE,
-    Calibration,
-    Factor,
+    ByPoint,
+    CameraFactor,
+    CameraUnknowns,
     Sightings,
     design,
     factorise,
     gram,
 )
 from jaxbundle.batch.small_cholesky import forward
-
-LEAST_REDUNDANCY = 1e-6
-"""A point with less is controlled by no other: it has no test value."""
+from jaxbundle.cameras import CameraModel
 
 
-def point_tests(model, free, seen: Sightings, used, at: Calibration):
+def point_tests(
+    model: CameraModel,
+    free: tuple[int, ...],
+    seen: Sightings,
+    used: ByPoint,
+    at: CameraUnknowns,
+) -> ByPoint:
     """Test values of all points seen [views, points], in pixels; NaN where there is none.
 
     **Arguments:** `seen`: the points of the included views; `used` [views, points]: 1 for
@@ -36,27 +41,29 @@ def point_tests(model, free, seen: Sightings, used, at: Calibration):
     weighted = [[used * column for column in columns] for columns in (columns_x, columns_y)]
     factor = factorise(gram(*weighted), seen.views, 0.0)
 
-    def test(columns):
+    def test(columns: list[ByPoint]) -> ByPoint:
         h = _leverage(factor, columns[:-1])
         redundancy = jnp.where(used > 0, 1 - h, 1 + h)
-        known = (seen.weight > 0) & (redundancy > LEAST_REDUNDANCY)
+        # a point of less redundancy is controlled by no other: far above rounding, far below any
+        # redundancy number that serves a test
+        known = (seen.weight > 0) & (redundancy > 1e-6)
         value = jnp.abs(columns[-1]) / jnp.sqrt(jnp.where(known, redundancy, 1.0))
         return jnp.where(known, value, jnp.nan)
 
     return jnp.fmax(test(columns_x), test(columns_y))
 
 
-def _leverage(factor: Factor, row: list):
+def _leverage(factor: CameraFactor, row: list[ByPoint]) -> ByPoint:
     """a·Q·aᵀ of rows given as columns [views, points]."""
     wide = lambda values: [value[:, None] for value in values]
     L = [wide(elements) for elements in factor.pose]
     scaled = [s * a for s, a in zip(wide(factor.scale.T), row[:POSE])]
-    own = forward(L, scaled)
+    of_pose = forward(L, scaled)
     rest = [
-        a - sum(o * e[:, i, None] for o, e in zip(own, factor.eliminated))
+        a - sum(o * e[:, i, None] for o, e in zip(of_pose, factor.eliminated))
         for i, a in enumerate(row[POSE:])
     ]
     rest = jnp.stack([s * a for s, a in zip(factor.interior_scale, rest)])
     flat = rest.reshape(len(rest), -1)
     through = jax.scipy.linalg.solve_triangular(factor.interior, flat, lower=True)
-    return sum(o * o for o in own) + (through**2).sum(0).reshape(rest.shape[1:])
+    return sum(o * o for o in of_pose) + (through**2).sum(0).reshape(rest.shape[1:])

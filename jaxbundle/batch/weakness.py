@@ -14,9 +14,6 @@ from jaxbundle.batch.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
-SMALLEST_PART = 0.05
-"""A parameter with this part of the square of a vanishing direction is named."""
-
 
 def is_vague(
     model: CameraModel,
@@ -38,15 +35,12 @@ def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "ca
     """Parameters with part in the null space of the scaled reduced normal matrix."""
     finite = np.all(np.isfinite(reduced), axis=(1, 2))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
+    # before the elimination the diagonal is 1, so that an eigenvalue is the part that remains
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
-    return finite[:, None] & (share > SMALLEST_PART)
-
-
-STRAIGHT, SAME = 0.01, 0.01
-"""Largest change of scale across half of a board that is seen from the front, and largest
-difference of it between photographs that are tilted alike: a tilt of 20° at a distance of five
-boards makes 0.04."""
+    # a twentieth of the square of the direction: of those that nothing determines, the ones that
+    # change visibly together
+    return finite[:, None] & (share > 0.05)
 
 
 def weak_geometry(
@@ -61,6 +55,10 @@ def weak_geometry(
     the relative distance of a point at x from the middle of the view. Equal l in all views give two
     conditions for the camera, however many there are (Sturm and Maybank, 1999).
     """
+    # Largest change of scale across half of a board that counts as seen from the front, and largest
+    # difference between photographs that count as tilted alike: a tilt of 20° at a distance of five
+    # boards makes 0.04.
+    straight = alike = 0.01
     centred = points - points.mean(0)
     axes, size = np.linalg.svd(centred)[2], np.linalg.svd(centred, compute_uv=False)
     if size[2] > 1e-6 * size[0]:
@@ -68,22 +66,10 @@ def weak_geometry(
     X = centred @ axes[:2].T / size[0] * np.sqrt(len(points))
     tilts, middles, extents = [], [], []
     for view, seen in zip(xy, visible):
-        if seen.sum() < 6:
+        if seen.sum() < 6:  # four points determine a homography, two control it
             continue
-        middle = view[seen].mean(0)
-        extent = np.sqrt(((view[seen] - middle) ** 2).sum(1).mean())
-        x, ones = (view[seen] - middle) / extent, np.ones((int(seen.sum()), 1))
-        from_plane, zero = np.concatenate([X[seen], ones], 1), np.zeros((int(seen.sum()), 3))
-        A = np.concatenate(
-            [
-                np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
-                np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
-            ]
-        )
-        H = np.linalg.svd(A)[2][-1].reshape(3, 3)
-        line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
-        with np.errstate(all="ignore"):
-            tilts.append(line[:2] / line[2])
+        tilt, middle, extent = _find_tilt(X[seen], view[seen])
+        tilts.append(tilt)
         middles.append(middle)
         extents.append(extent)
     if len(tilts) < 2 or not np.isfinite(tilts).all():
@@ -91,17 +77,39 @@ def weak_geometry(
     extent = np.median(extents)
     # the tilts about the middle of one view, in the same unit of length
     tilts, middles = np.array(tilts) * (extent / np.array(extents))[:, None], np.array(middles)
-    if np.linalg.norm(tilts, axis=1).max() < STRAIGHT:
+    if np.linalg.norm(tilts, axis=1).max() < straight:
         return (
             "all photographs look straight at the board: a longer principal distance and a larger "
             "distance give the same images"
         )
     shift = (middles - middles[0]) / extent
     about_one = tilts / (1 - np.einsum("vi,vi->v", tilts, shift))[:, None]
-    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < SAME:
+    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < alike:
         return (
             "all photographs show the board tilted alike, in the same direction of the image: one "
             "tilt does not separate the principal distance from the distance, nor the principal "
             "point from the tilt"
         )
     return ""
+
+
+def _find_tilt(
+    X: Float[np.ndarray, "n 2"], xy: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], float]:
+    """l of a view (`weak_geometry`), about the middle of its points and in units of their extent;
+    this middle and extent, pixels."""
+    middle = xy.mean(0)
+    extent = np.sqrt(((xy - middle) ** 2).sum(1).mean())
+    x, ones, zero = (xy - middle) / extent, np.ones((len(xy), 1)), np.zeros((len(xy), 3))
+    # the direct linear transformation of the plane (Hartley, 1997); its least singular vector
+    from_plane = np.concatenate([X, ones], 1)
+    A = np.concatenate(
+        [
+            np.concatenate([from_plane, zero, -x[:, :1] * from_plane], 1),
+            np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
+        ]
+    )
+    H = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
+    with np.errstate(all="ignore"):
+        return line[:2] / line[2], middle, extent

@@ -10,6 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import SECTIONS, rig_settings
@@ -40,8 +42,8 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.system.workers import Workers
 
 RIGS_A_WRITE = 32
-OF_A_PROCESS = 280e6
-"""Bytes of a process that searches boards, before its first photograph (measured)."""
+"""Rigs between two writes: what an interruption loses. A rig is a network of its own, and takes
+longer than a camera of a batch; not critical."""
 SIGMA_IMAGE = "sigma_image"
 WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
 """Settings present only in lines computed with them."""
@@ -81,18 +83,18 @@ class BatchSettings:
     brief: bool
 
     @classmethod
-    def of(
+    def check(
         cls,
-        model,
-        free,
-        board,
-        rig,
-        pixel_size,
-        overrides,
-        max_iterations,
-        snooping,
-        significance,
-        brief,
+        model: str | CameraModel,
+        free: Sequence[str] | None,
+        board: Board | None,
+        rig: bool,
+        pixel_size: float | None,
+        overrides: Sequence[str],
+        max_iterations: int,
+        snooping: str | None,
+        significance: float,
+        brief: bool,
     ) -> "BatchSettings":
         """The settings from the arguments of `run_batch`.
 
@@ -171,12 +173,14 @@ def plan_works(
         else:
             works[name] = _network(path, name, settings)
     if settings.board is not None and folders:
+        # corners are kept beside the results, except where these are no file (/dev/stdout)
         regular = os.path.isfile(file) or not os.path.exists(file)
         kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
         # the photographs of a folder are of one size
         of_folders = (filter(is_photograph, Path(one).rglob("*")) for one in folders.values())
         some = [path for found in of_folders for path in islice(found, 1)]
-        at_once = searches_at_once(some, settings.board, OF_A_PROCESS)
+        # bytes of a process that searches boards, before its first photograph (measured)
+        at_once = searches_at_once(some, settings.board, 280e6)
         workers = held.enter_context(Workers(search_alone, at_once))
         if settings.rig:
             rigs = RigFolders(tuple(folders.values()), settings.board, kept, workers)
@@ -191,16 +195,16 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     brief, of_rigs = settings.brief, settings.as_rigs()
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
-    def cameras(chosen, _):
+    def cameras(chosen: Sequence[int], _: Tell) -> list[dict]:
         batch = calibrate_batch(
-            **stack.arguments(chosen),
+            **stack.arguments(np.asarray(chosen)),
             model=settings.model,
             free=settings.free,
             **settings.adjusting,
         )
         return [batch.row(i, brief) for i in range(len(chosen))]
 
-    def rigs(chosen, tell):
+    def rigs(chosen: Sequence[int], tell: Tell) -> list[dict]:
         return [shorten(row, brief) for row, _ in solve_rigs(stack.rigs(chosen), of_rigs, tell)]
 
     if settings.are_plain() and not stack.of_rigs:
@@ -212,7 +216,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
     brief, of_rigs = settings.brief, settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.adjusting}
 
-    def solve(chosen, tell):
+    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
@@ -231,6 +235,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
             rows[i] |= of_photographs(views[i], brief)
         return [rows[i] for i in chosen]
 
+    # the board is a setting of the lines: other corners are found with another one
     lines = settings.of_cameras() | {"board": repr(found.board)}
     portion = sys.maxsize if settings.are_plain() else RIGS_A_WRITE
     return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=portion)
@@ -239,7 +244,7 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
 def _photographed_rigs(found: RigFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
     of_rigs = settings.as_rigs()
 
-    def solve(chosen, tell):
+    def solve(chosen: Sequence[int], tell: Tell) -> list[dict]:
         measured = found.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
@@ -273,10 +278,10 @@ def _network(path: str, name: str, settings: BatchSettings) -> Work:
     solve = lambda chosen, _: [
         network_row(path, settings.overrides, **settings.adjusting) for _ in chosen
     ]
-    return Work((name,), settings.of_networks(), lambda i: of_input(path), solve, "its files", True)
+    return Work((name,), settings.of_networks(), lambda _: of_input(path), solve, "its files", True)
 
 
-def network_row(path: str, overrides: Sequence[str] = (), **options) -> dict:
+def network_row(path: str, overrides: Sequence[str] = (), **options: Any) -> dict:
     """The status and brief result of one network (`options` of `adjust`), or the reason for a
     failure."""
     try:
@@ -286,5 +291,6 @@ def network_row(path: str, overrides: Sequence[str] = (), **options) -> dict:
     except (InputError, NotSolvedError) as error:
         status = "bad input" if isinstance(error, InputError) else "not solved"
         return {"status": status, "error": str(error)}
+    # one broken network must not end a night of others
     except UNEXPECTED as error:
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}

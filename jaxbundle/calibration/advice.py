@@ -1,5 +1,6 @@
 """Weaknesses of a calibration in words, and advice on further photographs."""
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,20 +10,42 @@ from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
-FEW_VIEWS = 8
-SMALLEST_ROLL = 60.0
-"""Minimum difference of roll between two photographs, degrees; 90 is best."""
-SMALLEST_TILT = 15.0
-"""Minimum angle between line of sight and board normal, degrees."""
-FEW_TILTED = 3
-RANGE = 1.3
-"""Minimum ratio of farthest to nearest distance of the board."""
-REACH, PART = 0.85, 0.6
-LARGEST_RMS = 1.0
-"""A larger RMS, in pixels, is not caused by corner detection."""
-LARGEST_TEST = 3.0
-SMALLEST_T = 1.0
-"""A distortion coefficient with smaller |value|/σ is insignificant."""
+
+@dataclasses.dataclass(frozen=True)
+class AdviceSettings:
+    """From where on photographs of a board are good enough; below it, advice is given.
+
+    **Fields:**
+
+    - `min_views`: photographs of the board. Each has 6 unknowns of its own; larger or smaller:
+      advice comes earlier or later.
+    - `min_roll`: difference of roll between two photographs, degrees; 90 is best: the principal
+      point is then seen from two sides; at 60 a cos of ½ remains.
+    - `min_tilt`, `min_tilted`: angle between line of sight and board normal, degrees, and the
+      number of photographs that have it: the change of scale across the board, which separates
+      the principal distance from the distance, grows with the sine of the angle.
+    - `min_distance_ratio`: of farthest to nearest distance of the board.
+    - `min_reach`, `min_part`: of the half diagonal to the farthest point; of the cells of the image
+      with points. Beyond the farthest point the distortion is extrapolated by its highest power.
+    - `max_rms`: a larger RMS, in pixels, is not caused by corner detection, which has a tenth.
+    - `max_test`: of the two halves (1 expected, for k parameters with a σ of √(2/k)).
+    - `min_t`: a distortion coefficient with smaller |value|/σ is insignificant: its
+      error is larger than itself, and 0 would be nearer.
+    """
+
+    min_views: int = 8
+    min_roll: float = 60.0
+    min_tilt: float = 15.0
+    min_tilted: int = 3
+    min_distance_ratio: float = 1.3
+    min_reach: float = 0.85
+    min_part: float = 0.6
+    max_rms: float = 1.0
+    max_test: float = 3.0
+    min_t: float = 1.0
+
+
+ADVICE = AdviceSettings()
 
 
 def advice(
@@ -35,6 +58,7 @@ def advice(
     t: dict[str, float],
     model: CameraModel,
     validation: CrossValidation | None = None,
+    settings: AdviceSettings = ADVICE,
 ) -> list[str]:
     """Warnings in words, the most serious first; empty if there are none.
 
@@ -48,13 +72,13 @@ def advice(
         for name in model.principal_distance
         if t.get(name, np.inf) < VAGUE_RATIO
     ]
-    found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
-    if rms > LARGEST_RMS:
+    found += [*_geometry(position, rotation, middle, unit, settings), *_image(covered, settings)]
+    if rms > settings.max_rms:
         found.append(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
             "board (--board-sigma), or free more parameters"
         )
-    if validation is not None and validation.test > LARGEST_TEST:
+    if validation is not None and validation.test > settings.max_test:
         found.append(
             f"the two halves of the photographs contradict each other (test {validation.test:.1f}, "
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
@@ -63,9 +87,11 @@ def advice(
     return found
 
 
-def suggest(t: dict[str, float], model: CameraModel) -> list[str]:
+def suggest(
+    t: dict[str, float], model: CameraModel, settings: AdviceSettings = ADVICE
+) -> list[str]:
     """Suggestions in words, for a calibration that may be good as it is."""
-    weak = [name for name, value in t.items() if value < SMALLEST_T and name not in model.core]
+    weak = [name for name, value in t.items() if value < settings.min_t and name not in model.core]
     if not weak or model.prior:
         return []
     return [
@@ -85,37 +111,43 @@ def tilts(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views
     return np.degrees(np.arccos(np.clip(np.abs(rotation[:, 2, 2]), 0, 1)))
 
 
-def _geometry(position, rotation, middle, unit) -> Iterator[str]:
+def _geometry(
+    position: Float[np.ndarray, "views 3"],
+    rotation: Float[np.ndarray, "views 3 3"],
+    middle: Float[np.ndarray, "3"],
+    unit: str,
+    settings: AdviceSettings,
+) -> Iterator[str]:
     number = len(position)
-    if number < FEW_VIEWS:
+    if number < settings.min_views:
         yield (
-            f"only {number} photographs show the board: take {FEW_VIEWS} to 20, from different "
-            "directions"
+            f"only {number} photographs show the board: take {settings.min_views} to 20, from "
+            "different directions"
         )
-    steep = (tilts(rotation) > SMALLEST_TILT).sum()
-    if steep < FEW_TILTED:
+    steep = (tilts(rotation) > settings.min_tilt).sum()
+    if steep < settings.min_tilted:
         yield (
             f"only {steep} of {number} photographs look at the board from more than "
-            f"{SMALLEST_TILT:.0f}° aside, fewer than {FEW_TILTED}: the principal distance "
-            "can hardly be separated from the distance of the board; take some tilted by 20° to "
-            "45°, to the left, to the right, up and down"
+            f"{settings.min_tilt:.0f}° aside, fewer than {settings.min_tilted}: the principal "
+            "distance can hardly be separated from the distance of the board; take some tilted by "
+            "20° to 45°, to the left, to the right, up and down"
         )
     turn = turns(rotation)
     apart = np.abs(turn[:, None] - turn) % 180
-    if np.minimum(apart, 180 - apart).max() < SMALLEST_ROLL:
+    if np.minimum(apart, 180 - apart).max() < settings.min_roll:
         yield (
             "no photograph is rolled by 90° about the line of sight: only the tilts determine the "
             "principal point; take some with the camera rolled"
         )
     away = np.linalg.norm(position - middle, axis=1)
-    if away.max() < RANGE * away.min():
+    if away.max() < settings.min_distance_ratio * away.min():
         yield (
             f"all photographs are from nearly one distance ({away.min():.3g} to {away.max():.3g} "
             f"{unit}): take some nearer and some farther away"
         )
 
 
-def _image(covered: Coverage) -> Iterator[str]:
+def _image(covered: Coverage, settings: AdviceSettings) -> Iterator[str]:
     empty = [name for name, there in covered.corners.items() if not there]
     if empty:
         corners = f"{', '.join(empty)} corner{'s' if len(empty) > 1 else ''}"
@@ -123,12 +155,12 @@ def _image(covered: Coverage) -> Iterator[str]:
             f"no point in the {corners} of the image: the distortion there is extrapolated; "
             "photograph the board there"
         )
-    elif covered.reach < REACH:
+    elif covered.reach < settings.min_reach:
         yield (
             f"the points reach to {100 * covered.reach:.0f} % of the half diagonal: photograph the "
             "board closer to the corners"
         )
-    if covered.part < PART:
+    if covered.part < settings.min_part:
         yield (
             f"points cover {100 * covered.part:.0f} % of the image: move the board about in it, or "
             "let it fill the image"

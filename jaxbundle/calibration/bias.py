@@ -43,23 +43,43 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.calibration.observation_equations import (
+    LinearisedImagePoints,
+    lagrange_multipliers,
+    linearise_image_points,
+)
 from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.calibration.quality import used_rays
 from jaxbundle.cameras import get_model
-from jaxbundle.leastsquares.quality.distributions import f_tail
+from jaxbundle.leastsquares.quality.distributions import f_tail, normal_quantile
 
 SIGNIFICANCE = 0.01
-"""Level of the test."""
-NORMAL_MEDIAN = 0.6744897501960817
-"""The median of |x| of a standard normal x."""
-FEWEST = 10
-"""Minimum number of cells."""
+"""Joint level of the tests: one good calibration in a hundred is suspected."""
 
 
-DEGREES = {"camera": 5, "heights": 4, "plane": 2}
-"""Degrees of the polynomials of a smooth bias."""
-SMALLEST_REMAINDER = 0.01
-"""Smallest fraction of the square of a field that the unknowns must leave."""
+@dataclasses.dataclass(frozen=True)
+class BiasSettings:
+    """What the tests of a bias look for.
+
+    **Fields:**
+
+    - `min_cells`: of four corners, and degrees of freedom they must leave: with 10 the σ of a
+      corner is known to a third.
+    - `camera_degree`: of the polynomials in the image: the fifth contains r⁴·x, the term of k2, and
+      everything below.
+    - `height_degree`, `plane_degree`: of those on the board: a board bends in its length and its
+      width, and twists (fourth); its plane is stretched and sheared (second).
+    - `min_remainder`: fraction of the square of a field that the unknowns must leave; less is not
+      worth a degree of freedom.
+    """
+
+    min_cells: int = 10
+    camera_degree: int = 5
+    height_degree: int = 4
+    plane_degree: int = 2
+    min_remainder: float = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +96,7 @@ class FTest:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bias:
+class CalibrationBias:
     """Corner noise compared with the residuals of a calibration.
 
     **Fields:** `cells` of four corners; `corner_sigma`: σ of a coordinate from them, robust;
@@ -116,7 +136,9 @@ class Bias:
         return f"the residuals contain a bias{part}, {what}"
 
 
-def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
+def find_bias(
+    adjustment: Adjustment, grid: tuple[int, int], settings: BiasSettings | None = None
+) -> CalibrationBias | None:
     """Test the calibration of one camera from photographs of a board.
 
     **Arguments:** the adjustment; `grid`: rows and columns of the board, whose points follow each
@@ -124,24 +146,33 @@ def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
 
     **Returns:** None if there are too few complete cells, or no redundancy.
     """
+    settings = settings or BiasSettings()
     problem = adjustment.problem
     cells = cells_of_four(problem, grid)
-    if len(cells) < FEWEST or not adjustment.sigma0 > 0:
+    if len(cells) < settings.min_cells or not adjustment.sigma0 > 0:
         return None
     found = linearise_image_points(problem, adjustment.values)
     t, A = _equations(adjustment, found, cells)
+    # An orthonormal basis of what camera and board can move in all t: the projection needs no
+    # normal equations, whose condition is the square of that of A. Columns to the length 1, since
+    # k3 and f differ by ten powers of ten.
     U, size, _ = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), False)
     U = U[:, size > len(A) * np.finfo(float).eps * size[0]]
-    left, own = t - U @ (U.T @ t), len(t) - U.shape[1]
-    more = adjustment.redundancy - own
-    if own < FEWEST or more < 1:
+    left, degrees = t - U @ (U.T @ t), len(t) - U.shape[1]
+    more = adjustment.redundancy - degrees
+    if degrees < settings.min_cells or more < 1:
         return None
     omega, of_cells = float(left @ left), slice(0, 2 * len(cells))
-    kept = np.sqrt(np.clip(1 - np.sum(U**2, 1), 1e-3, None))
-    noise = float(np.median(np.abs(left / kept)[of_cells])) / NORMAL_MEDIAN
-    tests = {"cells": _f_test(adjustment.vtpv - omega, more, omega, own)}
-    for name, B in (("camera", _image_fields(problem)), ("board", _board_fields(problem, found))):
-        gain, q = _gain(adjustment, found, B)
+    # each over the root of its redundancy number, so that its σ is 1; the median of |x| as σ
+    root = np.sqrt(np.clip(1 - np.sum(U**2, 1), 1e-3, None))
+    noise = float(np.median(np.abs(left / root)[of_cells])) / normal_quantile(0.75)
+    tests = {"cells": _f_test(adjustment.vtpv - omega, more, omega, degrees)}
+    fields = {
+        "camera": _image_fields(problem, settings.camera_degree),
+        "board": _board_fields(problem, found, settings),
+    }
+    for name, B in fields.items():
+        gain, q = _gain(adjustment, found, B, settings.min_remainder)
         r = adjustment.redundancy - q
         if q and r > 0:
             tests[name] = _f_test(gain, q, adjustment.vtpv - gain, r)
@@ -149,7 +180,7 @@ def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
     pixel = np.array(unit_size(get_model(camera.model), camera.pixel_size))
     weight = np.asarray(problem.data.image_weight)[np.ravel(cells)]
     sigma = float(np.sqrt(np.mean(1 / (weight * pixel) ** 2)))
-    return Bias(len(cells), sigma * noise, sigma * adjustment.sigma0, tests)
+    return CalibrationBias(len(cells), sigma * noise, sigma * adjustment.sigma0, tests)
 
 
 def _f_test(gain: float, q: int, rest: float, r: int) -> FTest:
@@ -157,16 +188,23 @@ def _f_test(gain: float, q: int, rest: float, r: int) -> FTest:
     return FTest(float(F), (q, r), f_tail(max(float(F), 0.0), q, r))
 
 
-def _gain(adjustment, found, B) -> tuple[float, int]:
+def _gain(
+    adjustment: Adjustment,
+    found: LinearisedImagePoints,
+    B: Float[np.ndarray, "n 2 k"],
+    min_remainder: float,
+) -> tuple[float, int]:
     """The decrease of vᵀPv by the parameters of B, and the number of independent ones."""
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
+    # Along the eigenvectors of S the coefficients are independent; a small eigenvalue is a field
+    # that the unknowns absorb, of which only the rest would be tested, that is rounding.
     score, S = lagrange_multipliers(adjustment, found, B)
     size, V = np.linalg.eigh(S)
-    new = size > SMALLEST_REMAINDER
+    new = size > min_remainder
     return float(((V[:, new].T @ score) ** 2 / size[new]).sum()), int(new.sum())
 
 
-def _powers(xy, least: int, most: int) -> Float[np.ndarray, "n terms"]:
+def _powers(xy: Float[np.ndarray, "n 2"], least: int, most: int) -> Float[np.ndarray, "n terms"]:
     """Products of Legendre polynomials of x and y [n, 2], both scaled to −1 … 1."""
     scaled = [2 * (a - a.min()) / max(np.ptp(a), 1e-300) - 1 for a in xy.T]
     P, R = (np.polynomial.legendre.legvander(a, most) for a in scaled)
@@ -174,18 +212,21 @@ def _powers(xy, least: int, most: int) -> Float[np.ndarray, "n terms"]:
     return np.stack([P[:, i] * R[:, j] for i, j in pairs], 1)
 
 
-def _image_fields(problem) -> Float[np.ndarray, "n 2 k"]:
+def _image_fields(problem: Problem, degree: int) -> Float[np.ndarray, "n 2 k"]:
     """Smooth displacements in x and y over the image, divided by σ."""
-    field = _powers(np.asarray(problem.data.image_xy), 0, DEGREES["camera"])
+    field = _powers(np.asarray(problem.data.image_xy), 0, degree)
     each = np.asarray(problem.data.image_weight)[:, :, None] * field[:, None]
     none = np.zeros_like(each[:, 0])
     return np.stack([np.hstack([each[:, 0], none]), np.hstack([none, each[:, 1]])], 1)
 
 
-def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
+def _board_fields(
+    problem: Problem, found: LinearisedImagePoints, settings: BiasSettings
+) -> Float[np.ndarray, "n 2 k"]:
     """Image effects of smooth displacements of the board points, divided by σ."""
     XY = problem.network.points.position[problem.point, :2]
-    plane, height = _powers(XY, 0, DEGREES["plane"]), _powers(XY, 2, DEGREES["heights"])
+    plane = _powers(XY, 0, settings.plane_degree)
+    height = _powers(XY, 2, settings.height_degree)  # a height and a tilt are those of the pose
     of = found.slopes["point"]
     return np.concatenate(
         [
@@ -197,12 +238,13 @@ def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
     )
 
 
-def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:
+def cells_of_four(problem: Problem, grid: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
     """The image points of every complete cell of 2 × 2 points, in all photographs."""
     rows, columns = grid
-    used = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).all(1))
+    used = np.flatnonzero(used_rays(problem))
     place = np.full((len(problem.network.images), rows * columns), -1)
     place[problem.image[used], problem.point[used]] = used
+    # cells share no corner, so that their t are independent; an odd last row or column is not used
     place = place.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
     corners = [place[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
     place = np.stack(corners, 1)
@@ -210,16 +252,18 @@ def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:
 
 
 def _equations(
-    adjustment, found, cells
+    adjustment: Adjustment, found: LinearisedImagePoints, cells: Int[np.ndarray, "cells 4"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m u"]]:
     """t of all cells, followed by the pseudo-observations, and their derivatives by the free
     parameters of camera and board."""
     problem = adjustment.problem
     (name,) = (table.name for table in problem.layout.cameras)
     cut = lambda x: x[cells].reshape(len(cells), 8, -1)
+    # the last left singular vectors of J [8, 6] span what no pose of the cell can move
     N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
     t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
     of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
+    # a free or weighted board: its coordinates are columns of A, too
     free = problem.system.table("point").free.astype(bool)
     of_points = np.zeros((len(cells), 2, *free.shape))
     if free.any():
@@ -234,7 +278,7 @@ def _equations(
     place = np.full(free.shape, -1)
     place[free] = width + np.arange(free.sum())
     of_table = np.full(v.interior.shape, -1)
-    moving = list(problem.system.table(name).space.moving)
+    moving = list(problem.system.table(name).vector.moving)
     of_table[:, moving] = np.arange(width)
     for x, weight, column in (
         (v.control, data.control_weight, place[problem.layout.given["control"]]),

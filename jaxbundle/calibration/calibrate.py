@@ -17,16 +17,19 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import number, positive, show, text, vector
 from jaxbundle.bundle.adjust import adjust, check_options
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.start import Start, start_values
+from jaxbundle.calibration.start import CalibrationStart, start_values
 from jaxbundle.cameras import CameraModel, check_own, get_model, is_own
 from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
@@ -40,12 +43,10 @@ from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import Progress, present
-
-ECCENTRICITY_ROUNDS = 2
+from jaxbundle.types import AnyArray, Progress, Scalar, present
 
 
-def calibrate(
+def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     photographs: Sequence[str | Path] | BoardViews,
     board: Board | None = None,
     *,
@@ -62,7 +63,7 @@ def calibrate(
     camera: str = "cam",
     object_unit: str = "m",
     progress: Progress | None = None,
-    **options,
+    **options: Any,
 ) -> Calibration:
     """Calibrate a camera from photographs of a board.
 
@@ -96,6 +97,7 @@ def calibrate(
     _check_given(camera_model, given)
     text("camera", camera)
     text("object_unit", object_unit)
+    # either downweighted or removed: a test of residuals that robust weights changed has no level
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
@@ -103,6 +105,7 @@ def calibrate(
     board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
+    # held parameters need no prior
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
         camera,
@@ -123,7 +126,8 @@ def calibrate(
     )
     result = adjust(network, **options)
     if board.diameter is not None and board.kind != "chessboard" and result.converged:
-        for _ in range(ECCENTRICITY_ROUNDS):
+        # twice: the shifts depend on the poses, and these change by the shifts, by a small part
+        for _ in range(2):
             centred = _without_eccentricity(start, result, made)
             network = board_network(
                 dataclasses.replace(start, views=centred),
@@ -138,7 +142,11 @@ def calibrate(
     return Calibration(start.views, result, cross_validation)
 
 
-def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
+def views_of(
+    photographs: Sequence[str | Path] | BoardViews,
+    board: Board | None,
+    progress: Progress | None = None,
+) -> BoardViews:
     """The board measured in photographs; `BoardViews` are returned unchanged."""
     if isinstance(photographs, BoardViews):
         return photographs
@@ -155,7 +163,7 @@ def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
 
 
 def board_network(
-    start: Start,
+    start: CalibrationStart,
     camera: Camera,
     sigma_image: float | None,
     *,
@@ -168,6 +176,7 @@ def board_network(
     board = views.board
     view, point = np.nonzero(views.visible)
     xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
+    # image coordinates in the unit of the model, σ in pixels: a pixel is not square in every camera
     sx, sy = (sigma_image or UNSTATED_BOARD_SIGMA) * np.array(unit_size(model, camera.pixel_size))
     role = "tie" if board_free else "fixed" if board_sigma is None else "control"
     X, Y, Z = board.points.T
@@ -191,6 +200,7 @@ def board_network(
         },
         sigma_origin=UNIT if sigma_image is None else STATED,
         datum="inner" if board_free else "control",
+        # residuals where noise arises: in the photograph, not in the ideal image without distortion
         residuals="measured",
         angle_unit="deg",
         image_unit=model.unit,
@@ -213,7 +223,9 @@ def board_network(
     return network
 
 
-def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
+def _without_eccentricity(
+    start: CalibrationStart, result: Adjustment, camera: Camera
+) -> BoardViews:
     """The measured views with points moved from the ellipse centres to the images of the circle
     centres."""
     views, model = start.views, get_model(camera.model)
@@ -227,10 +239,16 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
 
 
 @partial(compile_once, static=0)
-def _shifts(model, p, poses, centres, radius):
+def _shifts(
+    model: CameraModel,
+    p: Float[AnyArray, " parameters"],
+    poses: Pose,
+    centres: Float[AnyArray, "points 3"],
+    radius: Scalar,
+) -> Float[Array, "views points 2"]:
     up = jnp.array([0.0, 0.0, 1.0])
-    one = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(poses, centres)
+    shift = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
+    return jax.vmap(jax.vmap(shift, (None, 0)), (0, None))(poses, centres)
 
 
 def check_model(name: str | CameraModel) -> CameraModel:
@@ -247,7 +265,9 @@ def check_model(name: str | CameraModel) -> CameraModel:
     return model
 
 
-def _model(name: str | CameraModel, free) -> tuple[CameraModel, tuple[str, ...]]:
+def _model(
+    name: str | CameraModel, free: Iterable[str] | None
+) -> tuple[CameraModel, tuple[str, ...]]:
     model = check_model(name)
     if isinstance(free, str) or not (free is None or isinstance(free, Iterable)):
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
@@ -264,7 +284,7 @@ def _model(name: str | CameraModel, free) -> tuple[CameraModel, tuple[str, ...]]
     return model, free
 
 
-def _pair(pixel_size) -> tuple[float, float] | None:
+def _pair(pixel_size: Any) -> tuple[float, float] | None:
     if pixel_size is None:
         return None
     pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")
@@ -273,7 +293,7 @@ def _pair(pixel_size) -> tuple[float, float] | None:
     return float(pair[0]), float(pair[1])
 
 
-def _check_given(model: CameraModel, given) -> None:
+def _check_given(model: CameraModel, given: Any) -> None:
     if given is None:
         return
     if not isinstance(given, Mapping):
@@ -288,7 +308,7 @@ def _check_given(model: CameraModel, given) -> None:
         check(f"given: {name}", value)
 
 
-def _check(sigma_image, board_sigma, board_free) -> None:
+def _check(sigma_image: Any, board_sigma: Any, board_free: bool) -> None:
     if sigma_image is not None:
         positive("sigma_image", sigma_image)
     if board_sigma is not None:

@@ -3,7 +3,7 @@ r"""Choice of the camera model: several models calibrated from the same views of
 **Cross-validation.** The views fall into folds. For each fold the camera is estimated from the
 other folds, and the poses of its own views with that camera; their residuals show the error of the
 model in unseen photographs. This is one adjustment per fold, in which the σ of its views are
-`FAINT` times as large, so that they determine only their own poses.
+a thousand times as large, so that they determine only their own poses.
 
 **Information criteria**, for n image coordinates with the weighted sum of squares S, and k
 parameters as the trace of n·I minus their redundancy numbers (unknowns with a prior count in part):
@@ -22,9 +22,10 @@ section 3.4.3, the rule of one standard error.
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -32,9 +33,15 @@ from jaxtyping import Bool, Float
 from jaxbundle import plotting
 from jaxbundle.arguments import integer, show
 from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
 from jaxbundle.calibration.pixels import unit_size
-from jaxbundle.calibration.quality import at_result, kept_rays, part, residuals_in_pixels
+from jaxbundle.calibration.quality import (
+    residuals_in_pixels,
+    start_at_result,
+    take_images,
+    used_rays,
+)
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.cameras import CameraModel, Comparison, compare_cameras, get_model
 from jaxbundle.display import print_in_one_screen
@@ -45,9 +52,8 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.difference import expected_difference
 from jaxbundle.types import Progress
 
-FAINT = 1e3
-FEWEST = 4
-"""Minimum number of photographs for the camera of a fold."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @print_in_one_screen
@@ -73,7 +79,7 @@ class Candidate:
     bic: float
 
     @property
-    def given(self):
+    def model_and_parameters(self) -> tuple[CameraModel, dict[str, float]]:
         """The model and its parameters."""
         return get_model(self.calibration.camera.model), self.calibration.parameters
 
@@ -100,11 +106,20 @@ class ModelComparison:
     model (None: nothing to compare).
     """
 
-    def __init__(self, candidates, failed, folds, views, gross):
+    def __init__(
+        self,
+        candidates: Iterable[Candidate],
+        failed: Mapping[str, str],
+        folds: int,
+        views: Iterable[str],
+        gross: Iterable[tuple[str, str]],
+    ):
         self.candidates: tuple[Candidate, ...] = tuple(candidates)
         self.failed: dict[str, str] = dict(failed)
         self.folds, self.views, self.gross = folds, tuple(views), tuple(gross)
         self.best = min(self.candidates, key=lambda one: one.left_out)
+        # one standard error (Breiman et al.): between models that the scatter of the photographs
+        # cannot separate, the simpler one
         enough = [one for one in self.candidates if self.excess(one)[0] <= self.excess(one)[1]]
         self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
 
@@ -140,7 +155,7 @@ class ModelComparison:
             text += f"; {worse} {'is' if len(simpler) == 1 else 'are'} simpler and worse"
         return text + "."
 
-    def plot_difference(self, model: str, ax=None):
+    def plot_difference(self, model: str, ax: "Axes | None" = None) -> "Axes":
         """The map of a model's difference from the best; matplotlib axes."""
         found = self.differences[model]
         if found is None:
@@ -154,7 +169,7 @@ class ModelComparison:
         return choice_text(self)
 
     def to_dict(self) -> dict:
-        """The same as plain dicts and numbers, as in JSON."""
+        """The comparison as plain dicts and numbers, as in JSON."""
         from jaxbundle.calibration.report import choice_dict
 
         return choice_dict(self)
@@ -170,7 +185,7 @@ def compare_models(
     models: Sequence[str | CameraModel],
     folds: int = 4,
     progress: Progress | None = None,
-    **options,
+    **options: Any,
 ) -> ModelComparison:
     """Calibrate one camera with several models and choose the sufficient one.
 
@@ -190,30 +205,23 @@ def compare_models(
     folds = integer("folds", folds, 2)
     names = [check_model(model).name for model in models]
     views = views_of(photographs, board, progress)
-    found, failed = {}, {}
-    for name, model in zip(names, models):
-        try:
-            one = calibrate(views, model=model, cross_validation=False, **options)
-        except (InputError, NotSolvedError) as error:
-            failed[name] = str(error)
-            continue
-        if one.converged:
-            found[name] = one
-        else:
-            failed[name] = f"not solved: {one.adjustment.termination}"
+    found, failed = _calibrate_all(views, dict(zip(names, models)), options)
     if not found:
         raise NotSolvedError(
             "not solved: none of the models: "
             + "; ".join(f"{name}: {why}" for name, why in failed.items())
         )
+    # Models are compared on the same observations: a photograph, or a point, that one of them could
+    # not use would make its residuals smaller. A point is gross if no model explains it.
     together = set.intersection(*({*one.views.names} for one in found.values()))
     common = [name for name in views.names if name in together]
-    if len(common) < folds + FEWEST:
+    needed = folds + 4  # so that about four remain for the camera of a fold
+    if len(common) < needed:
         raise InputError(
             f"{len(common)} photographs can be used by all models; {folds} folds need "
-            f"{folds + FEWEST} at least: give more, or fewer folds"
+            f"{needed} at least: give more, or fewer folds"
         )
-    gross = set.intersection(*(_removed_points(one) for one in found.values()))
+    gross = set.intersection(*map(_removed_points, found.values()))
     candidates = []
     for name, one in found.items():
         candidate = _candidate(name, one, common, gross, folds)
@@ -226,11 +234,29 @@ def compare_models(
     return ModelComparison(candidates, failed, folds, common, sorted(gross))
 
 
+def _calibrate_all(
+    views: BoardViews, models: Mapping[str, str | CameraModel], options: Mapping[str, Any]
+) -> tuple[dict[str, Calibration], dict[str, str]]:
+    """The calibrations by the names of the models, and why others failed."""
+    found, failed = {}, {}
+    for name, model in models.items():
+        try:
+            calibration = calibrate(views, model=model, cross_validation=False, **options)
+        except (InputError, NotSolvedError) as error:
+            failed[name] = str(error)
+            continue
+        if calibration.converged:
+            found[name] = calibration
+        else:
+            failed[name] = f"not solved: {calibration.adjustment.termination}"
+    return found, failed
+
+
 def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
     """Image and point of removed gross errors."""
     adjustment = calibration.adjustment
     ids = _ids(adjustment.problem.network)
-    return {ids[i] for i in np.flatnonzero(~kept_rays(adjustment))}
+    return {ids[i] for i in np.flatnonzero(~used_rays(adjustment.problem))}
 
 
 def _ids(network: Network) -> list[tuple[str, str]]:
@@ -238,25 +264,35 @@ def _ids(network: Network) -> list[tuple[str, str]]:
     return [(network.images.id[i], network.points.id[p]) for i, p in zip(rays.image, rays.point)]
 
 
-def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
+def _candidate(
+    name: str,
+    calibration: Calibration,
+    common: Sequence[str],
+    gross: set[tuple[str, str]],
+    folds: int,
+) -> Candidate | str:
     """A model with its statistics, or the reason for a failure."""
     result = calibration.adjustment
     network = result.problem.network
     keep = np.array([pair not in gross for pair in _ids(network)])
-    network = at_result(network, result, keep)
-    network = part(network, np.isin(np.array(network.images.id, object), common))
+    network = start_at_result(network, result, keep)
+    network = take_images(network, np.isin(np.array(network.images.id, object), common))
     camera = network.cameras[0]
     again = adjust(network)
     if not again.converged:
         return f"{name}: all observations together: {again.termination}"
     squares = np.zeros(len(network.observations))
+    # every fold-th view, not a block: neighbouring photographs are alike, and a block would leave a
+    # part of the poses out
     turns = np.arange(len(network.images)) % folds
     for fold in range(folds):
         left = turns[network.observations.image] == fold
-        one = adjust(_faint(network, left))
+        one = adjust(_without_weight(network, left))
         if not one.converged:
             return f"{name}: the photographs without those of fold {fold + 1}: {one.termination}"
         squares[left] = _squares(one, camera)[left]
+    # v is over σ, and the redundancy that of the image coordinates alone: k counts an unknown with
+    # a prior by the part that the image determines
     v = again.inspection.residuals.image
     redundancy = float(again.reliability.redundancy.image.sum())
     n, S = v.size, float(np.square(v).sum())
@@ -271,19 +307,22 @@ def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
         float(np.sqrt(_squares(again, camera).mean())),
         float(np.sqrt(squares.mean())),
         sums / counts,
+        # σ is estimated, so that −2·ln of the likelihood is n·ln(S/n) and a constant
         n * np.log(S / n) + 2 * k,
         n * np.log(S / n) + k * np.log(n),
     )
 
 
-def _faint(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
-    """The network with negligible weight for some rays, which then do not affect the camera."""
+def _without_weight(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
+    """The network with negligible weight for some rays, which then do not affect the camera.
+
+    A millionth of the weight: large enough for the poses, small enough for the camera."""
     rays = network.observations
-    sigma = np.where(left[:, None], FAINT * rays.sigma, rays.sigma)
+    sigma = np.where(left[:, None], 1e3 * rays.sigma, rays.sigma)
     return network.replace(observations=dataclasses.replace(rays, sigma=sigma))
 
 
-def _squares(adjustment, camera: Camera) -> Float[np.ndarray, " rays"]:
+def _squares(adjustment: Adjustment, camera: Camera) -> Float[np.ndarray, " rays"]:
     """|v|² of every point, pixels²."""
     return np.square(residuals_in_pixels(adjustment, camera)[0]).sum(1)
 
@@ -291,13 +330,16 @@ def _squares(adjustment, camera: Camera) -> Float[np.ndarray, " rays"]:
 def _difference(best: Candidate, one: Candidate) -> Difference | None:
     camera = best.calibration.camera
     sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
+    mappings = best.model_and_parameters, one.model_and_parameters
     try:
-        comparison = compare_cameras(best.given, one.given, **sizes)
+        comparison = compare_cameras(*mappings, **sizes)
     except ValueError:
         return None
-    of = lambda c: c.calibration.adjustment.camera_covariance(c.calibration.name)
-    C = expected_difference(comparison, best.given, one.given, (of(best), of(one)), **sizes)
-    size = unit_size(best.given[0], camera.pixel_size)[0]
+    covariance = lambda c: c.calibration.adjustment.camera_covariance(c.calibration.name)
+    covariances = covariance(best), covariance(one)
+    C = expected_difference(comparison, *mappings, covariances, **sizes)
+    size = unit_size(mappings[0][0], camera.pixel_size)[0]
+    # lengths over the σ of a length: √ of the trace
     sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
     ratio = comparison.length / sigma
     return Difference(

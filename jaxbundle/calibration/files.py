@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -48,6 +49,12 @@ from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, head_line
 from jaxbundle.types import Progress
 
+if TYPE_CHECKING:
+    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.result import Calibration
+    from jaxbundle.calibration.rig.result import RigCalibration
+    from jaxbundle.calibration.several import Calibrations
+
 COMMAND = "calibrate"
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 COLMAP = "colmap"
@@ -75,11 +82,13 @@ def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> st
 
 def file_name(name: str) -> str:
     """A name that is valid in a file system."""
+    # ASCII, not hidden, and short: camera names are free text, and folders go to other systems
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
 
 
 def files_of(names: Sequence[str]) -> list[str]:
     """Files that a calibration of these cameras may write, figures as patterns."""
+    # what may be replaced in a folder that is written again; anything else in it is somebody's
     found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
@@ -111,7 +120,7 @@ def files_of(names: Sequence[str]) -> list[str]:
 
 
 def write_calibration(
-    calibration, folder: str | Path, plots: bool = True, force: bool = False
+    calibration: "Calibration", folder: str | Path, plots: bool = True, force: bool = False
 ) -> None:
     """Write a calibration into a folder (see the module's docstring).
 
@@ -127,11 +136,11 @@ def write_calibration(
 
 
 def _fill(
-    calibration,
+    calibration: "Calibration",
     folder: Path,
     plots: bool,
     origin: Origin,
-    choice=None,
+    choice: "ModelComparison | None" = None,
     progress: Progress | None = None,
 ) -> None:
     name = file_name(calibration.name)
@@ -139,6 +148,7 @@ def _fill(
     write_text(folder / REPORT, head_line(origin) + calibration.report())
     write_text(folder / PAGE, compose_calibration(calibration, origin, choice))
     write_text(folder / RESULT, json_text(calibration.to_dict()))
+    # the report says why; files of a camera that is none would be used
     if not calibration.converged:
         return
     network = adjusted_network(calibration.adjustment)
@@ -156,6 +166,7 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     model = get_model(network.cameras[0].model)
     if model.name not in FOREIGN:
         try:
+            # beyond 90° a perspective model has no image
             nearest = "kannala-brandt" if model.wide else "opencv"
             network, cost = convert_cameras(network, nearest)
         except InputError as error:
@@ -166,7 +177,9 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     return remark
 
 
-def write_calibrations(found, folder: str | Path, plots: bool = True, force: bool = False) -> None:
+def write_calibrations(
+    found: "Calibrations", folder: str | Path, plots: bool = True, force: bool = False
+) -> None:
     """Write one calibration into a folder, several into separate subfolders.
 
     Several have a common report.txt, report.html and result.json; a rig adds its
@@ -180,11 +193,11 @@ def write_calibrations(found, folder: str | Path, plots: bool = True, force: boo
 
 
 def fill_calibrations(
-    found,
+    found: "Calibrations",
     folder: Path,
     plots: bool,
     origin: Origin = UNKNOWN,
-    choice=None,
+    choice: "ModelComparison | None" = None,
     progress: Progress | None = None,
 ) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
@@ -215,6 +228,7 @@ def fill_rig(network: Network, folder: Path) -> None:
         if len(network.cameras) > 2 and kind.endswith("stereo"):
             continue
         target, refused = TARGETS[kind], ""
+        # as it is, else with the models that the format has, its best one first
         for model in (None, *target.models[:2]):
             try:
                 fitted, costs = network, {}
@@ -233,7 +247,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
 
 
-def calibrations_dict(found, brief: bool = False) -> dict:
+def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
     """The JSON of one calibration, or of several under their names, with the rig."""
     if len(found.cameras) == 1:
         return next(iter(found.cameras.values())).to_dict(brief)
@@ -245,7 +259,9 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     return document
 
 
-def fill_comparison(choice, folder: Path, plots: bool, progress: Progress | None = None) -> None:
+def fill_comparison(
+    choice: "ModelComparison", folder: Path, plots: bool, progress: Progress | None = None
+) -> None:
     """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
@@ -265,8 +281,9 @@ def fill_comparison(choice, folder: Path, plots: bool, progress: Progress | None
         )
 
 
-def save_plots(calibration, folder: Path, progress: Progress | None = None) -> None:
+def save_plots(calibration: "Calibration", folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
+    # drawn when needed: most of the time of a figure is matplotlib's
     near = float(np.median(calibration.distances))
     drawings = {
         "coverage": ((7, 5.6), None, calibration.plot_coverage),
@@ -281,7 +298,7 @@ def save_plots(calibration, folder: Path, progress: Progress | None = None) -> N
     draw_figures(calibration.adjustment, folder, progress)
 
 
-def save_rig_plots(rig, folder: Path, progress: Progress | None = None) -> None:
+def save_rig_plots(rig: "RigCalibration", folder: Path, progress: Progress | None = None) -> None:
     """Coverage and uncertainty of every camera in the rig."""
     drawings = {}
     for name in rig.names:
@@ -300,11 +317,12 @@ def json_text(document: dict) -> str:
     return json.dumps(_plain(document), ensure_ascii=False, indent=1) + "\n"
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
+    # JSON has neither NaN nor infinity, and readers refuse what Python writes for them
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

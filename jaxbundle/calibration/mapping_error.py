@@ -20,23 +20,22 @@ calibration, International Journal of Computer Vision 130.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import grid_of
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.display import print_in_one_screen
+from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.projection import have_rays, slopes_of_images
 from jaxbundle.statistics.validity import farthest_measurements, measured_centre
-
-DRAWS = 20_000
-"""Samples of K for its quantile, accurate to 1 %."""
-FEWEST = 2
-"""Grid points that determine the rotation: three angles from two coordinates each."""
+from jaxbundle.types import present
 
 
 @print_in_one_screen
@@ -62,11 +61,14 @@ class MappingError:
 
     def quantile(self, probability: float = 0.95) -> float:
         """The quantile of √K for this probability, pixels; from a reproducible sample."""
-        z = np.random.default_rng(0).normal(size=(DRAWS, len(self.weights)))
+        # a weighted sum of χ²₁ has no closed distribution; 20 000 samples give it to 1 %
+        z = np.random.default_rng(0).normal(size=(20_000, len(self.weights)))
         return float(np.sqrt(np.quantile(z**2 @ self.weights, probability)))
 
 
-def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> MappingError:
+def mapping_error(
+    adjustment: Adjustment, camera: str, grid: tuple[int, int] = GRID
+) -> MappingError:
     """The mapping error of an adjusted camera, whose image size is known.
 
     **Arguments:** `grid`: columns and rows of the grid for the mean.
@@ -77,40 +79,53 @@ def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> Mapp
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     model = get_model(given.model)
-    uv = grid_of(given.image_size, *grid).reshape(-1, 2)
+    uv = grid_of(present(given.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, given.image_size, given.pixel_size)
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
+    # "measured": up to the farthest point from the distortion's centre, since distortion is radial
     farthest = farthest_measurements(problem, adjustment.values)[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]
-    if len(near) < FEWEST or len(near) == len(xy):
+    # two points determine the rotation: three angles from two coordinates each
+    if len(near) < 2 or len(near) == len(xy):
         return whole
     part = _weights(_form(given, p, names, near, "rotation"), C)
     return dataclasses.replace(whole, measured=MappingError(part, len(near) / len(uv)))
 
 
-def _weights(H, C) -> Float[np.ndarray, " k"]:
+def _weights(H: Float[np.ndarray, "k k"], C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
     """λ, by a root of H, in units of σ: C may be numerically singular, as for tied parameters."""
     sigma = np.sqrt(np.diagonal(C))
     unit = np.where(sigma > 0, sigma, 1.0)
+    # λ of C^½·H·C^½ are those of H^½ᵀ·C·H^½
     size, V = np.linalg.eigh(H * np.outer(unit, unit))
     root = V * np.sqrt(np.clip(size, 0, None))
     return np.clip(np.linalg.eigvalsh(root.T @ (C / np.outer(unit, unit)) @ root), 0, None)
 
 
 def mapping_form(
-    camera, p, names, grid: tuple[int, int] = GRID, frame: str = "rotation"
+    camera: Camera,
+    p: Float[np.ndarray, " parameters"],
+    names: Sequence[str],
+    grid: tuple[int, int] = GRID,
+    frame: str = "rotation",
 ) -> Float[np.ndarray, "k k"]:
     """H of the named parameters of a camera at the values `p` of all: pixels²; `frame` "camera":
     that of A, without a rotation."""
     model = get_model(camera.model)
-    uv = grid_of(camera.image_size, *grid).reshape(-1, 2)
+    uv = grid_of(present(camera.image_size), *grid).reshape(-1, 2)
     xy = in_model_units(uv, model, camera.image_size, camera.pixel_size)
     return _form(camera, p, names, xy, frame)
 
 
-def _form(camera, p, names, xy, frame):
+def _form(
+    camera: Camera,
+    p: Float[np.ndarray, " parameters"],
+    names: Sequence[str],
+    xy: Float[np.ndarray, "n 2"],
+    frame: str,
+) -> Float[np.ndarray, "k k"]:
     model = get_model(camera.model)
     columns = tuple(model.parameters.index(name) for name in names)
     A = slopes_of_images(model, p, columns, xy, frame)

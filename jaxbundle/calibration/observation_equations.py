@@ -4,18 +4,23 @@ For tests that add parameters to a calibration, or divide it, without a new adju
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.leastsquares.spaces import Space
+from jaxbundle.network.arrays import Values
 from jaxbundle.network.kinds import ImagePoint
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
-class Linearised(NamedTuple):
+class LinearisedImagePoints(NamedTuple):
     """Residuals over their σ, and their derivatives.
 
     `v` [n, 2]; `slopes`: by table, the derivatives by the changes of the row that is touched;
@@ -28,7 +33,9 @@ class Linearised(NamedTuple):
     by_columns: Float[np.ndarray, "n 2 columns"]
 
 
-def linearise_image_points(problem, values, columns: tuple[int, ...] = ()) -> Linearised:
+def linearise_image_points(
+    problem: Problem, values: Values, columns: tuple[int, ...] = ()
+) -> LinearisedImagePoints:
     """All image points of a network of one camera; 0 without weight.
 
     **Arguments:** `columns`: parameters of the camera, held or not, for derivatives.
@@ -43,11 +50,11 @@ def linearise_image_points(problem, values, columns: tuple[int, ...] = ()) -> Li
     data = problem.data
     v, J = _linearise(of, spaces, columns, touched, data.image_xy, data.image_weight)
     *parts, B = np.split(np.asarray(J), np.cumsum([s.width for s in spaces]), 2)
-    return Linearised(np.asarray(v), dict(zip(at, parts)), at, B)
+    return LinearisedImagePoints(np.asarray(v), dict(zip(at, parts)), at, B)
 
 
 def lagrange_multipliers(
-    adjustment, found: Linearised, B: Float[np.ndarray, "n 2 k"]
+    adjustment: Adjustment, found: LinearisedImagePoints, B: Float[np.ndarray, "n 2 k"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Bᵀv and S of omitted parameters b, B = ∂v/∂b:
 
@@ -64,28 +71,40 @@ def lagrange_multipliers(
         part = np.einsum("nrw,nrk->nkw", found.slopes[t], B)
         np.add.at(rows[t].swapaxes(0, 1), i, part)
     flat = B.reshape(-1, k)
+    # (JᵀB)ᵀ·Q·(JᵀB) by the factor that the adjustment holds: Q itself, thousands squared, is never
+    # made
     S = flat.T @ flat - adjustment.inspection.solution.propagate_rows(rows)
     return flat.T @ found.v.ravel(), S
 
 
 @partial(compile_once, static=(0, 1, 2))
-def _linearise(of, spaces, columns, touched, xy, weight):
+def _linearise(
+    of: ImagePoint,
+    spaces: tuple[Space, ...],
+    columns: tuple[int, ...],
+    touched: tuple[Any, ...],
+    xy: Float[AnyArray, "n 2"],
+    weight: Float[AnyArray, "n 2"],
+) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 directions"]]:
     """v/σ [n, 2] of all image points and their derivatives [n, 2, directions]: by the changes of
     pose, camera and point, and by b."""
     ends = np.cumsum([s.width for s in spaces])
 
-    def of_one(touched, xy, weight):
-        def v(change):
+    def linearise_point(
+        touched: tuple[Any, ...], xy: Float[AnyArray, "2"], weight: Float[AnyArray, "2"]
+    ) -> tuple[Array, Array]:
+        def v(change: Float[Array, " directions"]) -> tuple[Array, Array]:
             *changes, b = jnp.split(change, ends)
             pose, interior, ray = (
                 s.move(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
             )
             p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
             residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
+            # returned twice: value and derivatives in one pass
             residual = jnp.where(weight > 0, weight * residual, 0.0)
             return residual, residual
 
         J, found = jax.jacfwd(v, has_aux=True)(jnp.zeros(ends[-1] + len(columns)))
         return found, J
 
-    return jax.vmap(of_one)(touched, xy, weight)
+    return jax.vmap(linearise_point)(touched, xy, weight)

@@ -1,9 +1,11 @@
 """The pages of a calibration: of one camera, of several, of a rig."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxbundle.calibration.quality import Coverage, UncertaintyMap
 from jaxbundle.calibration.report import (
     MAPS_HEADER,
     MODELS_HEADER,
@@ -23,6 +25,7 @@ from jaxbundle.calibration.verdict import (
     cross_validation_in_words,
 )
 from jaxbundle.calibration.verdict import find as find_own
+from jaxbundle.measure.views import BoardViews
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page import (
     UNKNOWN,
@@ -42,10 +45,18 @@ from jaxbundle.report.page.overview import list_messages
 from jaxbundle.report.page.sections import show_residuals
 from jaxbundle.report.page.tables import table_of_residuals
 
+if TYPE_CHECKING:
+    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.result import Calibration
+    from jaxbundle.calibration.rig.result import RigCalibration
+    from jaxbundle.calibration.several import Calibrations
+
 KIND = "calibration of cameras"
 
 
-def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
+def compose_calibrations(
+    found: "Calibrations", origin: Origin = UNKNOWN, choice: "ModelComparison | None" = None
+) -> Iterator[str]:
     """The page of one calibration, or the common page of several, with the rig.
 
     **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models.
@@ -55,12 +66,14 @@ def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterat
     return write(_describe_several(found, origin))
 
 
-def compose_calibration(calibration, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
+def compose_calibration(
+    calibration: "Calibration", origin: Origin = UNKNOWN, choice: "ModelComparison | None" = None
+) -> Iterator[str]:
     """The page of one camera: that of its adjustment, and its accuracy."""
     return compose(calibration.adjustment, origin, also=_describe_one(calibration, choice))
 
 
-def _describe_one(calibration, choice=None) -> Addition:
+def _describe_one(calibration: "Calibration", choice: "ModelComparison | None" = None) -> Addition:
     views, sections = calibration.views, []
     rows = list(photograph_facts(views))
     if calibration.converged:
@@ -86,12 +99,15 @@ def _describe_one(calibration, choice=None) -> Addition:
     )
 
 
-def _unit(calibration) -> str:
+def _unit(calibration: "Calibration") -> str:
     return clean(calibration.adjustment.network.object_unit)
 
 
-def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Section:
+def _quality(
+    covered: Coverage, maps: Sequence[UncertaintyMap], unit: str, name: str = "", number: int = 0
+) -> Section:
     """Coverage, and the uncertainty of a projected point over the image."""
+    # cells without points stay white
     counts = np.where(covered.counts > 0, covered.counts, np.nan)
     caption = f"Measured points by cell: {coverage_in_words(covered)}"
     parts = [figure(draw_field(counts, 0), caption)]
@@ -109,7 +125,7 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
     return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link)
 
 
-def _validation(calibration) -> Section:
+def _validation(calibration: "Calibration") -> Section:
     """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
     # σ is 0 everywhere if the measurements fit exactly, and no number without a ray
@@ -140,14 +156,14 @@ def _validation(calibration) -> Section:
     return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
 
 
-def _list_failed(views) -> list[Section]:
+def _list_failed(views: BoardViews) -> list[Section]:
     if not views.failed:
         return []
     rows = grid(("photograph", "reason"), views.failed, "words")
     return [Section("failed", "Photographs not used", rows, "Not used")]
 
 
-def _models(choice) -> Section:
+def _models(choice: "ModelComparison") -> Section:
     parts = [
         paragraph(choice.sentence),
         grid(MODELS_HEADER, model_rows(choice)),
@@ -161,7 +177,7 @@ def _models(choice) -> Section:
     return Section("models", "Camera models compared", "".join(parts), "Models")
 
 
-def _describe_several(found, origin: Origin) -> Page:
+def _describe_several(found: "Calibrations", origin: Origin) -> Page:
     """The common page: the verdict, the rig, the parameters of all."""
     sections, tables = [], {"cameras": _table_of_cameras(found)}
     rig = found.rig
@@ -185,7 +201,7 @@ def _describe_several(found, origin: Origin) -> Page:
     return Page(title, [first, *sections], origin, tables=tables)
 
 
-def _rig(rig, unit: str) -> Section:
+def _rig(rig: "RigCalibration", unit: str) -> Section:
     parts = [facts(rig_facts(rig, unit))]
     for name, m in rig.mountings.items():
         parts += [
@@ -200,7 +216,7 @@ def _rig(rig, unit: str) -> Section:
     return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig")
 
 
-def _table_of_cameras(found) -> Listing:
+def _table_of_cameras(found: "Calibrations") -> Listing:
     """One row per parameter of every separately calibrated camera."""
     rows = [
         (name, one.camera.model, parameter, value, one.sigma.get(parameter))

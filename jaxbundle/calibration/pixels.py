@@ -5,14 +5,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
-def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
+def unit_size(model: CameraModel, pixel_size: tuple[float, float] | None) -> tuple[float, float]:
     """Width and height of a pixel in the unit of the model.
 
     **Raises:** `InputError` if the model is in mm and the pixel size is missing.
@@ -27,11 +28,19 @@ def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
 
 
 @partial(compile_once, static=0)
-def _images(model, p, position, rotation, points):
-    def one(X0, M, X):
+def _images(
+    model: CameraModel,
+    p: Float[AnyArray, " parameters"],
+    position: Float[AnyArray, "views 3"],
+    rotation: Float[AnyArray, "views 3 3"],
+    points: Float[AnyArray, "points 3"],
+) -> Float[Array, "views points 2"]:
+    def image(
+        X0: Float[AnyArray, "3"], M: Float[AnyArray, "3 3"], X: Float[AnyArray, "3"]
+    ) -> Float[Array, "2"]:
         return jnp.stack(project(model, tuple(p), *(M @ (X - X0))))
 
-    return jax.vmap(jax.vmap(one, (None, None, 0)), (0, 0, None))(position, rotation, points)
+    return jax.vmap(jax.vmap(image, (None, None, 0)), (0, 0, None))(position, rotation, points)
 
 
 def images_of_board(

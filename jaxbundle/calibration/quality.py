@@ -1,13 +1,16 @@
 """Accuracy of a calibration: uncertainty maps, coverage of the image, comparison of two halves."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
@@ -23,13 +26,13 @@ from jaxbundle.statistics.projection import (
 )
 
 GRID = (11, 9)
-"""Columns and rows of the grid of a map."""
+"""Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ
+is smooth, and changes little between neighbours."""
 DRAWN = (21, 17)
-"""The same for a figure, with σ interpolated in between."""
-CELLS = (12, 9)
-"""Columns and rows of the cells in which coverage is counted."""
-HELD_OUT_FEWEST = 4
-"""Minimum number of photographs for calibrations from halves."""
+"""Those of the grid of a figure, half as far apart, with σ interpolated in between."""
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 
 @print_in_one_screen
@@ -51,7 +54,7 @@ class UncertaintyMap:
     def sigma(self) -> Float[np.ndarray, "rows columns"]:
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 2)
 
-    def to_xarray(self):
+    def to_xarray(self) -> "Dataset":
         """σ and covariance over u and v (pixels), as an `xarray.Dataset` (extra `grids`)."""
         axes = np.array(["u", "v"])
         return data_set(
@@ -81,14 +84,16 @@ class UncertaintyMap:
         return float(np.fmax.reduce(_in_corners(self.sigma)))
 
 
-def grid_of(image_size, columns: int = GRID[0], rows: int = GRID[1]):
+def grid_of(
+    image_size: tuple[int, int] | Sequence[float], columns: int = GRID[0], rows: int = GRID[1]
+) -> Float[np.ndarray, "rows columns 2"]:
     """A grid from corner to corner of an image, pixels [rows, columns, 2]."""
     w, h = image_size
     return np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1)
 
 
 def uncertainty_map(
-    adjustment,
+    adjustment: Adjustment,
     camera: str,
     distance: float = np.inf,
     frame: str = "scene",
@@ -117,6 +122,8 @@ def uncertainty_map(
         views = np.flatnonzero(network.images.camera == c)
         p = np.array(list(adjustment.camera_parameters(camera).values()))
         there = np.flatnonzero(have_rays(model, p, xy))
+        # fixed in the scene, a point moves with the pose of each view as well, and poses are
+        # correlated with the camera: the whole covariance, by propagation through a function
         function = images_through_scene(model, c, views, adjustment.values, xy[there], distance)
         Q = adjustment.covariance_of(function).reshape(len(there), 2, len(there), 2)
         n = np.arange(len(there))
@@ -145,6 +152,7 @@ def over_distance(
     so its variance is a quadratic polynomial in 1/d, found exactly by Lagrange interpolation of
     `maps` at three distances.
     """
+    # infinity is the point 0 of 1/d, and as good a node as any other
     near = np.array([1 / m.distance for m in maps])
     variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
@@ -155,8 +163,8 @@ def over_distance(
             for own in near
         ]
     )
-    of = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
-    return of(middle), np.fmax.reduce(of(variance.T))
+    interpolate = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
+    return interpolate(middle), np.fmax.reduce(interpolate(variance.T))
 
 
 @print_in_one_screen
@@ -178,13 +186,21 @@ class Coverage:
         return float((self.counts > 0).mean())
 
 
-def coverage(uv: Float[np.ndarray, "n 2"], image_size, cells=CELLS) -> Coverage:
-    """The coverage of an image by measured points, pixels."""
+def coverage(
+    uv: Float[np.ndarray, "n 2"],
+    image_size: tuple[int, int] | Sequence[float],
+    cells: tuple[int, int] = (12, 9),
+) -> Coverage:
+    """The coverage of an image by measured points, pixels.
+
+    **Arguments:** `cells`: columns and rows, squares in an image of 4 : 3; more would stay empty
+    between the points of a board."""
     uv = uv[np.isfinite(uv).all(1)]
     (w, h), (columns, rows) = image_size, cells
     counts, *_ = np.histogram2d(
         uv[:, 1], uv[:, 0], (rows, columns), ((-0.5, h - 0.5), (-0.5, w - 0.5))
     )
+    # a corner is about a quarter of the height and a sixth of the width: nearly a square
     top, left = max(rows // 4, 1), max(columns // 6, 1)
     corners = {
         "upper left": counts[:top, :left],
@@ -222,13 +238,12 @@ class CrossValidation:
     comparison: Comparison | None
 
 
-def kept_rays(adjustment):
-    """Which observations of the adjusted network were not removed as gross errors."""
-    weight = np.asarray(adjustment.problem.data.image_weight)
-    return (weight > 0).all(1)
+def used_rays(problem: Problem) -> Bool[np.ndarray, " rays"]:
+    """Which image points have weight: those that were not removed as gross errors."""
+    return np.all(np.asarray(problem.data.image_weight) > 0, axis=1)
 
 
-def cross_validation(result) -> CrossValidation | None:
+def cross_validation(result: Adjustment) -> CrossValidation | None:
     """Calibrate from every other photograph, and test that camera on the rest.
 
     **Arguments:** the adjustment of one camera: its start values are used, and its removed
@@ -237,28 +252,38 @@ def cross_validation(result) -> CrossValidation | None:
     **Returns:** None if there are too few photographs, or a half does not determine the camera.
     """
     network = result.problem.network
-    if len(network.images) < 2 * HELD_OUT_FEWEST:
+    if len(network.images) < 8:  # four photographs are few for a camera, fewer none
         return None
-    network = at_result(network, result)
+    network = start_at_result(network, result)
+    # every other photograph, so that both halves have poses from all around
     turns = np.arange(len(network.images)) % 2
     try:
         again = partial(adjust, robust=result.robust)
-        halves = [again(part(network, turns == half)) for half in (0, 1)]
+        halves = [again(take_images(network, turns == half)) for half in (0, 1)]
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
+        # each half with the camera of the other, whose poses alone are estimated: the residuals
+        # grow by what the camera does not know of unseen photographs
         own = [half.camera_parameters(name) for half in halves]
-        held = [again(_held(part(network, turns == 1 - half), own[half])) for half in (0, 1)]
+        held = [
+            again(_with_fixed_camera(take_images(network, turns == 1 - half), own[half]))
+            for half in (0, 1)
+        ]
     except (InputError, NotSolvedError):
         return None
     if not all(other.converged for other in held):
         return None
+    # independent halves: Σ(p₁ − p₂) = C₁ + C₂, scaled to σ before the solution, as f and k3 differ
+    # by ten powers of ten
     names, C = halves[0].camera_covariance(name)
     C = C + halves[1].camera_covariance(name)[1]
     d = np.array([own[0][n] - own[1][n] for n in names])
     scale = np.sqrt(np.diagonal(C))
     test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
-    rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
+    v = lambda half: residuals_in_pixels(half, half.problem.network.cameras[0])[0]
+    rms_of = lambda half: float(np.sqrt(np.nanmean((v(half) ** 2).sum(1))))
+    rms = lambda parts: float(np.sqrt(np.mean([rms_of(p) ** 2 for p in parts])))
     return CrossValidation(
         rms(halves),
         rms(held),
@@ -269,7 +294,7 @@ def cross_validation(result) -> CrossValidation | None:
     )
 
 
-def _compare(camera: Camera, halves) -> Comparison | None:
+def _compare(camera: Camera, halves: Sequence[Mapping[str, float]]) -> Comparison | None:
     model = get_model(camera.model)
     try:
         return compare_cameras(
@@ -281,24 +306,27 @@ def _compare(camera: Camera, halves) -> Comparison | None:
         return None
 
 
-def at_result(network: Network, result, keep=None) -> Network:
+def start_at_result(
+    network: Network, result: Adjustment, keep: Bool[np.ndarray, " rays"] | None = None
+) -> Network:
     """The network with adjusted values as start values; parameters with a prior keep theirs, to
     which the prior refers. `keep`: remaining rays, by default those not removed."""
     camera, exterior = network.cameras[0], result.image_values
     parameters = result.camera_parameters(camera.id)
+    # a prior is an observation of the value it was stated for
     parameters |= {name: camera.parameters.get(name, 0.0) for name in camera.sigma}
     return network.replace(
         cameras=(dataclasses.replace(camera, parameters=parameters),),
         images=dataclasses.replace(
             network.images, position=exterior[:, :3], angles=exterior[:, 3:]
         ),
-        observations=network.observations.take(kept_rays(result) if keep is None else keep),
+        observations=network.observations.take(used_rays(result.problem) if keep is None else keep),
         warnings=(),
         notes=(),
     )
 
 
-def part(network: Network, keep) -> Network:
+def take_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
     """The network with some of its images and their rays."""
     images, rays = network.images, network.observations
     index = np.cumsum(keep) - 1
@@ -318,25 +346,21 @@ def part(network: Network, keep) -> Network:
     )
 
 
-def _held(network: Network, parameters) -> Network:
+def _with_fixed_camera(network: Network, parameters: Mapping[str, float]) -> Network:
     camera = dataclasses.replace(network.cameras[0], parameters=parameters, free=())
     return network.replace(cameras=(camera,))
 
 
-def _rms(adjustment) -> float:
-    """√(Σ|v|²/points) in pixels."""
-    camera = adjustment.problem.network.cameras[0]
-    v, _ = residuals_in_pixels(adjustment, camera)
-    return float(np.sqrt(np.nanmean((v**2).sum(1))))
-
-
-def residuals_in_pixels(adjustment, camera):
+def residuals_in_pixels(
+    adjustment: Adjustment, camera: Camera
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Residuals v [n, 2] of the image points of a camera, and the points [n, 2], in pixels; v is
     NaN where a point was removed."""
     problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)
     weight = np.asarray(data.image_weight)
     v = adjustment.inspection.residuals.image
-    used = np.all(weight > 0, axis=1)
+    used = used_rays(problem)
+    # v is over σ in the adjustment
     v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
     own = problem.camera == c

@@ -1,5 +1,8 @@
 """The report of a calibration and its JSON: photographs, camera, quality, adjustment."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxbundle.calibration.verdict import (
@@ -10,6 +13,7 @@ from jaxbundle.calibration.verdict import (
 )
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.io.text.csv_tables import table_rows
+from jaxbundle.measure.views import BoardViews
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     WITHOUT_SIGMA,
@@ -24,13 +28,19 @@ from jaxbundle.report.layout import (
     table,
 )
 
-MOST_FAILED = 50
+if TYPE_CHECKING:
+    from jaxbundle.calibration.bias import CalibrationBias
+    from jaxbundle.calibration.choice import ModelComparison
+    from jaxbundle.calibration.mapping_error import MappingError
+    from jaxbundle.calibration.quality import Coverage, UncertaintyMap
+    from jaxbundle.calibration.result import Calibration
+    from jaxbundle.calibration.rig.result import Mounting, RigCalibration
+    from jaxbundle.calibration.several import Calibrations
+
 MAPS_HEADER = ("point held in", "middle", "corners")
-LIMIT = 3.0
-"""Residuals of a rig with a larger |τ| are listed."""
 
 
-def text(calibration) -> str:
+def text(calibration: "Calibration") -> str:
     """Photographs, camera, quality and advice, followed by the report of the adjustment."""
     lines = [*_photographs(calibration)]
     if calibration.converged:
@@ -40,18 +50,18 @@ def text(calibration) -> str:
     return f"{body}\n\n{calibration.adjustment.report(verdict=verdict)}"
 
 
-def _photographs(calibration):
+def _photographs(calibration: "Calibration") -> list[str]:
     views = calibration.views
     lines = [f"Calibration of {clean(calibration.name)}", "=" * 100]
     lines += facts(photograph_facts(views))
     if views.failed:
         lines += heading("Photographs not used")
         rows = facts((clean(name), clean(why)) for name, why in views.failed)
-        lines += cut_lines(rows, MOST_FAILED, "…")
+        lines += cut_lines(rows, 50, "…")  # the JSON has all
     return lines
 
 
-def photograph_facts(views) -> list[tuple[str, str]]:
+def photograph_facts(views: BoardViews) -> list[tuple[str, str]]:
     """The board, the number of photographs and of detected points."""
     size = " × ".join(map(str, views.image_size))
     return [
@@ -62,10 +72,11 @@ def photograph_facts(views) -> list[tuple[str, str]]:
     ]
 
 
-def _camera(calibration):
+def _camera(calibration: "Calibration") -> list[str]:
     lines = heading(f"Camera ({calibration.adjustment.network.cameras[0].model})")
     free = calibration.sigma
     rows = []
+    # parameters held at zero are not part of the camera, to a reader
     for name, value in calibration.parameters.items():
         if name in free:
             rows.append((name, *estimate(value, free[name])))
@@ -76,7 +87,7 @@ def _camera(calibration):
     return lines
 
 
-def _quality(calibration):
+def _quality(calibration: "Calibration") -> list[str]:
     lines = heading("Quality")
     away, unit = calibration.distances, clean(calibration.adjustment.network.object_unit)
     lines += facts(
@@ -95,7 +106,7 @@ def _quality(calibration):
     return [*lines, *(line for words in further for line in paragraph(words))]
 
 
-def mapping_error_in_words(error) -> str:
+def mapping_error_in_words(error: "MappingError") -> str:
     """The expected mapping error."""
     percent = lambda share: f"{100 * share:.0f} % of the image"
     whole = "the whole image" if error.share == 1 else f"the {percent(error.share)} with rays"
@@ -111,7 +122,7 @@ def mapping_error_in_words(error) -> str:
     )
 
 
-def bias_in_words(bias) -> str:
+def bias_in_words(bias: "CalibrationBias") -> str:
     """σ of a corner compared with that of the residuals, and the conclusion of the tests."""
     tests = "; ".join(f"{name} {test}" for name, test in bias.tests.items())
     return (
@@ -120,20 +131,20 @@ def bias_in_words(bias) -> str:
     )
 
 
-def map_rows(maps, unit: str) -> list[tuple[str, str, str]]:
+def map_rows(maps: Sequence["UncertaintyMap"], unit: str) -> list[tuple[str, str, str]]:
     """The frame in which a point is fixed, its σ in the middle and in the corners, pixels
     (`MAPS_HEADER`)."""
     return [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3)) for m in maps]
 
 
-def _held_in(m, unit: str) -> str:
+def _held_in(m: "UncertaintyMap", unit: str) -> str:
     if m.frame in ("scene", "rig"):
         away = f"{m.distance:.3g} {unit}" if m.distance < np.inf else "infinity"
         return f"the {m.frame}, at {away}"
     return {"rotation": "all rays, rotation removed", "camera": "the camera frame"}[m.frame]
 
 
-def _advice(calibration):
+def _advice(calibration: "Calibration") -> list[str]:
     found = calibration.advice
     lines = heading("Advice")
     if not found:
@@ -143,7 +154,7 @@ def _advice(calibration):
     return lines
 
 
-def as_dict(calibration, brief: bool = False) -> dict:
+def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     """The JSON of the adjustment with a section `calibration`."""
     views, adjustment = calibration.views, calibration.adjustment
     about = {
@@ -165,7 +176,7 @@ def as_dict(calibration, brief: bool = False) -> dict:
     return found
 
 
-def _quality_dict(calibration) -> dict:
+def _quality_dict(calibration: "Calibration") -> dict:
     covered, checked, bias = calibration.coverage, calibration.cross_validation, calibration.bias
     return {
         "rms": calibration.rms,
@@ -206,7 +217,7 @@ def _quality_dict(calibration) -> dict:
     }
 
 
-def choice_text(found) -> str:
+def choice_text(found: "ModelComparison") -> str:
     """The comparison of models (`choice.ModelComparison`)."""
     lines = ["Camera models compared", "=" * 100]
     lines += facts(
@@ -227,7 +238,7 @@ def choice_text(found) -> str:
 MODELS_HEADER = ("model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ")
 
 
-def model_rows(found) -> list[tuple[str, ...]]:
+def model_rows(found: "ModelComparison") -> list[tuple[str, ...]]:
     """One row per model (`MODELS_HEADER`)."""
     low = {name: min(getattr(one, name) for one in found.candidates) for name in ("aic", "bic")}
     rows = []
@@ -253,7 +264,7 @@ def model_rows(found) -> list[tuple[str, ...]]:
     return rows
 
 
-def models_legend(found) -> str:
+def models_legend(found: "ModelComparison") -> str:
     """The columns of `model_rows`."""
     return (
         f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
@@ -262,7 +273,7 @@ def models_legend(found) -> str:
     )
 
 
-def choice_dict(found) -> dict:
+def choice_dict(found: "ModelComparison") -> dict:
     """The comparison of models as a section of JSON."""
     candidates = {}
     for one in found.candidates:
@@ -297,7 +308,7 @@ def choice_dict(found) -> dict:
     }
 
 
-def _coverage_dict(covered) -> dict:
+def _coverage_dict(covered: "Coverage") -> dict:
     return {
         "part": covered.part,
         "reach": covered.reach,
@@ -306,7 +317,7 @@ def _coverage_dict(covered) -> dict:
     }
 
 
-def _maps_dict(maps) -> list[dict]:
+def _maps_dict(maps: Sequence["UncertaintyMap"]) -> list[dict]:
     number = lambda x: float(x) if np.isfinite(x) else None
     return [
         {
@@ -319,7 +330,7 @@ def _maps_dict(maps) -> list[dict]:
     ]
 
 
-def _mapping_error_dict(error) -> dict | None:
+def _mapping_error_dict(error: "MappingError | None") -> dict | None:
     return (
         None
         if error is None
@@ -333,14 +344,14 @@ def _mapping_error_dict(error) -> dict | None:
     )
 
 
-def _rig_quality(rig, name: str) -> dict:
+def _rig_quality(rig: "RigCalibration", name: str) -> dict:
     return {
         "coverage": _coverage_dict(rig.coverage(name)),
         "uncertainty": _maps_dict(rig.reported_maps(name)),
     }
 
 
-def several_text(found) -> str:
+def several_text(found: "Calibrations") -> str:
     """The verdict on several cameras, and what it follows from."""
     _, words, findings = conclude_calibrations(found)
     rows = [("Verdict", words), *((clean(one.about), one.words) for one in findings)]
@@ -348,7 +359,7 @@ def several_text(found) -> str:
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def rig_text(rig) -> str:
+def rig_text(rig: "RigCalibration") -> str:
     """The mountings of a rig and its cameras in the common adjustment."""
     unit = clean(next(iter(rig.cameras.values())).adjustment.network.object_unit)
     lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
@@ -365,12 +376,13 @@ def rig_text(rig) -> str:
             *paragraph(f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"),
         ]
         lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
-    lines += observations.residuals(rig, LIMIT, "pope")
+    # residuals with |τ| above 3 are listed: one in 370 without blunders
+    lines += observations.residuals(rig, 3.0, "pope")
     lines += [*observations.redundancy(rig), *observations.removals(rig)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def rig_facts(rig, unit: str) -> list[tuple[str, str]]:
+def rig_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
     """Epochs, σ0, RMS, the board, and excluded or contradicting epochs."""
     odd = (*rig.left_out, *rig.contradicting)
     return [
@@ -389,12 +401,12 @@ def rig_facts(rig, unit: str) -> list[tuple[str, str]]:
     ]
 
 
-def mounting_title(rig, name: str) -> str:
+def mounting_title(rig: "RigCalibration", name: str) -> str:
     """Whose mounting, in whose frame."""
     return f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}"
 
 
-def mounting_rows(m, unit: str) -> list[tuple[str, str, str, str]]:
+def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
     """Base and angles of a mounting: name, value, σ, unit."""
     units = [unit] * 3 + ["deg"] * 3
     rows = [
@@ -406,12 +418,12 @@ def mounting_rows(m, unit: str) -> list[tuple[str, str, str, str]]:
     return [*rows, ("length", *estimate(m.length, m.length_sigma), unit)]
 
 
-def rig_parameter_rows(rig, name: str) -> list[tuple[str, str, str]]:
+def rig_parameter_rows(rig: "RigCalibration", name: str) -> list[tuple[str, str, str]]:
     """The free parameters of a camera in the rig: name, value, σ."""
     return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
 
 
-def rig_dict(rig, brief: bool = False) -> dict:
+def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
     """The rig as plain dicts and numbers: object unit, degrees, pixels; residuals, in the unit of
     the models, as of `adjust`; `brief` leaves them out."""
     found = {} if brief else rig.residuals

@@ -3,17 +3,18 @@
 import dataclasses
 import functools
 from functools import partial
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle import plotting
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice, suggest
-from jaxbundle.calibration.bias import Bias, find_bias
-from jaxbundle.calibration.left_out import left_out
+from jaxbundle.calibration.affinity import find_missing_affinity
+from jaxbundle.calibration.bias import CalibrationBias, find_bias
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
 from jaxbundle.cameras import get_model
@@ -22,9 +23,10 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
-DISTANCES = 400
-"""Number of distances of an uncertainty curve, dense enough to show every dip."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @print_anywhere
@@ -46,6 +48,8 @@ class Calibration:
         self.views = views
         self.validated = validated
         self.adjustment = adjustment
+        # report, page, JSON and figures use the same maps, each a propagation of the whole
+        # covariance
         self._maps: dict[tuple, UncertaintyMap] = {}
 
     @property
@@ -74,7 +78,7 @@ class Calibration:
         return dataclasses.replace(given, parameters=self.parameters, free=(), sigma={})
 
     @functools.cached_property
-    def _residuals(self):
+    def _residuals(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
         return quality.residuals_in_pixels(self.adjustment, self.adjustment.network.cameras[0])
 
     @property
@@ -116,7 +120,7 @@ class Calibration:
         return quality.cross_validation(self.adjustment) if self.validated else None
 
     @functools.cached_property
-    def bias(self) -> Bias | None:
+    def bias(self) -> CalibrationBias | None:
         """The bias test of camera model and board; None with too few cells of four corners."""
         return find_bias(self.adjustment, self.views.board.grid)
 
@@ -153,9 +157,10 @@ class Calibration:
             self.rms,
             self._significance,
             get_model(self.camera.model),
+            # only if it was made: four more adjustments are not made for an advice
             self.__dict__.get("cross_validation"),
         )
-        missed = left_out(self.adjustment)
+        missed = find_missing_affinity(self.adjustment)
         if missed is not None and missed.missed:
             found = [*found, str(missed)]
         if self.bias is not None and self.bias.found:
@@ -163,7 +168,7 @@ class Calibration:
         return found
 
     def uncertainty(
-        self, distance: float = np.inf, frame: str = "scene", grid=quality.GRID
+        self, distance: float = np.inf, frame: str = "scene", grid: tuple[int, int] = quality.GRID
     ) -> UncertaintyMap:
         """Uncertainty of a projected point over the image, pixels, for a distance in the object
         unit; frames: see `jaxbundle.statistics.projection`."""
@@ -178,6 +183,8 @@ class Calibration:
     def reported_maps(self) -> list[UncertaintyMap]:
         """Near (the median distance of the board), at ten times that, at infinity; and without the
         scene."""
+        # near the board the poses dominate, at infinity the camera; three distances also determine
+        # the whole curve (`quality.over_distance`)
         near = float(np.median(self.distances))
         chosen = (
             ("scene", near),
@@ -188,18 +195,21 @@ class Calibration:
         )
         return [self.uncertainty(distance, frame) for frame, distance in chosen]
 
-    def uncertainty_over_distance(self, distances: Float[np.ndarray, " n"]):
+    def uncertainty_over_distance(
+        self, distances: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """σ of a projected point in the middle and in the corners, pixels, [n] each."""
         return quality.over_distance(self._scene_maps, distances)
 
-    def uncertainty_curves(self):
+    def uncertainty_curves(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Distances from a quarter of the nearest of the board to a hundred times the farthest; σ
         of a projected point at them in the middle and in the corners (pixels); and these three of
         the maps of the report, as rows."""
         reported = np.array([(m.distance, m.middle, m.corners) for m in self._scene_maps]).T
         near = reported[0, np.isfinite(reported[0])]
+        # 400 of them, dense enough to show every dip
         ends = self.distances.min() / 4, 100 * self.distances.max()
-        distances = np.union1d(np.geomspace(*ends, DISTANCES), near)
+        distances = np.union1d(np.geomspace(*ends, 400), near)
         return distances, *self.uncertainty_over_distance(distances), reported
 
     @property
@@ -210,18 +220,20 @@ class Calibration:
     def _unit(self) -> str:
         return self.adjustment.network.object_unit
 
-    def plot_coverage(self, ax=None):
+    def plot_coverage(self, ax: "Axes | None" = None) -> "Axes":
         """Where in the image points were measured; matplotlib axes."""
         return plotting.coverage_map(
             self.coverage, self.measured, self.views.image_size, self.name, ax
         )
 
-    def plot_uncertainty(self, distance: float = np.inf, frame: str = "scene", ax=None):
+    def plot_uncertainty(
+        self, distance: float = np.inf, frame: str = "scene", ax: "Axes | None" = None
+    ) -> "Axes":
         """σ of a projected point over the image; matplotlib axes."""
         found = self.uncertainty(distance, frame, quality.DRAWN)
         return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
 
-    def plot_uncertainty_over_distance(self, ax=None):
+    def plot_uncertainty_over_distance(self, ax: "Axes | None" = None) -> "Axes":
         """The curves of `uncertainty_curves`, with the values of the report marked; matplotlib
         axes."""
         span = float(self.distances.min()), float(self.distances.max())
@@ -230,7 +242,7 @@ class Calibration:
             distances, middle, corners, span, self._unit, self.name, ax, reported=reported
         )
 
-    def plot_halves(self, ax=None):
+    def plot_halves(self, ax: "Axes | None" = None) -> "Axes":
         """The image differences of the cameras of the two halves (`cross_validation`); matplotlib
         axes."""
         halves = self.cross_validation
@@ -262,5 +274,5 @@ class Calibration:
 
 
 @partial(compile_once, static=())
-def _matrices(rotation):
+def _matrices(rotation: Float[AnyArray, "views 4"]) -> Float[Array, "views 3 3"]:
     return jax.vmap(matrix_from_quaternion)(rotation)

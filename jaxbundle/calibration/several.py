@@ -2,8 +2,8 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from jaxbundle.arguments import show
 from jaxbundle.calibration.calibrate import calibrate
@@ -36,17 +36,13 @@ class Calibrations:
         return "\n\n".join([*parts, *(one.report() for one in self.cameras.values())])
 
 
-def _tell(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
-    progress(f"{stage} of {name}", done, total)
-
-
 def calibrate_cameras(
     photographs: Mapping[str, Sequence[str | Path] | BoardViews],
     board: Board | None = None,
     *,
     rig: bool = False,
     progress: Progress | None = None,
-    **options,
+    **options: Any,
 ) -> Calibrations:
     """Calibrate several cameras from photographs of one board.
 
@@ -70,7 +66,7 @@ def calibrate_cameras(
         tell = (
             progress
             if progress is None or len(photographs) == 1
-            else partial(_tell, progress, name)
+            else lambda stage, *numbers, name=name: progress(f"{stage} of {name}", *numbers)
         )
         try:
             found[name] = calibrate(given, board, camera=name, progress=tell, **options)

@@ -46,6 +46,7 @@ def simulate_views(
         stations, points, camera, noise=(noise * width, noise * height), seed=seed, min_rays=1
     )
     rays = network.observations
+    # `simulate` keeps the points that have rays; the board has all, in its own order
     xy = np.full((len(stations), len(points), 2), np.nan)
     number = np.array([int(id) - 1 for id in network.points.id])
     uv = in_pixels(rays.xy, model, camera.image_size, camera.pixel_size)

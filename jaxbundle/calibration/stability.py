@@ -42,11 +42,6 @@ from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 
-ROTATION = 0.1
-"""μ below this: nearly a rotation."""
-SMALLEST_EFFECT = 1e-12
-"""Relative limit below which parameter changes that move no image are dropped."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Homogeneity:
@@ -143,14 +138,17 @@ def stability(
     cameras = [camera for camera, _ in calibrations]
     names = _check(calibrations, at)
     p = np.array([[camera.parameters[name] for name in names] for camera in cameras])
-    C = np.array([_order(covariance, names) for _, covariance in calibrations])
+    orders = [[list(free).index(name) for name in names] for _, (free, _) in calibrations]
+    C = np.array([np.asarray(c[1])[np.ix_(i, i)] for i, (_, c) in zip(orders, calibrations)])
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
+    # the derivatives of the image at the mean camera
     whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
     given = np.array([whole[name] for name in model.parameters])
     G, H = (mapping_form(cameras[0], given, names, frame=f) for f in ("camera", "rotation"))
+    # images by H, without rotation: what matters to a user who orients each photograph anew
     F = _without_rotation(G, H, sigma.mean(0))
     d = p - p.mean(0)
     found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
@@ -178,7 +176,9 @@ def stability(
     )
 
 
-def _check(calibrations, at) -> tuple[str, ...]:
+def _check(
+    calibrations: Sequence[tuple[Camera, Covariance]], at: Sequence[float] | None
+) -> tuple[str, ...]:
     """The names of the free parameters."""
     if len(calibrations) < 2:
         raise InputError("stability: give two calibrations of a camera or more")
@@ -202,12 +202,9 @@ def _check(calibrations, at) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _order(covariance: Covariance, names):
-    order = [list(covariance[0]).index(name) for name in names]
-    return np.asarray(covariance[1])[np.ix_(order, order)]
-
-
-def _homogeneity(p, C) -> Homogeneity:
+def _homogeneity(
+    p: Float[np.ndarray, "epochs k"], C: Float[np.ndarray, "epochs k k"]
+) -> Homogeneity:
     """Scaled by the σ of the first epoch, so that no parameter is tiny."""
     scale = np.sqrt(np.diagonal(C[0]))
     p, W = p / scale, np.linalg.inv(C / np.outer(scale, scale))
@@ -216,41 +213,58 @@ def _homogeneity(p, C) -> Homogeneity:
     return Homogeneity(float(np.einsum("nk,nkl,nl->", d, W, d)), (len(p) - 1) * p.shape[1])
 
 
-def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
+def _without_rotation(
+    G: Float[np.ndarray, "k k"], H: Float[np.ndarray, "k k"], scale: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "m k"]:
     """Functions F·p of the parameters that are invariant to rotation-like changes."""
     unit = np.outer(scale, scale)
+    # H·s = μ·G·s with a root of G, which is singular where changes of parameters cancel in the
+    # image
     size, U = np.linalg.eigh(G * unit)
-    seen = size > SMALLEST_EFFECT * size[-1]
+    # changes that move no image are dropped: rounding of the squares in G
+    seen = size > 1e-12 * size[-1]
     root = U[:, seen] / np.sqrt(size[seen])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
-    vectors = (root @ V)[:, mu > ROTATION]
+    # μ below a tenth: nearly a rotation, as a shift of the principal point is. Larger: real changes
+    # are left out too; smaller: changes count that the next orientation absorbs
+    vectors = (root @ V)[:, mu > 0.1]
     return vectors.T @ (G * unit) / scale
 
 
-def _line_of(p, sigma, x=None) -> tuple[float, float, float, float]:
+def _line_of(
+    p: Float[np.ndarray, " epochs"],
+    sigma: Float[np.ndarray, " epochs"],
+    x: Float[np.ndarray, " epochs"] | None = None,
+) -> tuple[float, float, float, float]:
     """Mean, or slope against x, and its σ; τ about it, and the probability of χ² without τ."""
+    # about the mean of x, mean and slope are nearly independent
     A = np.ones((len(p), 1)) if x is None else np.stack([np.ones(len(p)), x - x.mean()], 1)
     degrees = len(p) - A.shape[1]
 
-    def at(variance):
+    def fit(variance: float) -> tuple[float, float, float]:
         w = 1 / (sigma**2 + variance)
         Q = np.linalg.inv(A.T @ (w[:, None] * A))
         found = Q @ A.T @ (w * p)
         return found[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ found) ** 2)
 
+    # τ² is 0 if the epochs scatter no more than their σ, and at most the whole variance
     low, high = 0.0, float(np.var(p, ddof=1) * len(p))
-    chi2 = at(0.0)[2]
+    chi2 = fit(0.0)[2]
     if chi2 <= degrees:
         high = 0.0
+    # bisection, down to neighbouring numbers: χ² decreases with τ²
     for _ in range(200 if high else 0):
         middle = (low + high) / 2
-        low, high = (middle, high) if at(middle)[2] > degrees else (low, middle)
-    value, of_value, _ = at(high)
+        low, high = (middle, high) if fit(middle)[2] > degrees else (low, middle)
+    value, of_value, _ = fit(high)
     return float(value), float(of_value), float(np.sqrt(high)), chi2_tail(chi2, degrees)
 
 
-def _trend(slope, sigma, tau, epochs):
+def _trend(
+    slope: float, sigma: float, tau: float, epochs: int
+) -> tuple[float, float, float, float]:
     """Slope, σ, probability, τ; by Student's t where τ was estimated, else by the normal one."""
+    # t² ~ F(1, f): two-sided
     square = (slope / sigma) ** 2
     by_chance = f_tail(square, 1, epochs - 2) if tau else chi2_tail(square, 1)
     return slope, sigma, by_chance, tau

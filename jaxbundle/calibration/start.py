@@ -8,9 +8,10 @@ board from behind, like a mirror image.
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle.batch.camera import STATUS
 from jaxbundle.batch.camera import WEAK as WEAK_NUMBER
@@ -22,17 +23,12 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
 
-GROSS_LIMIT = 12.0
-"""Residuals above this multiple of their typical size (1.4826·median) are gross."""
-LEAST_GROSS = 3.0
-"""And above this many pixels."""
-PART = 1 / 3
 MIRRORED = "its points are numbered as in a mirror: it would see the board from behind"
 WEAK = STATUS[WEAK_NUMBER]
 
 
 @dataclasses.dataclass(frozen=True)
-class Start:
+class CalibrationStart:
     """Usable views, camera parameters, X0 and ω, φ, κ (radians) of every view.
 
     `behind`: every view shows the board as a mirror image.
@@ -46,8 +42,12 @@ class Start:
 
 
 def start_values(
-    views: BoardViews, model: CameraModel, free: tuple[str, ...], pixel_size=None, given=None
-) -> Start:
+    views: BoardViews,
+    model: CameraModel,
+    free: tuple[str, ...],
+    pixel_size: tuple[float, float] | None = None,
+    given: Mapping[str, float] | None = None,
+) -> CalibrationStart:
     """Start values for the adjustment of one camera; `given`: parameters known beforehand.
 
     **Raises:** `InputError` for too few views; `NotSolvedError` if they do not determine the
@@ -55,8 +55,9 @@ def start_values(
     """
     while True:
         if len(views) < 2:
+            why = f" ({views.failed[0][0]}: {views.failed[0][1]})" if views.failed else ""
             raise InputError(
-                f"only {count(len(views), 'photograph')} can be used{_why(views)}; a camera needs "
+                f"only {count(len(views), 'photograph')} can be used{why}; a camera needs "
                 "several, 8 or more, from different directions"
             )
         solved = _solve(views, model, free)
@@ -64,6 +65,8 @@ def start_values(
         if not used.all():
             views = views.take(used, "its points are too few or lie on a line")
             continue
+        # Seen from behind in some views only: their numbering is wrong. In all views: the
+        # photographs may be mirrored, which is said but changes no residual.
         behind = solved.position[:, 2] < views.board.points[:, 2].mean()
         if behind.any() and not behind.all():
             views = views.take(~behind, MIRRORED)
@@ -71,6 +74,7 @@ def start_values(
         gross = _gross_views(views, solved)
         if not gross.any():
             break
+        # most views bad: nothing says which are right
         if gross.sum() > len(views) - 2:
             raise NotSolvedError(
                 "not solved: the photographs contradict one another: the points of "
@@ -81,14 +85,10 @@ def start_values(
     parameters = parameters_of(
         solved, views.xy[views.visible], views.image_size, model, free, pixel_size, given
     )
-    return Start(views, parameters, solved.position, solved.angles, bool(behind.all()))
+    return CalibrationStart(views, parameters, solved.position, solved.angles, bool(behind.all()))
 
 
-def _why(views):
-    return f" ({views.failed[0][0]}: {views.failed[0][1]})" if views.failed else ""
-
-
-def _solve(views: BoardViews, model: CameraModel, free) -> FirstCamera:
+def _solve(views: BoardViews, model: CameraModel, free: Sequence[str]) -> FirstCamera:
     (found,) = first_cameras(
         views.board.points, views.xy[None], views.image_size, model, free, threads=1
     )
@@ -103,18 +103,18 @@ def _solve(views: BoardViews, model: CameraModel, free) -> FirstCamera:
     )
 
 
-def _gross_views(views, solved):
+def _gross_views(views: BoardViews, solved: FirstCamera) -> Bool[np.ndarray, " views"]:
     """Views with more than a third of gross residuals."""
-    v = _residuals(views, solved)
-    typical = 1.4826 * np.nanmedian(v)
-    gross = v > max(GROSS_LIMIT * typical, LEAST_GROSS)
-    return gross.sum(1) > PART * views.visible.sum(1)
-
-
-def _residuals(views, solved):
-    """Lengths of the residuals, pixels; NaN for missing points."""
     model, interior = solved.model, np.array(list(solved.interior.values()))
     computed = images_of_board(
         model, interior, solved.position, solved.rotation, views.board.points
     )
-    return np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
+    # lengths of the residuals, pixels; NaN for missing points
+    v = np.linalg.norm(computed - in_model_units(views.xy, model, views.image_size), axis=2)
+    typical = 1.4826 * np.nanmedian(v)
+    # Gross: above 12 times the typical size (1.4826·median, as σ) and 3 pixels. The camera of the
+    # start may have fewer coefficients than its model, and what they leave grows towards the
+    # corners to several times its median; a wrong board or order of corners is off by squares.
+    # Single blunders are left to data snooping.
+    gross = v > max(12.0 * typical, 3.0)
+    return gross.sum(1) > views.visible.sum(1) / 3

@@ -1,20 +1,28 @@
 """The verdict on a calibration: that of its adjustment, with coverage and cross-validation."""
 
-from jaxbundle.calibration.advice import LARGEST_TEST, PART, REACH
+from typing import TYPE_CHECKING
+
+from jaxbundle.calibration.advice import ADVICE
 from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, Finding, Verdict, conclude, in_words
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration.quality import Coverage
+    from jaxbundle.calibration.result import Calibration
+    from jaxbundle.calibration.rig.result import RigCalibration
+    from jaxbundle.calibration.several import Calibrations
 
 WITHOUT = ("Control",)
 """Findings of the adjustment that do not apply to a board."""
 
 
-def conclude_calibration(calibration) -> Verdict:
+def conclude_calibration(calibration: "Calibration") -> Verdict:
     """The verdict on a solved `Calibration`."""
     return conclude(
         calibration.adjustment, find(calibration), WITHOUT, len(calibration.shortcomings)
     )
 
 
-def conclude_calibrations(found) -> Verdict:
+def conclude_calibrations(found: "Calibrations") -> Verdict:
     """The verdict on several cameras (`Calibrations`): a finding for each, and for their rig."""
     findings = [_judge_camera(name, one) for name, one in found.cameras.items()]
     if found.rig is not None:
@@ -22,33 +30,33 @@ def conclude_calibrations(found) -> Verdict:
     return Verdict(*in_words(findings, 0), tuple(findings))
 
 
-def _judge_camera(name: str, calibration) -> Finding:
+def _judge_camera(name: str, calibration: "Calibration") -> Finding:
     about = f"Camera {name}"
     if not calibration.converged:
         return Finding(about, BAD, f"not solved: {calibration.adjustment.termination}")
     return Finding(about, *conclude_calibration(calibration)[:2])
 
 
-def _judge_rig(rig) -> Finding:
+def _judge_rig(rig: "RigCalibration") -> Finding:
     doubtful = rig.left_out or rig.contradicting or not rig.converged
     words = f"{len(rig.epochs)} epochs, {len(rig.left_out)} left out, σ0 {rig.sigma0:.4f}"
     return Finding("Rig", DOUBTFUL if doubtful else GOOD, words)
 
 
-def find(calibration) -> list[Finding]:
-    """Its own findings."""
+def find(calibration: "Calibration") -> list[Finding]:
+    """What the adjustment does not know of: coverage of the image, and the two halves."""
     covered, checked = calibration.coverage, calibration.cross_validation
-    good = covered.part >= PART and covered.reach >= REACH
+    good = covered.part >= ADVICE.min_part and covered.reach >= ADVICE.min_reach
     words = coverage_in_words(covered)
     found = [Finding("Coverage", GOOD if good else DOUBTFUL, words, words)]
     if checked is not None:
-        state = DOUBTFUL if checked.test > LARGEST_TEST else GOOD
+        state = DOUBTFUL if checked.test > ADVICE.max_test else GOOD
         words = " ".join(cross_validation_in_words(calibration))
         found.append(Finding("Cross-validation", state, words, "halves that contradict each other"))
     return found
 
 
-def coverage_in_words(covered) -> str:
+def coverage_in_words(covered: "Coverage") -> str:
     """The part of the image with measured points."""
     return (
         f"points in {100 * covered.part:.0f} % of the image's cells, out to "
@@ -56,7 +64,7 @@ def coverage_in_words(covered) -> str:
     )
 
 
-def cross_validation_in_words(calibration) -> list[str]:
+def cross_validation_in_words(calibration: "Calibration") -> list[str]:
     """The cross-validation of the halves, in sentences."""
     checked = calibration.cross_validation
     if checked is None:

@@ -37,14 +37,8 @@ SMALLEST_SIDE = {
     "aprilgrid": 2,
 }
 """Minimum columns and rows of a board."""
-MARKER = 0.75
-"""Side of a marker, in sides of a square, if it is not given."""
 ARUCO, APRILTAGS = "DICT_4X4_50", "DICT_APRILTAG_36h11"
 """Dictionaries of `charuco` and `aprilgrid`, if none is given."""
-
-
-def _is_length(x: float) -> bool:
-    return 0 < x < np.inf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,16 +81,25 @@ class Board:
         for name in ("square", "diameter", "marker"):
             value = getattr(self, name)
             if value is not None or name == "square":
-                length = number(f"board: {name}", value, "a positive length", _is_length)
+                is_length = lambda x: 0 < x < np.inf
+                length = number(f"board: {name}", value, "a positive length", is_length)
                 object.__setattr__(self, name, length)
         if self.kind == "aprilgrid":
-            given = self.marker, self.dictionary
-            object.__setattr__(self, "marker", given[0] or MARKER * self.square)
-            object.__setattr__(self, "dictionary", APRILTAGS if given[1] == ARUCO else given[1])
+            object.__setattr__(self, "marker", self.marker_side)
+            if self.dictionary == ARUCO:
+                object.__setattr__(self, "dictionary", APRILTAGS)
         if self.marker is not None and self.marker >= self.square:
             raise InputError(
                 f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
             )
+
+    @property
+    def marker_side(self) -> float:
+        """Side of a marker or tag, object unit: `marker`, or ¾ of a square if that is not given.
+
+        Only ratios matter to the detection, and it tolerates another one: OpenCV's example boards
+        have ½ to ¾, Kalibr's tags 1/1.3 of the step."""
+        return self.marker or 0.75 * self.square
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -15,6 +15,7 @@ light for 1; the code is the smallest number of its bits for any first sector
 """
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -25,20 +26,37 @@ from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.corners import find_board_points, memory_of_search
 from jaxbundle.measure.marker_corners import fit_marker_corners
-from jaxbundle.measure.targets import centre_by_ellipse
+from jaxbundle.measure.targets import Target, centre_by_ellipse
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.photographs.opencv import need_opencv
 
-SAMPLES = 20
-"""Samples in every sector of a ring."""
-GAP, RING, BEYOND = 1.5, 2.5, 3.4
-"""Radii in the middle of the dark gap, of the ring, and beyond it, in radii of the disc."""
-FEWEST_PIXELS, ROUND = 20, 0.12
-"""Minimum pixels of a disc, and the relative tolerance of its area to that of its ellipse."""
-SECTOR_TOLERANCE = 0.3
-"""Tolerance of sectors and the gap relative to the contrast."""
-OF_RINGS = 13
-"""Bytes a pixel of the search of rings; measured, at 6 and 54 million pixels."""
+
+@dataclasses.dataclass(frozen=True)
+class RingSettings:
+    """Which blobs are taken for the disc of a ring-coded target, and how its ring is read.
+
+    **Fields:**
+
+    - `min_pixels`: area within the outline of a disc, pixels: a radius of 3; the sectors of smaller
+      ones, of 3 pixels, blur into each other.
+    - `max_area_misfit`: of the area of a blob relative to the ellipse through its outline. By the
+      raster alone discs are off by up to 0.09 at a radius of 3 and 0.03 at 5. Larger: letters and
+      branches are tried as discs, which takes time, and are refused by their ring; half: small
+      discs are lost.
+    - `level_tolerance`: of the grey value of a sector or of the gap, in contrasts of the disc.
+      Above 0.5 a sector is neither light nor dark; the smaller, the more blurred rings are refused.
+    - `samples`: in every sector; a fifth at both of its ends is not used.
+    """
+
+    min_pixels: int = 20
+    max_area_misfit: float = 0.12
+    level_tolerance: float = 0.3
+    samples: int = 20
+
+
+Grey = UInt8[np.ndarray, "rows columns"]
+MeasuredPoint = tuple[str, Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]
+"""Name, pixels, covariance."""
 
 
 @print_in_one_screen
@@ -61,25 +79,31 @@ class NamedPoints:
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
-def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> NamedPoints:
+def find_coded_targets(grey: Grey, kind: str, rings: RingSettings | None = None) -> NamedPoints:
     """The coded targets of a photograph, without repeated names.
+
+    **Arguments:** `kind`: see the module; `rings`: other than the defaults of `RingSettings`.
 
     **Raises:** `InputError` for an unknown kind.
     """
     check_kind(kind)
     name, _, option = kind.partition(":")
     if name in ("ring12", "ring14"):
-        found = _rings(grey, int(name[4:])) or _rings(255 - grey, int(name[4:]))
-        return _unique(found)
+        bits, rings = int(name[4:]), rings or RingSettings()
+        return _without_repeated(_rings(grey, bits, rings) or _rings(255 - grey, bits, rings))
     if name == "charuco":
-        return _unique(_charuco(grey, option))
-    return _markers(grey, *_dictionary(name, option))
+        return _without_repeated(_charuco(grey, option))
+    if name == "aruco":
+        return _markers(grey, option or "DICT_4X4_50", 1)
+    border = 2 if name == "aprilgrid" else 1
+    return _markers(grey, f"DICT_APRILTAG_{(option or '36h11').upper()}", border)
 
 
 def memory_of_targets(rows: int, columns: int, kind: str) -> float:
     """Bytes that the search of targets takes in a photograph, beside its grey values."""
     if kind.startswith("ring"):
-        return OF_RINGS * rows * columns
+        # bytes a pixel, measured in photographs of 6 and of 54 million pixels
+        return 13 * rows * columns
     return memory_of_search(rows, columns, "charuco")
 
 
@@ -94,24 +118,18 @@ def check_kind(kind: str) -> None:
         )
 
 
-def _dictionary(name, option):
-    """The name of OpenCV's dictionary, and the bits of the border."""
-    if name == "aruco":
-        return option or "DICT_4X4_50", 1
-    return f"DICT_APRILTAG_{(option or '36h11').upper()}", 2 if name == "aprilgrid" else 1
-
-
-def _unique(found) -> NamedPoints:
+def _without_repeated(found: Sequence[MeasuredPoint]) -> NamedPoints:
+    """Points whose name occurs once: of two, one is a wrong reading, and nothing says which."""
     names = [name for name, *_ in found]
-    kept = [one for one in found if names.count(one[0]) == 1]
+    unique = [point for point in found if names.count(point[0]) == 1]
     return NamedPoints(
-        tuple(name for name, *_ in kept),
-        np.array([xy for _, xy, _ in kept], float).reshape(-1, 2),
-        np.array([covariance for *_, covariance in kept], float).reshape(-1, 2, 2),
+        tuple(name for name, *_ in unique),
+        np.array([xy for _, xy, _ in unique], float).reshape(-1, 2),
+        np.array([covariance for *_, covariance in unique], float).reshape(-1, 2, 2),
     )
 
 
-def _markers(grey, dictionary, border) -> NamedPoints:
+def _markers(grey: Grey, dictionary: str, border: int) -> NamedPoints:
     cv2 = need_opencv()
     known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
     if dictionary.upper() not in known:
@@ -127,7 +145,7 @@ def _markers(grey, dictionary, border) -> NamedPoints:
     once = np.bincount(ids, minlength=1)[ids] == 1
     ids, near = ids[once], np.array([four[0] for four in corners], float).reshape(-1, 4, 2)[once]
     if not len(ids):
-        return _unique([])
+        return _without_repeated([])
     side = words.markerSize + 2 * border
     draw = lambda id: cv2.aruco.generateImageMarker(words, id, side, borderBits=border) > 0
     found = fit_marker_corners(grey, near, np.array([draw(id) for id in ids.tolist()]), border)
@@ -141,7 +159,7 @@ def _markers(grey, dictionary, border) -> NamedPoints:
     )
 
 
-def _charuco(grey, option):
+def _charuco(grey: Grey, option: str) -> list[MeasuredPoint]:
     try:
         columns, rows = (int(n) for n in option.lower().split(":")[0].split("x"))
     except ValueError:
@@ -159,27 +177,29 @@ def _charuco(grey, option):
     ]
 
 
-def _rings(grey, bits):
-    found = []
-    for near in _discs(grey):
+def _rings(grey: Grey, bits: int, settings: RingSettings) -> list[MeasuredPoint]:
+    found: list[tuple[float, int, Target]] = []
+    for near in _discs(grey, settings):
         try:
             target = centre_by_ellipse(grey, near)
         except InputError:
             continue
-        if target.bright and (read := _code(grey, target, bits)) is not None:
+        if target.bright and (read := _code(grey, target, bits, settings)) is not None:
             found.append((*read, target))
-    kept = []
-    for _, code, target in sorted(found, key=lambda one: one[0]):
+    distinct: list[tuple[int, Target]] = []
+    for _, code, target in sorted(found, key=lambda read: read[0]):
         # a sector of a ring may look like a disc with a ring; the more distinct one is right
-        reach = 3 * target.axes[0]
-        if all(np.linalg.norm(target.xy - t.xy) > max(reach, 3 * t.axes[0]) for _, t in kept):
-            kept.append((code, target))
-    return [(str(code), target.xy, target.covariance) for code, target in kept]
+        ring = 3 * target.axes[0]
+        if all(np.linalg.norm(target.xy - t.xy) > max(ring, 3 * t.axes[0]) for _, t in distinct):
+            distinct.append((code, target))
+    return [(str(code), target.xy, target.covariance) for code, target in distinct]
 
 
-def _discs(grey):
+def _discs(grey: Grey, settings: RingSettings) -> Iterator[Float[np.ndarray, "2"]]:
     """Centres of light blobs that fill the ellipse of their outline."""
     cv2 = need_opencv()
+    # a local threshold follows uneven light; 8 grey values above the mean of a window of a
+    # twentieth of the image: noise of σ 2 exceeds it once in 30 000 pixels
     side = max(15, (min(grey.shape) // 20) | 1)
     light = cv2.adaptiveThreshold(
         grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, side, -8
@@ -187,40 +207,47 @@ def _discs(grey):
     outlines, _ = cv2.findContours(light, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         area = cv2.contourArea(outline)
-        if area < FEWEST_PIXELS or len(outline) < 6:
+        if area < settings.min_pixels or len(outline) < 6:  # fitEllipse needs five points
             continue
         middle, axes, _ = cv2.fitEllipse(outline)
         # the outline passes through the centres of the outermost pixels
         full = np.pi / 4 * axes[0] * axes[1]
-        if min(axes) > 0.25 * max(axes) and abs(area / max(full, 1e-9) - 1) < ROUND:
+        # a ratio of axes of 0.25: a target seen 75° from its normal
+        misfit = abs(area / max(full, 1e-9) - 1)
+        if min(axes) > 0.25 * max(axes) and misfit < settings.max_area_misfit:
             yield np.array(middle)
 
 
-def _code(grey, target, bits):
+def _code(
+    grey: Grey, target: Target, bits: int, settings: RingSettings
+) -> tuple[float, int] | None:
     """The misfit of the ring around a disc, and its code; None if there is none."""
     from scipy.ndimage import map_coordinates
 
-    n = bits * SAMPLES
+    samples, tolerance = settings.samples, settings.level_tolerance
+    n = bits * samples
     t = 2 * np.pi * np.arange(n) / n
     c, s = np.cos(target.angle), np.sin(target.angle)
     turn = np.array([[c, -s], [s, c]])
     rim = target.axes * np.stack([np.cos(t), np.sin(t)], 1) @ turn.T
-    places = target.xy + np.array([GAP, RING, BEYOND])[:, None, None] * rim
+    # in the middle of the gap (r to 2·r) and of the ring (2·r to 3·r), and beyond it, still on
+    # the dark ground
+    places = target.xy + np.array([1.5, 2.5, 3.4])[:, None, None] * rim
     u, v = places[..., 0], places[..., 1]
     if u.min() < 0 or v.min() < 0 or u.max() > grey.shape[1] - 1 or v.max() > grey.shape[0] - 1:
         return None
     gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
     dark = np.median(gap)
     gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond))
-    if np.abs(gap).max() > SECTOR_TOLERANCE or beyond.mean() > 0.5:
+    if np.abs(gap).max() > tolerance or beyond.mean() > 0.5:
         return None
-    # the sectors begin at the changes
-    by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
-    inner = by_start[:, :, SAMPLES // 5 : -(SAMPLES // 5)]
+    # the sectors begin where the values within them vary least; their blurred ends do not count
+    by_start = np.stack([np.roll(value, -k).reshape(bits, samples) for k in range(samples)])
+    inner = by_start[:, :, samples // 5 : -(samples // 5)]
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
     off = np.minimum(np.abs(means), np.abs(means - 1))
-    if np.any(off > SECTOR_TOLERANCE):
+    if np.any(off > tolerance):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():

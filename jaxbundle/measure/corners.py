@@ -7,13 +7,16 @@ million pixels take 25 s, one of 1600 columns 1 s), points are measured in the o
 """
 
 import dataclasses
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.board_points import BoardPoints, make_points
-from jaxbundle.measure.boards import MARKER, SMALLEST_SIDE, Board
+from jaxbundle.measure.boards import SMALLEST_SIDE, Board
 from jaxbundle.measure.saddles import Saddles, fit_saddles, lines_of_grid
 from jaxbundle.measure.tag_grids import find_tags, get_dictionary
 from jaxbundle.measure.targets import centre_by_ellipse
@@ -21,17 +24,15 @@ from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import image_errors
 
 Grey = UInt8[np.ndarray, "rows columns"]
+Places = Float[np.ndarray, "n 2"]
+Grid = Float[np.ndarray, "rows columns 2"]
+"""Image points of a board by row and column."""
 
 SIDES = (1600, 3200)
-"""Longer sides of the reduced copies in which boards are searched in turn, in pixels."""
-MARKERS = 3
-"""More markers than this prove another dictionary: false ones are rare."""
+"""Longer sides of the reduced copies in which boards are searched in turn, in pixels. The first
+takes a second (see above); the second, of four times the pixels, finds squares of half the size."""
 QUICK_SIDE = 800
-"""The same for boards of other sizes."""
-OF_A_COPY, OF_MARKERS = 230, 6
-"""Bytes a pixel of the largest copy in which OpenCV searches a chessboard that is not there (most:
-measured in a photograph of 3072 × 2048 pixels), and of a photograph in which it searches
-markers."""
+"""The same for boards of other sizes, a hint only, in a quarter of the pixels of the first copy."""
 
 
 def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
@@ -68,13 +69,15 @@ def find_board_points(grey: Grey, board: Board) -> BoardPoints:
 
 def memory_of_search(rows: int, columns: int, kind: str) -> float:
     """Bytes that the search of a board of a kind takes in a photograph, beside its grey values."""
+    # bytes a pixel, measured in a photograph of 3072 × 2048 pixels: in a search of markers 6; of a
+    # chessboard that is not there, the worst case, 230 of the largest copy
     if kind in ("charuco", "aprilgrid"):
-        return OF_MARKERS * rows * columns
+        return 6 * rows * columns
     factor = min(1.0, SIDES[-1] / max(rows, columns))
-    return OF_A_COPY * factor**2 * rows * columns
+    return 230 * factor**2 * rows * columns
 
 
-def _is_in_small(cv2, grey, board) -> bool:
+def _is_in_small(cv2: ModuleType, grey: Grey, board: Board) -> bool:
     """Whether a chessboard is in a small copy of a photograph: much faster than a full search."""
     small, _ = _reduce(cv2, grey, QUICK_SIDE)
     found, _ = cv2.findChessboardCornersSB(
@@ -117,7 +120,7 @@ def _with_other_markers(grey: Grey, board: Board) -> Board | None:
     names = sorted(name for name in dir(aruco) if name.startswith("DICT_"))
     known = {name: aruco.getPredefinedDictionary(getattr(aruco, name)) for name in names}
     markers = board.columns * board.rows // 2
-    best, most = None, MARKERS
+    best, most = None, 3  # up to three markers may be false readings of another dictionary
     for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):
         if name == board.dictionary or len(dictionary.bytesList) < markers:
             continue
@@ -147,10 +150,11 @@ def largest_chessboard(grey: Grey, board: Board) -> Board | None:
     return dataclasses.replace(board, columns=columns, rows=rows)
 
 
-def _chessboard(cv2, grey, board):
+def _chessboard(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     size = (board.columns, board.rows)
 
-    def seek(grey):
+    def seek(grey: Grey) -> Any:
+        # the detector of Duda and Frese (2018) first, the older one where it finds nothing
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
         if not found:
@@ -169,7 +173,9 @@ def _chessboard(cv2, grey, board):
     return make_points(fit_saddles(grey, xy.reshape(-1, 2), lines), np.arange(xy.size // 2), board)
 
 
-def _in_copies(cv2, grey, seek):
+def _in_copies(
+    cv2: ModuleType, grey: Grey, seek: Callable[[Grey], Any]
+) -> Float[np.ndarray, "n 2"] | None:
     """The result of `seek` in reduced copies, in pixels of the image; None: nothing found."""
     sides = [side for side in SIDES if side < max(grey.shape)]
     for side in (*sides, max(grey.shape))[: len(SIDES)]:
@@ -180,7 +186,7 @@ def _in_copies(cv2, grey, seek):
     return None
 
 
-def _reduce(cv2, grey, side):
+def _reduce(cv2: ModuleType, grey: Grey, side: int) -> tuple[Grey, int]:
     """The image reduced by a whole factor to the maximum side; and the factor."""
     factor = -(-max(grey.shape) // side)
     if factor < 2:
@@ -190,7 +196,7 @@ def _reduce(cv2, grey, side):
     return cv2.resize(grey[:rows, :columns], size, interpolation=cv2.INTER_AREA), factor
 
 
-def _turn_upright(xy):
+def _turn_upright(xy: Grid) -> Grid:
     """Rows from the top, each from the left: not mirrored, the first row at the top."""
     right, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
     if np.linalg.det([right.sum(0), down.sum(0)]) < 0:
@@ -199,7 +205,7 @@ def _turn_upright(xy):
     return xy if (y, x) <= (v, u) else xy[::-1, ::-1]
 
 
-def _first_black(grey, xy, board):
+def _first_black(grey: Grey, xy: Grid, board: Board) -> Grid:
     """The one of two or four possible numberings with a black first square."""
     turns = [xy, xy[::-1, ::-1]]
     if board.columns == board.rows:
@@ -208,21 +214,22 @@ def _first_black(grey, xy, board):
     return max(turns, key=lambda xy: _contrast(grey, xy))
 
 
-def _contrast(grey, xy):
-    """Grey-value difference between squares of the other and of the first colour; 0: undecided."""
+def _contrast(grey: Grey, xy: Grid) -> float:
+    """Sign of the grey-value difference between squares of the other and of the first colour; 0:
+    undecided."""
     middle = (xy[:-1, :-1] + xy[1:, 1:] + xy[:-1, 1:] + xy[1:, :-1]) / 4
     column, row = np.rint(middle).astype(int).reshape(-1, 2).T
     shade = grey[row, column].astype(float).reshape(middle.shape[:2])
     i, j = np.indices(shade.shape)
-    own = (i + j) % 2 == 0
-    difference = shade[~own].mean() - shade[own].mean()
-    return np.sign(difference)
+    first = (i + j) % 2 == 0
+    return np.sign(shade[~first].mean() - shade[first].mean())
 
 
-def _charuco(cv2, grey, board):
+def _charuco(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     aruco, dictionary = cv2.aruco, get_dictionary(board.dictionary)
-    marker = board.marker or MARKER * board.square
+    marker = board.marker_side
     best, seen = None, {}
+    # OpenCV before 4.6 began boards of an even number of rows with a white square
     for legacy in (False, True):
         size = (board.columns, board.rows)
         known = aruco.CharucoBoard(size, board.square, marker, dictionary)
@@ -244,6 +251,7 @@ def _charuco(cv2, grey, board):
     on_grid = np.full((*board.grid, 2), np.nan)
     on_grid.reshape(-1, 2)[ids] = xy
     lines = lines_of_grid(on_grid).reshape(-1, 2, 2)[ids]
+    # least median of squares: corners interpolated from a wrongly read marker are outliers
     H, _ = cv2.findHomography(X, xy, cv2.LMEDS)
     if H is None:
         raise InputError("the corners of the ChArUco board found lie on a line")
@@ -253,10 +261,15 @@ def _charuco(cv2, grey, board):
     return make_points(fit_saddles(grey, xy, lines, _strips(image, X, lines, board)), ids, board)
 
 
-def _strips(image, X, lines, board):
+def _strips(
+    image: Callable[[Places], Places],
+    X: Places,
+    lines: Float[np.ndarray, "n 2 2"],
+    board: Board,
+) -> Float[np.ndarray, "n 2 2 2"]:
     """Distances of the corners of markers from the lines through the corners of a ChArUco board,
     for `fit_saddles`."""
-    width = (1 - (board.marker or MARKER * board.square) / board.square) / 2
+    width = (1 - board.marker_side / board.square) / 2
     normal = np.stack([-lines[..., 1], lines[..., 0]], 2)
     normal /= np.linalg.norm(normal, axis=2)[..., None]
     strips, rows = np.empty((len(X), 2, 2, 2)), np.arange(len(X))
@@ -268,12 +281,12 @@ def _strips(image, X, lines, board):
     return strips
 
 
-def _circles(cv2, grey, board):
+def _circles(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     size = (board.columns, board.rows)
     uneven = board.kind == "asymmetric-circles"
     flags = cv2.CALIB_CB_ASYMMETRIC_GRID if uneven else cv2.CALIB_CB_SYMMETRIC_GRID
 
-    def seek(grey):
+    def seek(grey: Grey) -> Any:
         for shade in (0, 255):
             finder = _blob_finder(cv2, grey, shade)
             for more in (0, cv2.CALIB_CB_CLUSTERING):
@@ -301,10 +314,12 @@ def _circles(cv2, grey, board):
     return make_points(centres, np.arange(len(targets)), board)
 
 
-def _blob_finder(cv2, grey, shade):
+def _blob_finder(cv2: ModuleType, grey: Grey, shade: int) -> Any:
     """Round blobs of any size in the image; the limit of OpenCV is 5000 pixels."""
     wanted = cv2.SimpleBlobDetector_Params()
     wanted.blobColor = shade
+    # of 4 pixels across to an eighth of the image, a board of 3 × 3; ellipses of circles seen
+    # obliquely, far from round; not the background between them, which is not convex
     wanted.minArea, wanted.maxArea = 15, grey.size / 8
     wanted.minDistBetweenBlobs = 4
     wanted.filterByInertia, wanted.minInertiaRatio = True, 0.05
@@ -312,14 +327,14 @@ def _blob_finder(cv2, grey, shade):
     return cv2.SimpleBlobDetector_create(wanted)
 
 
-def _number_asymmetric(xy):
+def _number_asymmetric(xy: Grid) -> Grid:
     """The numbering with the second row shifted to the right, not mirrored."""
 
-    def fits(xy):
+    def fits(xy: Grid) -> bool:
         right, down = xy[0, -1] - xy[0, 0], xy[-1] - xy[0]
         shift = (xy[1] - xy[0]).mean(0)
-        other = (xy[2] - xy[0]).mean(0) / 2 if len(xy) > 2 else 0 * shift
-        return np.linalg.det([right, down.mean(0)]) > 0 and (shift - other) @ right > 0
+        straight = (xy[2] - xy[0]).mean(0) / 2 if len(xy) > 2 else 0 * shift
+        return np.linalg.det([right, down.mean(0)]) > 0 and (shift - straight) @ right > 0
 
     turns = [xy, xy[::-1, ::-1], xy[::-1], xy[:, ::-1]]
     good = [turned for turned in turns if fits(turned)]

@@ -31,11 +31,6 @@ from jaxbundle.cameras import CameraModel, project
 from jaxbundle.orientation.pose import Pose, to_camera
 from jaxbundle.types import AnyArray, Scalar
 
-RIM = 32
-"""Points of a rim."""
-ROUNDING = 1e-13
-"""Added to the scatter matrix, relative: points exactly on an ellipse leave it singular."""
-
 
 class Ellipse(eqx.Module):
     """Centre, semi-axes (the longer first), the longer one's angle to x; σ0 of the distances of the
@@ -57,7 +52,7 @@ def fit_ellipse(
 
     **Returns:** NaN if the points determine no ellipse.
     """
-    p = jnp.ones(xy.shape[0]) if weights is None else weights
+    p = jnp.ones(xy.shape[0]) if weights is None else jnp.asarray(weights)
     xy = jnp.where(p[:, None] > 0, xy, 0.0)
     middle = p @ xy / jnp.sum(p)
     size = jnp.sqrt(p @ jnp.sum((xy - middle) ** 2, 1) / jnp.sum(p))
@@ -68,7 +63,8 @@ def fit_ellipse(
     )
     back = -jnp.linalg.solve(S3, S2.T)
     T = S1 + S2 @ back
-    T = T + ROUNDING * jnp.trace(S1) * jnp.eye(3)
+    # points exactly on an ellipse leave T singular: rounding, some hundred ε, is added
+    T = T + 1e-13 * jnp.trace(S1) * jnp.eye(3)
     L = jnp.linalg.cholesky(T)
     inverse = jax.scipy.linalg.solve_triangular(L, jnp.eye(3), lower=True)
     constraint = jnp.array([[0, 0, 2.0], [0, -1, 0], [2, 0, 0]])
@@ -82,8 +78,8 @@ def fit_ellipse(
     A, B, C, D, E, _ = conic
     slope = jnp.hypot(2 * A * x + B * y + D, B * x + 2 * C * y + E)
     distance = rows @ conic / slope
-    spare = jnp.maximum(jnp.sum(p > 0) - 5, 1)
-    sigma0 = jnp.sqrt(jnp.sum(p * distance**2) / spare)
+    redundancy = jnp.maximum(jnp.sum(p > 0) - 5, 1)
+    sigma0 = jnp.sqrt(jnp.sum(p * distance**2) / redundancy)
     design = jnp.sqrt(p)[:, None] * rows / slope[:, None]
     # the length of the conic's coefficients has no meaning: it is held
     N = design.T @ design + jnp.trace(design.T @ design) * jnp.outer(conic, conic)
@@ -91,7 +87,9 @@ def fit_ellipse(
     covariance = sigma0**2 * J @ jnp.linalg.solve(N, J.T)
 
     centre = _centre(conic)
-    depth = -(conic @ jnp.array([*_squares(*centre), *centre, 1.0]))
+    # F at the centre: about it A·x² + B·xy + C·y² = depth, with semi-axes √(depth/eigenvalue)
+    x, y = centre
+    depth = -(conic @ jnp.array([x * x, x * y, y * y, x, y, 1.0]))
     values, vectors = jnp.linalg.eigh(jnp.array([[A, B / 2], [B / 2, C]]))
     axes = jnp.sqrt(depth / values)
     angle = jnp.arctan2(vectors[1, 0], vectors[0, 0])
@@ -101,7 +99,7 @@ def fit_ellipse(
 
 def circle_centre_shift(
     model: CameraModel,
-    p,
+    p: Float[AnyArray, " parameters"],
     pose: Pose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
@@ -125,7 +123,7 @@ def circle_centre_shift(
 
 def rim_centre_shift(
     model: CameraModel,
-    p,
+    p: Float[AnyArray, " parameters"],
     pose: Pose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
@@ -136,18 +134,15 @@ def rim_centre_shift(
     aside = jnp.where(jnp.abs(normal[0]) < 0.8, jnp.array([1.0, 0, 0]), jnp.array([0, 1.0, 0]))
     a = jnp.cross(normal, aside)
     a = a / jnp.linalg.norm(a)
-    t = 2 * jnp.pi * (jnp.arange(RIM) + 0.5) / RIM
+    n = 32  # points: the ellipse has 5 coefficients; distortion over a circle is of low degree
+    t = 2 * jnp.pi * (jnp.arange(n) + 0.5) / n
     rim = centre + radius * (jnp.cos(t)[:, None] * a + jnp.sin(t)[:, None] * jnp.cross(normal, a))
     image = lambda X: jnp.stack(project(model, tuple(p), *to_camera(pose, X)))
     return fit_ellipse(jax.vmap(image)(rim)).centre - image(centre)
 
 
-def _centre(conic):
+def _centre(conic: Float[Array, "6"]) -> Float[Array, "2"]:
     """The point with zero gradient of the conic."""
     A, B, C, D, E, _ = conic
     determinant = 4 * A * C - B * B
     return jnp.stack([B * E - 2 * C * D, B * D - 2 * A * E]) / determinant
-
-
-def _squares(x, y):
-    return x * x, x * y, y * y

@@ -22,12 +22,13 @@ from jaxtyping import Array, Float
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
-from jaxbundle.leastsquares.iterations.small import adjust
+from jaxbundle.leastsquares.iterations.small import Fit, adjust
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.system.programs import compile_once
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
+"""Parameters of each kind, the letters above."""
 
 
 @print_in_one_screen
@@ -73,7 +74,9 @@ def transform(
 
 
 @partial(compile_once, static=0)
-def _transform_all(kind, p, xy):
+def _transform_all(
+    kind: str, p: Float[AnyArray, " u"], xy: Float[AnyArray, "n 2"]
+) -> Float[Array, "n 2"]:
     return jax.vmap(partial(transform, kind), (None, 0))(p, xy)
 
 
@@ -107,6 +110,7 @@ def fit_fiducials(
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("fiducial marks: every coordinate must be a finite number")
     p = np.ones(marks) if weights is None else np.asarray(weights, float)
+    # pixels of thousands beside mm: reduced to the centroid and the spread, N is well scaled
     middle, size = source.mean(0), max(float(source.std()), 1e-300)
     fit = _fit(kind, unknowns, (source - middle) / size, target, p)
     if not bool(fit.determined):
@@ -129,11 +133,22 @@ def fit_fiducials(
 
 
 @partial(compile_once, static=(0, 1))
-def _fit(kind, unknowns, source, target, p):
+def _fit(
+    kind: str,
+    unknowns: int,
+    source: Float[AnyArray, "marks 2"],
+    target: Float[AnyArray, "marks 2"],
+    p: Float[AnyArray, " marks"],
+) -> Fit:
     start = jnp.zeros(unknowns).at[jnp.array([0, 1] if unknowns == 4 else [0, 4])].set(1.0)
     root = jnp.sqrt(p)[:, None]
 
-    def residuals(q, source, target, root):
+    def residuals(
+        q: Float[Array, " u"],
+        source: Float[Array, "marks 2"],
+        target: Float[Array, "marks 2"],
+        root: Float[Array, "marks 1"],
+    ) -> Float[Array, " 2*marks"]:
         return (root * (_transform_all(kind, q, source) - target)).ravel()
 
     # linear ones end with the first step; the projective one starts from it
@@ -144,10 +159,12 @@ def _fit(kind, unknowns, source, target, p):
 
 
 @partial(compile_once, static=0)
-def _in_source_units(kind, q, middle, size):
+def _in_source_units(
+    kind: str, q: Float[AnyArray, " u"], middle: Float[AnyArray, "2"], size: Scalar
+) -> tuple[Float[Array, " u"], Float[Array, "u u"]]:
     """Parameters for (x, y) from those for (x − middle)/size, and their derivatives."""
 
-    def same(q):
+    def convert(q: Float[AnyArray, " u"]) -> Float[Array, " u"]:
         (mx, my), k = middle, size
         if kind == "similarity":
             a, b = q[0] / k, q[1] / k
@@ -157,4 +174,4 @@ def _in_source_units(kind, q, middle, size):
         H = jnp.concatenate([H[:, :2] / k, (H[:, 2] - H[:, :2] @ middle / k)[:, None]], 1)
         return (H / H[2, 2]).ravel()[: len(q)]
 
-    return same(q), jax.jacfwd(same)(q)
+    return convert(q), jax.jacfwd(convert)(q)

@@ -47,29 +47,52 @@ Sutton (2000), Systematic errors in digital image correlation caused by intensit
 Optical Engineering 39(11); Unser (1999), Splines, IEEE Signal Processing Magazine 16(6).
 """
 
+import dataclasses
+from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
-STEPS = 12
-"""Evaluations of a matching: two of three end after six."""
-LAST_STEP = 0.005
-"""Steps below this, anywhere in the window, end the iterations, pixels."""
-LARGEST_SHIFT = 0.5
-"""The centre may move from its start by this part of the side of the window."""
-SMALLEST_CONTRAST = 1e-6
-"""Standard deviation of grey values, relative to the largest, below which there is no contrast."""
-SMALLEST_PIVOT = 1e-5
-"""Smallest square of a pivot of N, scaled to a unit diagonal; below it nothing is determined."""
-TINY = 1e-20
 UNKNOWNS = 8
+"""A [2, 3], row by row, h0, h1."""
+Unknowns = Float[Array, "8"]
+Normal = Float[Array, "8 8"]
+Pixels = Float[AnyArray, " n*n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LeastSquaresSettings:
+    """When the iterations of a matching end, and which results are refused.
+
+    **Fields:**
+
+    - `last_step`: pixels; steps below this, anywhere in the window, end the iterations. A match of
+      good texture has a σ of 0.016, and the next step is far smaller.
+    - `max_shift`: the centre may move from its start by this part of the side of the window: beyond
+      half of it, nothing of the expected window is seen.
+    - `min_scale`: smallest determinant of A relative to its start; below 0 it is mirrored.
+    - `min_contrast`: standard deviation of grey values, relative to the largest, below which there
+      is none: ten roundings of 32 bits.
+    - `min_pivot`: smallest square of a pivot of N, scaled to a unit diagonal, below which nothing
+      is determined: a hundred roundings of 32 bits.
+    - `damping`, `min_damping`: λ at the start, and the smallest, which rounding does not exceed.
+    """
+
+    last_step: float = 0.005
+    max_shift: float = 0.5
+    min_scale: float = 0.1
+    min_contrast: float = 1e-6
+    min_pivot: float = 1e-5
+    damping: float = 1e-3
+    min_damping: float = 1e-6
 
 
 class MatchingStatus(IntEnum):
@@ -107,84 +130,89 @@ def match_least_squares(
     template: Float[AnyArray, "n n"],
     image: Float[AnyArray, "rows columns"],
     start: Float[AnyArray, "2 3"],
-    steps: int = STEPS,
+    steps: int = 12,
     blur: float = 0.0,
     reach: int = 0,
     bend: float | Float[AnyArray, ""] = 0.0,
+    settings: LeastSquaresSettings | None = None,
 ) -> LeastSquaresMatch:
     """Match a window with another image, from a start within a few pixels; batch it by `jax.vmap`.
 
     **Arguments:** `template`: grey values of the window, n odd, its centre the point; `image`: the
     other image or a piece of it; `start`: A, from pixels about the centre of the window (x right, y
-    down) to pixels of `image`; `steps`: maximum evaluations; `blur`: σ, pixels, of the Gaussian by
-    which both were smoothed, 0: white noise; `reach`: pixels, less than n/2, over which
-    residuals may be correlated, 0: not at all (then no `bend`); `bend`: σ of terms of second order
-    at the edge of the window, pixels of `image`.
+    down) to pixels of `image`; `steps`: maximum evaluations, of which two matches in three need
+    six; `blur`: σ, pixels, of the Gaussian by which both were smoothed, 0: white noise; `reach`:
+    pixels, less than n/2, over which residuals may be correlated, 0: not at all (then no `bend`);
+    `bend`: σ of terms of second order at the edge of the window, pixels of `image`.
 
     **Returns:** `status` gives the reason of a failure; the covariance is infinite if undetermined.
     """
-    n, dtype = template.shape[0], template.dtype
-    start = start.astype(dtype)
-    mean = jnp.mean(template)
-    contrast = jnp.std(template)
-    textured = contrast > SMALLEST_CONTRAST * jnp.max(jnp.abs(template))
+    settings = settings or LeastSquaresSettings()
+    n, dtype, start = template.shape[0], template.dtype, start.astype(template.dtype)
+    mean, contrast = jnp.mean(template), jnp.std(template)
+    textured = contrast > settings.min_contrast * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
     grey = ((template - mean) / unit).ravel()
     other = spline_coefficients((image.astype(dtype) - mean) / unit)
-    x, y = _window(n, dtype)
+    offset = jnp.arange(n, dtype=dtype) - n // 2
+    y, x = (a.ravel() for a in jnp.meshgrid(offset, offset, indexing="ij"))
     # unknowns scaled by their effect at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
     computed = lambda p: jax.vmap(_compute, (None, None, 0, 0))(p / size, other, x, y)
-
-    def normal_equations(p):
-        # forward, and stored: in reverse, or within the products, grey values are looked up again
-        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
-        return J.T @ J, J.T @ v, v @ v
-
-    begin = size * _with_radiometry(start, other, grey, x, y)
-    p, N, square, moving = _minimise(normal_equations, begin, steps)
-    Q, determined = _inverse(N)
+    p = size * _with_radiometry(start, other, x, y)
+    p, N, square, moving = _minimise(computed, grey, p, steps, settings)
+    Q, determined = _inverse(N, settings.min_pivot)
     contrast2 = (p[7] / size[7]) ** 2
     if blur > 0:
-        M = _correlate(jax.jacfwd(computed)(p), n, blur)
+        J = jax.jacfwd(computed)(p)
+        M = _sum_over_pairs(J, n, lambda d: np.exp(-(d**2) / (4 * blur**2)))
         variance = square / (n * n - jnp.trace(Q @ M))
-        Q, real = _inverse(N - variance * _of_noise(contrast2, size, x, y, blur))
-        determined &= real
-        C = variance * Q @ M @ Q
+        N = N - variance * _expect_noise(contrast2, size, x, y, blur)
+        Q, real = _inverse(N, settings.min_pivot)
+        determined, C, drawn = determined & real, variance * Q @ M @ Q, 0
     else:
         variance = square / (n * n - UNKNOWNS)
-        kept, pull = jax.value_and_grad(_interpolated_noise)(p, size, x, y)
-        noise = variance / (1 + contrast2 * kept / (n * n / 2))
-        drawn = contrast2 * noise * jnp.where(determined, Q @ pull, 0)
-        C = noise * (1 + contrast2) * Q
+        C, drawn = _white_noise(p, Q, determined, variance, contrast2, (size, x, y))
         if reach:
             J, v = jax.jacfwd(computed)(p), computed(p) - grey
-            p, C = _bend(p, J, v, variance, bend, x, y, reach)
-        p = p + drawn
-    p = p / size
-    affine = p[:6].reshape(2, 3)
+            p, C = _bend(p, J, v, variance, bend, x, y, reach, settings.min_pivot)
+    p = (p + drawn) / size
     known = textured & determined & (p[7] > 0)
-    status = _status(affine, start, image.shape, n, textured, known, moving)
     return LeastSquaresMatch(
-        affine,
-        jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
-        jnp.where(known, C[2:6:3, 2:6:3], jnp.inf),
-        unit * jnp.sqrt(variance),
-        jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
-        status,
+        affine=p[:6].reshape(2, 3),
+        radiometry=jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
+        covariance=jnp.where(known, C[2:6:3, 2:6:3], jnp.inf),
+        sigma0=unit * jnp.sqrt(variance),
+        correlation=jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
+        status=_status(p, start, image.shape, n, textured, known, moving, settings),
     )
 
 
-def _status(affine, start, shape, n, textured, known, moving):
+def _status(
+    p: Unknowns,
+    start: Float[AnyArray, "2 3"],
+    shape: tuple[int, ...],
+    n: int,
+    textured: Bool[Array, ""],
+    known: Bool[Array, ""],
+    moving: Bool[Array, ""],
+    settings: LeastSquaresSettings,
+) -> Int[Array, ""]:
     """The first reason for the end of a matching."""
+    affine = p[:6].reshape(2, 3)
     middle = (jnp.asarray(shape[::-1]) - 1) / 2
-    reach = jnp.max(jnp.abs(affine @ _corners(n, affine.dtype) - middle[:, None]), 1)
+    h = n // 2
+    corners = jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], affine.dtype)
+    reach = jnp.max(jnp.abs(affine @ corners - middle[:, None]), 1)
     away = jnp.linalg.norm(affine[:, 2] - start[:, 2])
     turned = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
     reasons = (
         (~textured, MatchingStatus.NO_TEXTURE),
         (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
-        (~((away < LARGEST_SHIFT * n) & (turned > 0.1)), MatchingStatus.DIVERGED),
+        (
+            ~((away < settings.max_shift * n) & (turned > settings.min_scale)),
+            MatchingStatus.DIVERGED,
+        ),
         (~known, MatchingStatus.NO_TEXTURE),
         (moving, MatchingStatus.NOT_CONVERGED),
     )
@@ -201,7 +229,9 @@ def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, 
     return down @ image @ along.T
 
 
-def grey_value(coefficients: Float[AnyArray, "rows columns"], u, v) -> Float[Array, ""]:
+def grey_value(
+    coefficients: Float[AnyArray, "rows columns"], u: Scalar, v: Scalar
+) -> Float[AnyArray, ""]:
     """The grey value of an image at (u, v), by its `spline_coefficients`."""
     rows, columns = coefficients.shape
     i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
@@ -214,7 +244,8 @@ def grey_value(coefficients: Float[AnyArray, "rows columns"], u, v) -> Float[Arr
     return sum((a * line(r) for a, r in zip(down, row)), nil)
 
 
-def _spline_weights(t):
+def _spline_weights(t: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """The cubic B-spline at t + 1, t, 1 − t, 2 − t, 0 ≤ t < 1 (Unser, 1999, equation 3)."""
     return (
         (1 - t) ** 3 / 6,
         ((3 * t - 6) * t * t + 4) / 6,
@@ -223,23 +254,38 @@ def _spline_weights(t):
     )
 
 
-def _prefilter(n):
-    """From n values to the coefficients of the spline through them."""
+def _prefilter(n: int) -> Float[np.ndarray, "n n"]:
+    """From n values to the coefficients of the spline through them.
+
+    The inverse of the banded matrix of ⅙, ⅔, ⅙, dense: windows are small, and two products with it
+    are one call for all of a batch, where the recursive filter of Unser is a loop over the rows."""
     B = (np.eye(n, k=-1) + 4 * np.eye(n) + np.eye(n, k=1)) / 6
     B[[0, -1]] = np.eye(n)[[0, -1]]
     return np.linalg.inv(B)
 
 
-def _kept_noise(t):
+def _remaining_noise(t: Pixels) -> Pixels:
     """κ: variance of interpolated white noise of variance 1, t from a pixel, along one axis."""
+    # the prefilter's response √3·(√3 − 2)^|k|; 0.27²⁴ is rounding
     k = np.arange(-24, 25)
     response = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(k)
-    own = np.correlate(response, response, "full")[2 * 24 :][:4]
+    correlation = np.correlate(response, response, "full")[2 * 24 :][:4]
     w = _spline_weights(t)
-    return sum(own[abs(i - j)] * a * b for i, a in enumerate(w) for j, b in enumerate(w))
+    pairs = ((i, a, j, b) for i, a in enumerate(w) for j, b in enumerate(w))
+    return sum((correlation[abs(i - j)] * a * b for i, a, j, b in pairs), jnp.zeros_like(t))
 
 
-def _bend(p, J, v, variance, bend, x, y, reach):
+def _bend(
+    p: Unknowns,
+    J: Float[Array, "n*n 8"],
+    v: Pixels,
+    variance: Scalar,
+    bend: Scalar,
+    x: Pixels,
+    y: Pixels,
+    reach: int,
+    min_pivot: float,
+) -> tuple[Unknowns, Normal]:
     """The unknowns after a step that includes terms of second order, observed as 0 ± `bend`, and
     their covariance from correlated residuals."""
     x, y = x / jnp.max(x), y / jnp.max(y)
@@ -247,30 +293,26 @@ def _bend(p, J, v, variance, bend, x, y, reach):
     # in units of their σ: of size 0 if there are none
     J = jnp.column_stack([J, *(bend * column for column in second)])
     weight = jnp.diag(variance * np.repeat([0, 1], [UNKNOWNS, len(second)]).astype(J.dtype))
-    Q, _ = _inverse(J.T @ J + weight)
+    Q, _ = _inverse(J.T @ J + weight, min_pivot)
     step = Q @ (J.T @ v)
-    C = Q @ (_gather(J * (v - J @ step)[:, None], reach) + weight**2) @ Q
+    g, n = J * (v - J @ step)[:, None], round(len(v) ** 0.5)
+    K = lambda d: np.maximum(1 - np.abs(d) / reach, 0)
+    C = Q @ (_sum_over_pairs(g, n, K) + weight**2) @ Q
     return p - step[:UNKNOWNS], C[:UNKNOWNS, :UNKNOWNS]
 
 
-def _gather(g, reach):
-    """Σ K(d)·g(x)·g(x + d)ᵀ over a square window."""
-    n = round(len(g) ** 0.5)
+def _sum_over_pairs(
+    g: Float[Array, "n*n k"], n: int, K: Callable[[np.ndarray], np.ndarray]
+) -> Float[Array, "k k"]:
+    """Σ K(dx)·K(dy)·g(x)·g(x + d)ᵀ over a window of n × n pixels; K separates, so that it takes 2·n
+    products a pixel instead of n²."""
     k = np.arange(n)
-    K = jnp.asarray(np.maximum(1 - np.abs(k[:, None] - k) / reach, 0), g.dtype)
-    near = jnp.einsum("ab,cd,bdp->acp", K, K, g.reshape(n, n, -1))
+    weight = jnp.asarray(K(k[:, None] - k), g.dtype)
+    near = jnp.einsum("ab,cd,bdp->acp", weight, weight, g.reshape(n, n, -1))
     return g.T @ near.reshape(g.shape)
 
 
-def _correlate(J, n, blur):
-    """JᵀRJ of a window of n × n pixels."""
-    k = np.arange(n)
-    K = jnp.asarray(np.exp(-((k[:, None] - k) ** 2) / (4 * blur**2)), J.dtype)
-    smooth = jnp.einsum("ab,cd,bdp->acp", K, K, J.reshape(n, n, UNKNOWNS))
-    return J.T @ smooth.reshape(J.shape)
-
-
-def _of_noise(contrast2, size, x, y, blur):
+def _expect_noise(contrast2: Scalar, size: Unknowns, x: Pixels, y: Pixels, blur: float) -> Normal:
     """E JₙᵀJₙ for residuals of variance 1, for the share of the other image."""
     one, nil = jnp.ones_like(x), jnp.zeros_like(x)
     slope = jnp.sqrt(contrast2 / (1 + contrast2) / (2 * blur**2))
@@ -280,32 +322,40 @@ def _of_noise(contrast2, size, x, y, blur):
     return u.T @ u + v.T @ v + contrast
 
 
-def _interpolated_noise(p, size, x, y):
-    """½·Σκ(u)·κ(v) over a window."""
-    a = p / size
+def _white_noise(
+    p: Unknowns,
+    Q: Normal,
+    determined: Bool[Array, ""],
+    variance: Scalar,
+    contrast2: Scalar,
+    window: tuple[Unknowns, Pixels, Pixels],
+) -> tuple[Normal, Unknowns]:
+    """C from equal white noise in both windows, and what p is drawn between the pixels."""
+    size, x, y = window
     fraction = lambda u: u - jnp.floor(jax.lax.stop_gradient(u))
-    u, v = fraction(a[0] * x + a[1] * y + a[2]), fraction(a[3] * x + a[4] * y + a[5])
-    return jnp.sum(_kept_noise(u) * _kept_noise(v)) / 2
+
+    def interpolated_noise(p: Unknowns) -> Float[Array, ""]:
+        """½·Σκ(u)·κ(v) over the window."""
+        a = p / size
+        u, v = fraction(a[0] * x + a[1] * y + a[2]), fraction(a[3] * x + a[4] * y + a[5])
+        return jnp.sum(_remaining_noise(u) * _remaining_noise(v)) / 2
+
+    remaining, pull = jax.value_and_grad(interpolated_noise)(p)
+    noise = variance / (1 + contrast2 * remaining / (len(x) / 2))
+    drawn = contrast2 * noise * jnp.where(determined, Q @ pull, 0)
+    return noise * (1 + contrast2) * Q, drawn
 
 
-def _compute(p, image, x, y):
+def _compute(
+    p: Unknowns, image: Float[Array, "rows columns"], x: Scalar, y: Scalar
+) -> Float[Array, ""]:
     """h0 + h1·g2 of one pixel of the window."""
     return p[6] + p[7] * grey_value(image, p[0] * x + p[1] * y + p[2], p[3] * x + p[4] * y + p[5])
 
 
-def _window(n, dtype):
-    """x, y of the pixels of a window."""
-    offset = jnp.arange(n, dtype=dtype) - n // 2
-    y, x = jnp.meshgrid(offset, offset, indexing="ij")
-    return x.ravel(), y.ravel()
-
-
-def _corners(n, dtype):
-    h = n // 2
-    return jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], dtype)
-
-
-def _with_radiometry(start, image, grey, x, y):
+def _with_radiometry(
+    start: Float[AnyArray, "2 3"], image: Float[Array, "rows columns"], x: Pixels, y: Pixels
+) -> Unknowns:
     """The eight unknowns: A, and h0, h1 from the mean and the variance of the covered pixels."""
     u, v = start @ jnp.stack([x, y, jnp.ones_like(x)])
     covered = jax.vmap(grey_value, (None, 0, 0))(image, u, v)
@@ -314,38 +364,61 @@ def _with_radiometry(start, image, grey, x, y):
     return jnp.concatenate([start.ravel(), jnp.stack([-h1 * jnp.mean(covered), h1])])
 
 
-def _minimise(normal_equations, begin, steps):
-    """The unknowns, N, vᵀv, and whether they still change, after damped steps."""
+def _minimise(
+    computed: Callable[[Unknowns], Pixels],
+    grey: Pixels,
+    begin: Unknowns,
+    steps: int,
+    settings: LeastSquaresSettings,
+) -> tuple[Unknowns, Normal, Scalar, Bool[Array, ""]]:
+    """The unknowns, N, vᵀv, and whether they still change, after damped steps.
 
-    def improve(state):
+    Marquardt's own rule (1963), λ by tenfold: a step is accepted if vᵀv does not grow, and the
+    position decides about the end, in pixels. The engine (`leastsquares/iterations/loop.py`)
+    accepts by the gain ratio and ends by the σ of the unknowns; its limits for rounding are those
+    of 64 bits, whereas windows are matched in 32. Measured on 512 windows of 17 × 17 pixels in
+    pieces of 41 × 41, stopping at 0.1 σ: the same RMS error, 0.016 pixel, and the same time, 0.40
+    ms against 0.43 here; from starts up to 2.5 pixels off it loses 6 matches, this rule 3. At 0.01
+    σ it loses 6 of the near ones to rounding.
+    """
+
+    def normal_equations(p: Unknowns) -> tuple[Normal, Unknowns, Scalar]:
+        # forward, and stored: in reverse, or within the products, grey values are looked up again
+        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
+        return J.T @ J, J.T @ v, v @ v
+
+    def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
         count, p, N, g, square, damping, moving = state
         # undetermined unknowns do not change: a unit diagonal, and a small addition
-        scale = 1 / jnp.sqrt(jnp.diag(N) + TINY)
+        scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)
         scaled = N * scale * scale[:, None] + damping * jnp.eye(UNKNOWNS, dtype=N.dtype)
         step = -scale * cho_solve(cho_factor(scaled), scale * g)
         N1, g1, square1 = normal_equations(p + step)
         better = square1 <= square
         new = (p + step, N1, g1, square1)
-        kept = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
-        still = jnp.max(jnp.abs(step[:6])) < LAST_STEP
+        accepted = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
+        still = jnp.max(jnp.abs(step[:6])) < settings.last_step
         rate = jnp.where(better, 0.1, 10.0).astype(damping.dtype)
-        return count + 1, *kept, jnp.maximum(damping * rate, 1e-6), moving & ~still
+        damping = jnp.maximum(damping * rate, settings.min_damping)
+        return count + 1, *accepted, damping, moving & ~still
 
-    def goes_on(state):
-        return (state[0] < steps) & state[-1]
-
-    start = (0, begin, *normal_equations(begin), jnp.asarray(1e-3, begin.dtype), jnp.asarray(True))
-    _, p, N, _, square, _, moving = jax.lax.while_loop(goes_on, improve, start)
+    damping = jnp.asarray(settings.damping, begin.dtype)
+    start = (0, begin, *normal_equations(begin), damping, jnp.asarray(True))
+    _, p, N, _, square, _, moving = jax.lax.while_loop(
+        lambda state: (state[0] < steps) & state[-1], improve, start
+    )
     return p, N, square, moving
 
 
-def _inverse(N):
+def _inverse(
+    N: Float[Array, "k k"], min_pivot: float
+) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
     """N⁻¹, and whether N determines everything."""
-    scale = 1 / jnp.sqrt(jnp.diag(N) + TINY)
+    scale = 1 / jnp.sqrt(jnp.diag(N) + 1e-20)
     scaled = N * scale * scale[:, None]
     factor = cho_factor(scaled)
     least = jnp.min(jnp.diag(factor[0]) ** 2)
-    determined = jnp.isfinite(least) & (least > SMALLEST_PIVOT)
+    determined = jnp.isfinite(least) & (least > min_pivot)
     eye = jnp.eye(len(N), dtype=N.dtype)
     safe = jnp.where(determined, scaled, eye)
     return cho_solve(cho_factor(safe), eye) * scale * scale[:, None], determined

@@ -14,32 +14,55 @@ A marker is expected in a light margin of at least one of its cells, as it is de
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Real
 
-from jaxbundle.measure.corner_quality import LARGEST_SIGMA, NO_EDGE, TOO_SMALL
-from jaxbundle.measure.straight_edges import EdgeFits, Edges, fit_edges, take
+from jaxbundle.measure.corner_quality import MAX_SIGMA, NO_EDGE, TOO_SMALL
+from jaxbundle.measure.straight_edges import EdgeFits, EdgeSettings, StraightEdges, fit_edges, take
 
-NARROWEST = 2.0
-"""Narrowest strip, a cell of the marker or of its margin, in τ: below, blurred edges are one."""
-NARROW, NARROW_OBLIQUE = 0.5, 1.0
-"""σ, in τ, of what the model neglects in strips of a width of one τ; it decreases by
-exp(−(width/τ)²/2). The second is multiplied by the cosine of the angle between adjacent sides.
-Found on rendered markers."""
-SURE = 4.0
-"""A strip of this width, in τ, hardly depends on how well its place is known."""
-FIRST_BLUR = 0.8
-"""τ before it is estimated: a lens in focus, and the pixel."""
-CELL_FOR_SHIFT = 7.0
-"""Cells at least as wide as this, in τ, show the shift of edges: 2·2.7 at the ends of an edge are
-left out."""
-FEWEST_INNER_EDGES, MOST_INNER_EDGES = 8, 100
-"""Edges between cells that determine it, and are enough."""
-GROUPS = (12, 24, 48)
-"""Limits of lengths, pixels, of edges that are fitted together."""
-CURVATURE = 0.5
-"""Prior σ of the curvature of a straight line's image, times the longer side of the image: with
-radial distortion k1 a line at the distance d from the centre has 2·k1·d/f²; 0.2·1/f for k1 =
-0.2."""
+Grey = Real[np.ndarray, "rows columns"]
+Quadrilaterals = Float[np.ndarray, "markers 4 2"]
+
+
+@dataclasses.dataclass(frozen=True)
+class MarkerSettings:
+    """How the sides of markers are fitted, and which corners are too uncertain.
+
+    Half and double were tried as for `EdgeSettings`; what has no figures below changes nothing in
+    markers of 15 pixels a side and more, but decides about smaller ones.
+
+    **Fields:**
+
+    - `edges`: of the fits of the sides; its `blur_in_focus` is also the first τ of every marker.
+    - `min_strip`: narrowest strip, a cell of the marker or of its margin, in τ: below, blurred
+      edges are one.
+    - `neglected`, `neglected_oblique`: σ, in τ, of what the model neglects in strips of a width of
+      one τ; it decreases by exp(−(width/τ)²/2). The second is multiplied by the cosine of the angle
+      between adjacent sides. Found on rendered markers, so that normalised errors have an RMS of 1.
+    - `wide_strip`: a strip of this width, in τ, hardly depends on how well its place is known:
+      exp(−4²/2) = 0.03 %. Markers with narrower ones are fitted once more (double: RMS 0.0138 for
+      a third fit of all).
+    - `shift_cell`: cells at least as wide as this, in τ, show the shift of edges: twice `clearance`
+      of the edges, at both ends, is left out (double, so that fewer markers are corrected: 0.0147,
+      with grey values proportional to light).
+    - `min_shift_edges`, `max_shift_edges`: edges between cells that determine it, and are enough:
+      σ decreases by their root.
+    - `lengths`: limits, pixels, of edges that are fitted together, so that arrays have little
+      padding; they change only the time.
+    - `curvature`: prior σ of the curvature of a straight line's image, times the longer side of the
+      image: with radial distortion k1 a line at the distance d from the centre has 2·k1·d/f²;
+      0.2·1/f for k1 = 0.2.
+    """
+
+    edges: EdgeSettings = EdgeSettings()
+    min_strip: float = 2.0
+    neglected: float = 0.5
+    neglected_oblique: float = 1.0
+    wide_strip: float = 4.0
+    shift_cell: float = 7.0
+    min_shift_edges: int = 8
+    max_shift_edges: int = 100
+    lengths: tuple[int, ...] = (12, 24, 48)
+    curvature: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,14 +71,26 @@ class MarkerCorners:
 
     xy: Float[np.ndarray, "markers 4 2"]
     covariance: Float[np.ndarray, "markers 4 2 2"]
-    why: np.ndarray
+    why: np.ndarray  # of str
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fitting:
+    """What all fits of a call have in common: the photograph, the border of the markers, σ of the
+    curvature, pixels⁻¹, and the settings."""
+
+    grey: Grey
+    border: int
+    curvature: float
+    settings: MarkerSettings
 
 
 def fit_marker_corners(
-    grey: np.ndarray,
-    near: Float[np.ndarray, "markers 4 2"],
-    cells: Float[np.ndarray, "markers cells cells"],
+    grey: Grey,
+    near: Quadrilaterals,
+    cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
     border: int,
+    settings: MarkerSettings | None = None,
 ) -> MarkerCorners:
     """The corners of markers found in a photograph.
 
@@ -63,70 +98,117 @@ def fit_marker_corners(
     marker; `cells`: 1 for light and 0 for dark cells of the marker, with its `border`, their
     number.
     """
+    settings = settings or MarkerSettings()
+    fitting = _Fitting(grey, border, settings.curvature / max(grey.shape), settings)
     number = len(near)
     xy = np.asarray(near, float)
-    blur = np.full((number, 4), FIRST_BLUR)
-    curvature = CURVATURE / max(grey.shape)
+    blur = np.full((number, 4), settings.edges.blur_in_focus)
+    # first from the detected corners, a few pixels off, then from the ones of the first fit
     for coarse in (True, False):
-        edges, fits, xy, covariance = _fit_sides(grey, xy, cells, border, blur, curvature, coarse)
-        before, blur = blur, _blur_of(fits)
+        edges, fits, xy, covariance = _fit_sides(fitting, xy, cells, blur, coarse)
+        # one lens, one distance: τ of a marker is the median over its sides
+        own = fits.blur.reshape(-1, 4)
+        before, blur = blur, np.repeat(np.median(own, axis=1), 4).reshape(own.shape)
         lost = ~_is_near(xy, near)
         xy[lost] = near[lost]
     # where the cells are narrow, or the blur was not the expected one, once more from there
     strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
-    again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < SURE * blur)).any(1)
+    again = ((np.abs(np.log(blur / before)) > 0.2) | (strip < settings.wide_strip * blur)).any(1)
     if again.any():
-        of = np.repeat(again, 4)
-        parts = _fit_sides(grey, xy[again], cells[again], border, blur[again], curvature, False)
-        _put(edges, of, parts[0])
-        _put(fits, of, parts[1])
+        sides = np.repeat(again, 4)
+        parts = _fit_sides(fitting, xy[again], cells[again], blur[again], False)
+        _put(edges, sides, parts[0])
+        _put(fits, sides, parts[1])
         xy[again], covariance[again] = parts[2:]
         lost |= ~_is_near(xy, near)
         xy[lost] = near[lost]
-    shift = edge_shift(grey, xy, cells, fits, curvature)
+    shift = edge_shift(fitting, xy, cells, fits)
     if shift is not None:
-        fits = _shifted(fits, *shift)
-        xy, covariance = _intersect(edges, _with_model_errors(edges, fits), number)
-    strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
-    solved = (fits.solved & _alike(fits, number)).reshape(number, 4)
-    why = np.full((number, 4), "", dtype=object)
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(np.nan_to_num(covariance, nan=1e9))[..., 1], 0))
-    why[~(sigma <= LARGEST_SIGMA)] = TOO_SMALL
-    why[~(solved & np.roll(solved, 1, 1))] = NO_EDGE
-    narrow = (strip < NARROWEST).reshape(number, 4)
-    why[narrow | np.roll(narrow, 1, 1)] = TOO_SMALL
-    why[~_is_near(xy, near)] = NO_EDGE
-    why[lost] = NO_EDGE
+        # the sides back outwards, by a shift in τ towards the dark side
+        fits.curve[:, 0] -= shift[0] * fits.blur
+        fits.covariance[:, 0, 0] += (shift[1] * fits.blur) ** 2
+        xy, covariance = _intersect(edges, _with_model_errors(edges, fits, settings), number)
+    why = _find_reasons(edges, fits, covariance, settings)
+    why[~_is_near(xy, near) | lost] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
 
 
-def _is_near(xy, near):
+def _find_reasons(
+    edges: StraightEdges,
+    fits: EdgeFits,
+    covariance: Float[np.ndarray, "markers 4 2 2"],
+    settings: MarkerSettings,
+) -> np.ndarray:
+    """Why corners [markers, 4] are left out, or "": each is of two sides, its own and the one
+    before."""
+    number = len(covariance)
+    strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
+    # a side with another contrast than the marker: another edge was met
+    contrast = fits.contrast.reshape(number, 4)
+    usual = np.median(contrast, axis=1, keepdims=True)
+    solved = fits.solved.reshape(number, 4) & (np.abs(contrast - usual) < 0.4 * np.abs(usual))
+    why = np.full((number, 4), "", dtype=object)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(np.nan_to_num(covariance, nan=1e9))[..., 1], 0))
+    why[~(sigma <= MAX_SIGMA)] = TOO_SMALL
+    why[~(solved & np.roll(solved, 1, 1))] = NO_EDGE
+    narrow = (strip < settings.min_strip).reshape(number, 4)
+    why[narrow | np.roll(narrow, 1, 1)] = TOO_SMALL
+    return why
+
+
+def _is_near(xy: Quadrilaterals, near: Quadrilaterals) -> Bool[np.ndarray, "markers 4"]:
     """Whether corners are where the marker was found: within 2.5 pixels or a seventh of its side,
     less than a cell."""
     side = np.linalg.norm(near - np.roll(near, 1, 1), axis=2).min(1)
     return np.linalg.norm(xy - near, axis=2) < np.maximum(side / 7, 2.5)[:, None]
 
 
-def _fit_sides(grey, xy, cells, border, blur, curvature, coarse):
+def _fit_sides(
+    fitting: _Fitting,
+    xy: Quadrilaterals,
+    cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
+    blur: Float[np.ndarray, "markers 4"],
+    coarse: bool,
+) -> tuple[StraightEdges, EdgeFits, Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
     """The sides of markers whose corners are expected at `xy`: edges, fits, corners, covariance."""
-    edges = _sides_of(xy, cells, border)
-    fits = _fit_by_length(grey, edges, blur.ravel(), curvature, coarse)
-    return edges, fits, *_intersect(edges, _with_model_errors(edges, fits), len(xy))
+    edges, settings = _sides_of(xy, cells, fitting.border), fitting.settings
+    # in groups of similar length, so that arrays have little padding
+    group, parts, order = np.digitize(2 * edges.half, settings.lengths), [], []
+    for g in np.unique(group):
+        rows = np.flatnonzero(group == g)
+        order.append(rows)
+        parts.append(
+            fit_edges(
+                fitting.grey,
+                take(edges, rows),
+                blur.ravel()[rows],
+                fitting.curvature,
+                settings.edges,
+                coarse,
+            )
+        )
+    back = np.argsort(np.concatenate(order))
+    names = (field.name for field in dataclasses.fields(EdgeFits))
+    fits = EdgeFits(*(np.concatenate([getattr(p, name) for p in parts])[back] for name in names))
+    return edges, fits, *_intersect(edges, _with_model_errors(edges, fits, settings), len(xy))
 
 
-def _blur_of(fits: EdgeFits):
-    """τ of the markers, for each of their sides."""
-    blur = fits.blur.reshape(-1, 4)
-    return np.repeat(np.median(blur, axis=1), 4).reshape(blur.shape)
-
-
-def _put(whole, rows, part) -> None:
+def _put(
+    whole: StraightEdges | EdgeFits,
+    rows: Bool[np.ndarray, " sides"],
+    part: StraightEdges | EdgeFits,
+) -> None:
     """Replace some rows of the arrays of a dataclass."""
     for field in dataclasses.fields(whole):
         getattr(whole, field.name)[rows] = getattr(part, field.name)
 
 
-def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float] | None:
+def edge_shift(
+    fitting: _Fitting,
+    xy: Quadrilaterals,
+    cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
+    fits: EdgeFits,
+) -> tuple[float, float] | None:
     """The shift of edges towards their dark side in τ (of inverted markers their light side, which
     is negative), and its σ; None if the markers are too small.
 
@@ -140,16 +222,16 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
 
     δ is proportional to τ: the mean of a/(τ·(…)) over the inner edges of the largest markers.
     """
-    n, number = cells.shape[1], len(xy)
+    n, number, settings = cells.shape[1], len(xy), fitting.settings
     blur = np.median(fits.blur.reshape(number, 4), axis=1)
     side = np.linalg.norm(xy - np.roll(xy, 1, 1), axis=2).min(1)
-    ready = fits.solved.reshape(number, 4).all(1) & (side / n > CELL_FOR_SHIFT * blur)
+    ready = fits.solved.reshape(number, 4).all(1) & (side / n > settings.shift_cell * blur)
     H = _homographies(xy, n)
     parts = []
     for marker in np.flatnonzero(ready)[np.argsort(-side[ready])]:
         bend = fits.curve.reshape(number, 4, 3)[marker, :, 2]
         parts.append(_inner_edges(marker, xy, cells[marker] > 0, H, bend))
-        if sum(len(part[0]) for part in parts) >= MOST_INNER_EDGES:
+        if sum(len(part[0]) for part in parts) >= settings.max_shift_edges:
             break
     if not parts:
         return None
@@ -157,7 +239,7 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     along = end - start
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     ends = np.zeros((len(start), 2))
-    inside = Edges(
+    inside = StraightEdges(
         start,
         end,
         np.stack([start, -across], 1),
@@ -169,23 +251,42 @@ def edge_shift(grey, xy, cells, fits: EdgeFits, curvature) -> tuple[float, float
     )
     for direction in (inside.before, inside.after):
         direction[:, 1] /= np.linalg.norm(direction[:, 1], axis=1)[:, None]
-    found = fit_edges(grey, inside, blur[marker], curvature)
+    found = fit_edges(fitting.grey, inside, blur[marker], fitting.curvature, settings.edges)
     shift = (found.curve[:, 0] - bent) / (found.blur * factor)
     sigma = np.sqrt(found.covariance[:, 0, 0]) / (found.blur * factor)
+    # shifts by gamma are of the order of τ/3: an edge of σ 0.5 says nothing; edges of the other
+    # sign of contrast are not the ones meant
     good = found.solved & (sigma < 0.5) & (found.contrast * fits.contrast[4 * marker] > 0)
-    if good.sum() < FEWEST_INNER_EDGES:
+    if good.sum() < settings.min_shift_edges:
         return None
+    return _robust_mean(shift, sigma, good)
+
+
+def _robust_mean(
+    shift: Float[np.ndarray, " edges"],
+    sigma: Float[np.ndarray, " edges"],
+    good: Bool[np.ndarray, " edges"],
+) -> tuple[float, float]:
+    """The mean of shifts without outliers, and its σ from their scatter."""
+    # outliers beyond 3.5 σ of the median, σ from the median deviation (1.4826 = 1/Φ⁻¹(¾)); 0.01 and
+    # 0.02 τ: what no photograph does better
     for _ in range(3):
         middle = np.median(shift[good])
         spread = 1.4826 * np.median(np.abs(shift[good] - middle)) + 0.01
-        good &= np.abs(shift - middle) < 3.5 * spread
+        good = good & (np.abs(shift - middle) < 3.5 * spread)
     weight = 1 / (sigma[good] ** 2 + 0.02**2)
     mean = weight @ shift[good] / weight.sum()
     scatter = weight @ (shift[good] - mean) ** 2 / weight.sum()
     return float(mean), float(np.sqrt(scatter / (good.sum() - 1)))
 
 
-def _inner_edges(marker, xy, light, H, bend):
+def _inner_edges(
+    marker: int,
+    xy: Quadrilaterals,
+    light: Bool[np.ndarray, "n n"],
+    H: Float[np.ndarray, "markers 3 3"],
+    bend: Float[np.ndarray, "4"],
+) -> tuple[np.ndarray, ...]:
     """Edges between light and dark cells of a marker, with the dark cell on the inner side: marker,
     start, end, factor 1 − s·(1 − 2·x/n), the part of a by the lens, narrowest cell.
 
@@ -217,8 +318,12 @@ def _inner_edges(marker, xy, light, H, bend):
         bent.append(s * (along * (1 - q**2) - mean * p * (p**2 + q**2 - 2)))
     start, end = (_image(H[marker : marker + 1], np.concatenate(x))[0] for x in (start, end))
     factor, bent = np.concatenate(factor), np.concatenate(bent)
-    useful = factor > 0.5
-    width = _narrowest(xy[marker]) / n
+    useful = factor > 0.5  # others hardly show the shift: the corners share it
+    # the smaller distance of opposite sides of the quadrilateral, roughly, over its cells
+    four = xy[marker]
+    a, b = four[2] - four[0], four[3] - four[1]
+    area = abs(a[0] * b[1] - a[1] * b[0]) / 2
+    width = area / np.linalg.norm(four - np.roll(four, 1, 0), axis=1).max() / n
     number = int(useful.sum())
     return (
         np.full(number, marker),
@@ -230,41 +335,23 @@ def _inner_edges(marker, xy, light, H, bend):
     )
 
 
-def _narrowest(four):
-    """The smaller distance of opposite sides of a quadrilateral, roughly."""
-    a, b = four[2] - four[0], four[3] - four[1]
-    area = abs(a[0] * b[1] - a[1] * b[0]) / 2
-    return area / np.linalg.norm(four - np.roll(four, 1, 0), axis=1).max()
-
-
-def _shifted(fits: EdgeFits, shift, sigma) -> EdgeFits:
-    """Sides moved back outwards by a shift towards the dark side, in τ."""
-    curve, covariance = fits.curve.copy(), fits.covariance.copy()
-    curve[:, 0] -= shift * fits.blur
-    covariance[:, 0, 0] += (sigma * fits.blur) ** 2
-    return dataclasses.replace(fits, curve=curve, covariance=covariance)
-
-
-def _with_model_errors(edges: Edges, fits: EdgeFits) -> EdgeFits:
+def _with_model_errors(edges: StraightEdges, fits: EdgeFits, settings: MarkerSettings) -> EdgeFits:
     """The fits with the σ of what the model neglects in narrow strips added to a."""
     strip = np.minimum(edges.inner, edges.outer).min(1) / fits.blur
     oblique = np.abs(
         [np.einsum("ni,ni->n", near[:, 1], edges.along) for near in (edges.before, edges.after)]
     ).max(0)
-    neglected = fits.blur * (NARROW + NARROW_OBLIQUE * oblique) * np.exp(-(strip**2) / 2)
+    neglected = settings.neglected + settings.neglected_oblique * oblique
     covariance = fits.covariance.copy()
-    covariance[:, 0, 0] += neglected**2
+    covariance[:, 0, 0] += (fits.blur * neglected * np.exp(-(strip**2) / 2)) ** 2
     return dataclasses.replace(fits, covariance=covariance)
 
 
-def _alike(fits: EdgeFits, number):
-    """Whether a side has the contrast of the marker: another edge may have been met."""
-    contrast = fits.contrast.reshape(number, 4)
-    usual = np.median(contrast, axis=1, keepdims=True)
-    return (np.abs(contrast - usual) < 0.4 * np.abs(usual)).ravel()
-
-
-def _sides_of(xy, cells, border) -> Edges:
+def _sides_of(
+    xy: Quadrilaterals,
+    cells: Float[np.ndarray, "markers cells cells"] | Bool[np.ndarray, "markers cells cells"],
+    border: int,
+) -> StraightEdges:
     """The sides of markers as edges: upper, right, lower, left; each from corner k to k + 1."""
     n = cells.shape[1]
     following = np.roll(xy, -1, axis=1)
@@ -283,7 +370,13 @@ def _sides_of(xy, cells, border) -> Edges:
         middle = (xy[:, k] + following[:, k]) / 2
         half = np.linalg.norm(following[:, k] - xy[:, k], axis=1)[:, None] / 2
 
-        def along_and_inside(t, depth, k=k, middle=middle, half=half):
+        def along_and_inside(
+            t: Float[np.ndarray, " n"],
+            depth: float,
+            k: int = k,
+            middle: Float[np.ndarray, "markers 2"] = middle,
+            half: Float[np.ndarray, "markers 1"] = half,
+        ) -> tuple[Float[np.ndarray, "markers n"], Float[np.ndarray, "markers n"]]:
             away = _image(H, _on_side(k, n, t, depth)) - middle[:, None]
             return (
                 np.einsum("mti,mi->mt", away, along[:, k]) / half,
@@ -299,7 +392,7 @@ def _sides_of(xy, cells, border) -> Edges:
         far.append(along_and_inside(ticks, border)[0])
         level.append(turned[:, border].astype(float))
     flat = lambda x: np.stack(x, 1).reshape(4 * len(xy), -1)
-    return Edges(
+    return StraightEdges(
         xy.reshape(-1, 2),
         following.reshape(-1, 2),
         before.reshape(-1, 2, 2),
@@ -311,14 +404,14 @@ def _sides_of(xy, cells, border) -> Edges:
     )
 
 
-def _on_side(k, n, t, depth):
+def _on_side(k: int, n: int, t: Float[np.ndarray, " n"], depth: float) -> Float[np.ndarray, "n 2"]:
     """Points of the marker's plane, 0 … n, at t along the side k and `depth` inside."""
     t = np.asarray(t, float)
     d = np.full_like(t, depth)
     return np.stack(((t, d), (n - d, t), (n - t, n - d), (d, n - t))[k], -1)
 
 
-def _homographies(xy, n):
+def _homographies(xy: Quadrilaterals, n: int) -> Float[np.ndarray, "markers 3 3"]:
     """Homographies [markers, 3, 3] from the marker's plane, a square of n × n cells."""
     corners = n * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     A = np.zeros((len(xy), 8, 8))
@@ -333,34 +426,20 @@ def _homographies(xy, n):
     return np.concatenate([h, np.ones((len(xy), 1))], 1).reshape(-1, 3, 3)
 
 
-def _image(H, points):
+def _image(
+    H: Float[np.ndarray, "markers 3 3"], points: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "markers n 2"]:
     """Images [markers, n, 2] of points [n, 2]."""
     image = np.einsum("mij,tj->mti", H, np.concatenate([points, np.ones((len(points), 1))], 1))
     return image[..., :2] / image[..., 2:]
 
 
-def _fit_by_length(grey, edges: Edges, blur, curvature, coarse) -> EdgeFits:
-    """The edges fitted in groups of similar length, so that arrays have little padding."""
-    length = 2 * edges.half
-    group = np.digitize(length, GROUPS)
-    parts, order = [], []
-    for g in np.unique(group):
-        rows = np.flatnonzero(group == g)
-        order.append(rows)
-        parts.append(fit_edges(grey, take(edges, rows), blur[rows], curvature, coarse))
-    back = np.argsort(np.concatenate(order))
-    return EdgeFits(
-        *(
-            np.concatenate([getattr(part, field.name) for part in parts])[back]
-            for field in dataclasses.fields(EdgeFits)
-        )
-    )
-
-
-def _intersect(edges: Edges, fits: EdgeFits, number: int):
+def _intersect(
+    edges: StraightEdges, fits: EdgeFits, number: int
+) -> tuple[Quadrilaterals, Float[np.ndarray, "markers 4 2 2"]]:
     """Corners [markers, 4, 2], corner k between the sides k − 1 and k, and their covariance."""
-    of = np.arange(4 * number).reshape(number, 4)
-    pair = np.stack([np.roll(of, 1, 1), of], 2)  # [markers, 4, 2 sides]
+    side = np.arange(4 * number).reshape(number, 4)
+    pair = np.stack([np.roll(side, 1, 1), side], 2)  # [markers, 4, 2 sides]
     middle, along, inward, half, curve, Q = (
         x[pair]
         for x in (edges.middle, edges.along, edges.inward, edges.half, fits.curve, fits.covariance)
@@ -373,7 +452,7 @@ def _intersect(edges: Edges, fits: EdgeFits, number: int):
         f = np.einsum("mksi,mksi->mks", away, inward) - np.einsum("mksi,mksi->mks", powers, curve)
         slope = (curve[..., 1] + 2 * curve[..., 2] * t) / half
         A = inward - slope[..., None] * along
-        parallel = np.abs(np.linalg.det(A)) < 0.05
+        parallel = np.abs(np.linalg.det(A)) < 0.05  # 3° between two sides
         A = np.where(parallel[..., None, None], np.eye(2), A)
         back = np.linalg.inv(A)
         step = np.einsum("mkis,mks->mki", back, f)

@@ -23,14 +23,9 @@ from jaxtyping import Array, Float, Real
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.measure.transfer import View, ground_point, image_point
+from jaxbundle.measure.transfer import View, ground_point, image_to_image
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
-
-STEP = 0.5
-"""Step of the heights, pixels of the other image."""
-FEWEST, MOST = 16, 4096
-"""Minimum and maximum number of heights."""
 
 
 @print_in_one_screen
@@ -82,9 +77,11 @@ def find_match(
         raise InputError(f"matching: the window at ({x:.1f}, {y:.1f}) is not within the base image")
     ends = np.asarray(_locus(view, other_view, place, jnp.array([Zmin, Zmax])))
     length = np.linalg.norm(ends[1] - ends[0])
-    steps = FEWEST if not np.isfinite(length) else math.ceil(length / STEP) + 1
-    # a power of two, so that points share compiled programs
-    steps = min(2 ** math.ceil(math.log2(max(steps, FEWEST))), MOST)
+    # Steps of half a pixel of the other image: ρ of a window is a peak of one to two pixels, whose
+    # top the parabola finds from three of them. Their number is a power of two, so that points
+    # share compiled programs; 4096 bound the time, for ends near the horizon.
+    steps = math.ceil(length / 0.5) + 1 if np.isfinite(length) else 1
+    steps = min(2 ** math.ceil(math.log2(max(steps, 16))), 4096)
     Z = jnp.linspace(Zmin, Zmax, steps)
     rho = np.asarray(_correlations(grey, other_grey, view, other_view, place, Z, half))
     best = int(np.nanargmax(rho)) if np.isfinite(rho).any() else -1
@@ -96,7 +93,7 @@ def find_match(
     return Match(found, point, float(rho[best]))
 
 
-def _peak(rho, best):
+def _peak(rho: Float[np.ndarray, " n"], best: int) -> float:
     """The vertex of a parabola through three neighbours, in steps from the middle one."""
     if not 0 < best < len(rho) - 1 or not np.isfinite(rho[best - 1 : best + 2]).all():
         return 0.0
@@ -108,31 +105,39 @@ def _peak(rho, best):
 _ground = compile_once(ground_point)
 
 
-def _carry(view, other_view, xy, Z):
-    return image_point(other_view, ground_point(view, xy, Z))
+@compile_once
+def _locus(
+    view: View, other_view: View, xy: Float[AnyArray, "2"], Z: Float[AnyArray, " n"]
+) -> Float[Array, "n 2"]:
+    return jax.vmap(lambda Z: image_to_image(view, xy, Z, other_view))(Z)
 
 
 @compile_once
-def _locus(view, other_view, xy, Z):
-    return jax.vmap(lambda Z: _carry(view, other_view, xy, Z))(Z)
-
-
-@compile_once
-def _correlations(base, other, view, other_view, xy, Z, half: int):
+def _correlations(
+    base: Float[AnyArray, "rows columns"],
+    other: Float[AnyArray, "other_rows other_columns"],
+    view: View,
+    other_view: View,
+    xy: Float[AnyArray, "2"],
+    Z: Float[AnyArray, " n"],
+    half: int,
+) -> Float[Array, " n"]:
     offset = jnp.arange(-half, half + 1.0)
     window = xy + jnp.stack(jnp.meshgrid(offset, offset), -1).reshape(-1, 2)
     grey = _sample(base, window)
     high = jnp.array(other.shape)[::-1] - 1
 
-    def one(Z):
-        places = jax.vmap(lambda place: _carry(view, other_view, place, Z))(window)
+    def correlate(Z: Float[Array, ""]) -> Float[Array, ""]:
+        places = jax.vmap(lambda place: image_to_image(view, place, Z, other_view))(window)
         inside = jnp.all((places >= 0) & (places <= high))
         rho = correlation(grey, _sample(other, jnp.where(inside, places, 0.0)))
         return jnp.where(inside, rho, jnp.nan)
 
-    return jax.lax.map(one, Z, batch_size=16)
+    return jax.lax.map(correlate, Z, batch_size=16)
 
 
-def _sample(grey, places):
+def _sample(
+    grey: Float[AnyArray, "rows columns"], places: Float[AnyArray, "n 2"]
+) -> Float[Array, " n"]:
     """Grey values between the pixels, bilinear."""
     return jax.scipy.ndimage.map_coordinates(grey, [places[:, 1], places[:, 0]], order=1)

@@ -10,19 +10,41 @@ import dataclasses
 
 import numpy as np
 import scipy  # its parts are loaded on use
+from jaxtyping import Bool, Float, Int, Real
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 
-FIRST, LARGEST = 8, 256
-"""Half a window, in pixels: the first, and the largest."""
-CONTRAST = 5.0
-"""Minimum difference of a target from its background, in σg."""
-LEAST_CONTRAST = 4.0
-"""Minimum difference of a target from its background, in grey values."""
-LEAST_PIXELS = 5
+Window = Float[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "rows columns"]
+
 MARGIN = 3
-"""Pixels of the blurred edge beyond the spot."""
+"""Pixels of the blurred edge beyond the spot: that of a lens a little out of focus, τ = 1 pixel, to
+3·τ. A spot whose margin is cut is not measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SpotSettings:
+    """What counts as a spot.
+
+    **Fields:**
+
+    - `first_half_window`, `last_half_window`: half of the side of the window about the given
+      position, pixels, doubled from the first to the last. The first: a position within a few
+      pixels, and small targets are found without a neighbour in the window; the last bounds the
+      time, and the size of a target to 500 pixels.
+    - `min_contrast_sigma`: difference of spot and background in σ of the noise. Otsu's threshold
+      always finds two classes: in noise alone, about 1.6 σ apart.
+    - `min_contrast`: the same in grey values, for images without noise (rendered, or smoothed by
+      compression), in which steps of one or two grey values remain; not critical.
+    - `min_pixels`: of a spot; with fewer there is no shape.
+    """
+
+    first_half_window: int = 8
+    last_half_window: int = 256
+    min_contrast_sigma: float = 5.0
+    min_contrast: float = 4.0
+    min_pixels: int = 5
 
 
 @print_in_one_screen
@@ -31,9 +53,9 @@ class Spot:
     """A spot in its window: the window's corner (column, row) in the photograph, grey values, the
     pixels of the spot, and the levels."""
 
-    corner: np.ndarray
-    grey: np.ndarray
-    inside: np.ndarray
+    corner: Int[np.ndarray, "2"]
+    grey: Window
+    inside: Mask
     background: float
     level: float
     threshold: float
@@ -44,25 +66,28 @@ class Spot:
         return self.level - self.background
 
 
-def find_spot(grey, near) -> Spot:
+def find_spot(
+    grey: Window, near: Float[np.ndarray, "2"], settings: SpotSettings | None = None
+) -> Spot:
     """The spot nearest to `near` (column, row) in `grey` [rows, columns].
 
     **Raises:** `InputError` if none stands out, or it is cut by the edge of the image.
     """
+    settings = settings or SpotSettings()
     where = f"at ({near[0]:.1f}, {near[1]:.1f})"
     rows, columns = grey.shape
     if not (0 <= near[0] < columns and 0 <= near[1] < rows):
         raise InputError(f"{where}: outside the image of {columns} × {rows} pixels")
     why = "no target stands out from its surroundings"
-    half = FIRST
-    while half <= LARGEST:
+    half = settings.first_half_window
+    while half <= settings.last_half_window:
         low = np.maximum(np.rint(near).astype(int) - half, 0)
         high = np.minimum(np.rint(near).astype(int) + half + 1, [columns, rows])
         window = grey[low[1] : high[1], low[0] : high[0]]
-        inside, threshold = _nearest_spot(window, near - low)
+        inside, threshold = _nearest_spot(window, near - low, settings)
         if inside is not None:
             if _ends_inside(inside):
-                return _levels(grey, low, window, inside, threshold)
+                return _levels(low, window, inside, threshold, settings)
             why = "the target reaches the edge of the image, or joins its surroundings"
         if (low == 0).all() and (high == [columns, rows]).all():
             break
@@ -70,17 +95,20 @@ def find_spot(grey, near) -> Spot:
     raise InputError(f"{where}: {why}")
 
 
-def _nearest_spot(window, near):
+def _nearest_spot(
+    window: Window, near: Float[np.ndarray, "2"], settings: SpotSettings
+) -> tuple[Mask | None, float]:
     """Pixels of the spot nearest to a position, and the threshold; None if there is none."""
     threshold = otsu(window)
     bright = window > threshold
     contrast = window[bright].mean() - window[~bright].mean() if bright.any() else 0.0
-    if contrast < max(CONTRAST * noise_of(window), LEAST_CONTRAST):
+    if contrast < max(settings.min_contrast_sigma * noise_of(window), settings.min_contrast):
         return None, threshold
+    # most of the rim of the window is background
     rim = np.concatenate([bright[0], bright[-1], bright[1:-1, 0], bright[1:-1, -1]])
     labels, number = scipy.ndimage.label(bright if rim.mean() < 0.5 else ~bright)
     sizes = scipy.ndimage.sum_labels(np.ones_like(window), labels, np.arange(1, number + 1))
-    large = np.flatnonzero(sizes >= LEAST_PIXELS) + 1
+    large = np.flatnonzero(sizes >= settings.min_pixels) + 1
     rows, columns = np.nonzero(np.isin(labels, large))
     if not len(rows):
         return None, threshold
@@ -89,7 +117,7 @@ def _nearest_spot(window, near):
     return scipy.ndimage.binary_fill_holes(inside), threshold
 
 
-def _ends_inside(inside) -> bool:
+def _ends_inside(inside: Mask) -> bool:
     """Whether the spot, including its blurred edge, is within the window."""
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
     free = min(
@@ -98,7 +126,13 @@ def _ends_inside(inside) -> bool:
     return free >= MARGIN
 
 
-def _levels(grey, low, window, inside, threshold) -> Spot:
+def _levels(
+    low: Int[np.ndarray, "2"],
+    window: Window,
+    inside: Mask,
+    threshold: float,
+    settings: SpotSettings,
+) -> Spot:
     """The spot in the smallest window around it, with the levels of target and background."""
     rows, columns = np.nonzero(inside)
     room = 2 * MARGIN
@@ -107,16 +141,18 @@ def _levels(grey, low, window, inside, threshold) -> Spot:
     cut = (slice(first[1], last[1]), slice(first[0], last[0]))
     window, inside = window[cut], inside[cut]
     bright = window[inside].mean() > window[~inside].mean()
+    # the level of the target two pixels within it, where the blurred edge ends; a spot that small
+    # is nowhere at its level, which is then between its middle and its extreme
     core = inside & ~scipy.ndimage.binary_dilation(~inside, iterations=2)
     level = (
         np.median(window[core])
-        if core.sum() >= LEAST_PIXELS
+        if core.sum() >= settings.min_pixels
         else np.quantile(window[inside], 0.9 if bright else 0.1)
     )
+    # the background from a ring of two pixels beyond the blurred edge, without neighbours
     around = scipy.ndimage.binary_dilation(inside, iterations=MARGIN + 2)
     around &= ~scipy.ndimage.binary_dilation(inside, iterations=MARGIN)
-    own = window > threshold if bright else window < threshold
-    around &= ~own
+    around &= ~(window > threshold if bright else window < threshold)
     background = np.median(window[around]) if around.any() else np.median(window[~inside])
     return Spot(
         low + first,
@@ -129,7 +165,7 @@ def _levels(grey, low, window, inside, threshold) -> Spot:
     )
 
 
-def otsu(grey) -> float:
+def otsu(grey: Real[np.ndarray, "rows columns"]) -> float:
     """The threshold that makes the two classes of grey values differ most (Otsu, 1979)."""
     low, high = float(grey.min()), float(grey.max())
     counts, edges = np.histogram(grey, 256, (low, max(high, low + 1e-9)))
@@ -138,15 +174,18 @@ def otsu(grey) -> float:
     above = below[-1] - below
     with np.errstate(divide="ignore", invalid="ignore"):
         between = below * above * (total / below - (total[-1] - total) / above) ** 2
+    # between two peaks all empty bins are equally good: their middle
     best = np.flatnonzero(between >= np.nanmax(between, initial=0.0) * (1 - 1e-12))
     return float(edges[1:][best].mean()) if len(best) else low
 
 
-def noise_of(grey) -> float:
+def noise_of(grey: Real[np.ndarray, "rows columns"]) -> float:
     """σ of the noise of the grey values (Immerkær, 1996, with the median instead of the mean, since
     edges are outliers); at least that of rounding to whole grey values, 1/√12."""
     if min(grey.shape) < 3:
         return 12**-0.5
+    # Laplacian of the Laplacian: 0 for linear and quadratic changes; its σ in noise of σ 1 is
+    # √36 = 6, and 0.6745 the median of |x| of a normal x
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
     response = scipy.ndimage.convolve(grey, mask)[1:-1, 1:-1]
     return max(float(np.median(np.abs(response)) / (6 * 0.6745)), 12**-0.5)

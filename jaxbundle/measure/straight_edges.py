@@ -25,35 +25,56 @@ import dataclasses
 
 import numpy as np
 import scipy  # its parts are loaded on use
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Real
 
 from jaxbundle.measure.grey_value_fit import noise_of_residuals, normal_equations
 
-IN_FOCUS = 0.8
-"""τ of a lens in focus, and the pixel: expected with a σ of a factor of e."""
-COLUMNS = 32
-"""Most rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a quarter and
-take twice the time."""
-REACH = 3.5
-"""Pixels are used to this distance from the edge, in τ, and one pixel more: the step is
-complete."""
-CLEAR = 2.7
-"""Distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is left."""
-DENSITY = np.float32((2 * np.pi) ** -0.5)
-PARTS = 12
-"""Parts of an edge that are compared, and left out singly."""
-OUTLIER = 3.5
-"""Limit of a part's shift in its standard deviations."""
-SHARPEST, SOFTEST = 0.35, 4.0
-"""Limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29."""
-STEPS, CONVERGED = 8, 3e-3
-"""Most steps, and the change of nearly all edges, in pixels, after which the next is negligible."""
+Theta = Float[np.ndarray, "n 9"]
+"""The unknowns of edges, in the order of `UNKNOWNS`."""
 UNKNOWNS = 9
 """a, b, c, W at the middle, its change to the end, the same of B, V, ln τ."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Edges:
+class EdgeSettings:
+    """How edges are fitted to the grey values beside them.
+
+    Half and double were tried on rendered markers (`tests/measure/test_corner_accuracy.py`), 48
+    corners with an RMS error of 0.0162 pixel and error/σ 1.04; what has no figures below hardly
+    changes either.
+
+    **Fields:**
+
+    - `blur_in_focus`: τ of a lens in focus, and the pixel: expected with a σ of a factor of e.
+    - `min_blur`, `max_blur`: limits of τ, pixels: a pixel's area alone has 1/√12 = 0.29, and the
+      step of a blur of 4 is 30 pixels wide.
+    - `max_columns`: rows of pixels across an edge; longer edges are sampled: 64 make σ smaller by a
+      quarter and take twice the time (half: RMS 0.0178, double: 0.0158).
+    - `reach`: pixels are used to this distance from the edge, in τ, and one pixel more: Φ(−3.5) =
+      0.02 %, the step is complete.
+    - `clearance`: distance from adjacent edges in τ: Φ(−2.7) = 0.4 % of their contrast is
+      left (half: RMS 0.0246, error/σ 1.58; double: 0.0300, for fewer pixels).
+    - `parts`: of an edge that are compared, and left out singly: two or three pixels each at
+      `max_columns`.
+    - `max_part_shift`: of a part in its standard deviations: 2·Φ(−3.5) is once in 180 edges.
+    - `max_steps`, `last_step`: end of the iterations: evaluations, and the change of nine edges in
+      ten, pixels; the next is then negligible (Gauss-Newton).
+    """
+
+    blur_in_focus: float = 0.8
+    min_blur: float = 0.35
+    max_blur: float = 4.0
+    max_columns: int = 32
+    reach: float = 3.5
+    clearance: float = 2.7
+    parts: int = 12
+    max_part_shift: float = 3.5
+    max_steps: int = 8
+    last_step: float = 3e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class StraightEdges:
     """The expected edges: what is known of `n` of them before the fit.
 
     **Fields:** `start`, `end`, pixels, the inner side to the right of their direction as seen in
@@ -103,21 +124,24 @@ class EdgeFits:
     solved: Bool[np.ndarray, " n"]
 
 
-def take(edges: Edges, rows) -> Edges:
+def take(edges: StraightEdges, rows: Int[np.ndarray, " rows"]) -> StraightEdges:
     """Some of the edges."""
-    return Edges(*(getattr(edges, field.name)[rows] for field in dataclasses.fields(Edges)))
+    return StraightEdges(
+        *(getattr(edges, field.name)[rows] for field in dataclasses.fields(StraightEdges))
+    )
 
 
-def _right_of(along):
+def _right_of(along: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """To the right in the image, whose v points down: (1, 0) → (0, 1)."""
     return np.stack([-along[..., 1], along[..., 0]], -1)
 
 
 def fit_edges(
-    grey: np.ndarray,
-    edges: Edges,
+    grey: Real[np.ndarray, "rows columns"],
+    edges: StraightEdges,
     blur: Float[np.ndarray, " n"],
     curvature: float,
+    settings: EdgeSettings,
     coarse: bool = False,
 ) -> EdgeFits:
     """Edges in a photograph.
@@ -125,36 +149,40 @@ def fit_edges(
     **Arguments:** `grey` [rows, columns]; `blur`: expected τ, which chooses the pixels;
     `curvature`: prior σ of it, 1/pixels; `coarse`: the edges are only known to a few pixels.
     """
-    pixels = _Pixels.of(grey, edges, blur)
-    theta = _start(pixels, edges, blur, coarse)
-    prior = _prior_weights(edges, curvature)
-    expected = np.zeros_like(theta)
-    expected[:, 8] = np.log(IN_FOCUS)
+    pixels = _Pixels.choose(grey, edges, blur, settings)
+    theta = _start(pixels, blur, coarse)
+    prior, expected = _pseudo_observations(edges, curvature, settings)
     noise = np.full(len(theta), 1.0)
-    part = np.minimum(((pixels.t + 1) / 2 * PARTS).astype(int).clip(0), PARTS - 1)
+    last = settings.parts - 1
+    part = np.minimum(((pixels.t + 1) / 2 * settings.parts).astype(int).clip(0), last)
     weight = pixels.weight
-    for step in range(STEPS):
+    for step in range(settings.max_steps):
         model, J = _model(theta, pixels)
         r = pixels.grey - model
+        # not earlier: at the start whole edges are off, and parts contradict one another
         if step == 3:
-            weight = pixels.weight * _consistent_parts(J, r, pixels.weight, part)[0]
+            weight = pixels.weight * _consistent_parts(J, r, pixels.weight, part, settings)[0]
         N, b = normal_equations(J, r, weight, prior, expected - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
+        # beyond τ the step is not linear: a, b, c by τ at most, τ by a factor of 1.5
         limit = np.exp(theta[:, 8])[:, None]
         d[:, :3] = np.clip(d[:, :3], -limit, limit)
         d[:, 8] = np.clip(d[:, 8], -0.4, 0.4)
         theta = theta + d
-        theta[:, 8] = np.clip(theta[:, 8], np.log(SHARPEST), np.log(SOFTEST))
+        theta[:, 8] = np.clip(theta[:, 8], np.log(settings.min_blur), np.log(settings.max_blur))
         noise = noise_of_residuals(r, weight, UNKNOWNS)
-        if step > 2 and np.quantile(np.abs(d[:, 0]), 0.9) < CONVERGED:
+        # edges that do not exist never settle: a tenth of them may go on
+        if step > 2 and np.quantile(np.abs(d[:, 0]), 0.9) < settings.last_step:
             break
     model, J = _model(theta, pixels)
     r = pixels.grey - model
-    _, excess = _consistent_parts(J, r, pixels.weight, part)
+    _, excess = _consistent_parts(J, r, pixels.weight, part, settings)
     N, _ = normal_equations(J, r, weight, prior, expected - theta, noise)
     Q = np.linalg.inv(N)[:, :3, :3]
     contrast = theta[:, 5] - theta[:, 3]
     used = weight.sum(1)
+    # an edge has twice as many pixels as unknowns, stands out of its residuals five times, and
+    # keeps 60 % of its pixels
     solved = (used > 2 * UNKNOWNS) & (noise < 0.2 * np.abs(contrast)) & np.isfinite(Q).all((1, 2))
     solved &= (weight * pixels.weight).sum(1) > 0.6 * pixels.weight.sum(1)
     scale = noise * excess
@@ -177,22 +205,29 @@ class _Pixels:
     level: np.ndarray
 
     @classmethod
-    def of(cls, grey, edges, blur) -> "_Pixels":
+    def choose(
+        cls,
+        grey: Real[np.ndarray, "rows columns"],
+        edges: StraightEdges,
+        blur: Float[np.ndarray, " n"],
+        settings: EdgeSettings,
+    ) -> "_Pixels":
+        """Those between the adjacent edges, in the strips, and within reach of the step."""
         along, inward, half = edges.along, edges.inward, edges.half
         flat = np.abs(along[:, 0]) > np.abs(along[:, 1])
         k = np.where(flat, 0, 1)  # the axis that runs along the edge
-        one = np.arange(len(k))
-        low = np.minimum(edges.start, edges.end)[one, k]
-        high = np.maximum(edges.start, edges.end)[one, k]
-        number = int(min(np.ceil(np.max(high - low)) + 1, COLUMNS))
+        row = np.arange(len(k))
+        low = np.minimum(edges.start, edges.end)[row, k]
+        high = np.maximum(edges.start, edges.end)[row, k]
+        number = int(min(np.ceil(np.max(high - low)) + 1, settings.max_columns))
         step = np.maximum((high - low) / max(number - 1, 1), 1.0)
         major = np.rint(low[:, None] + step[:, None] * np.arange(number))
-        slope = along[one, 1 - k] / along[one, k]
-        line = edges.middle[one, 1 - k, None] + slope[:, None] * (
-            major - edges.middle[one, k, None]
+        slope = along[row, 1 - k] / along[row, k]
+        line = edges.middle[row, 1 - k, None] + slope[:, None] * (
+            major - edges.middle[row, k, None]
         )
-        reach = REACH * np.max(blur) + 1
-        rows = int(np.ceil(reach * np.sqrt(1 + np.max(slope**2))))
+        reach = settings.reach * blur[:, None] + 1
+        rows = int(np.ceil((settings.reach * np.max(blur) + 1) * np.sqrt(1 + np.max(slope**2))))
         minor = np.rint(line)[:, :, None] + np.arange(-rows, rows + 1)
         major = np.broadcast_to(major[:, :, None], minor.shape)
         place = np.where(
@@ -206,15 +241,15 @@ class _Pixels:
         t = np.einsum("npk,nk->np", away, along) / half[:, None]
         ends = np.stack([(1 - t) / 2, (1 + t) / 2], 2)
         inner, outer = (np.einsum("npe,ne->np", ends, w) for w in (edges.inner, edges.outer))
-        weight = np.asarray(inside & (s < np.minimum(inner, REACH * blur[:, None] + 1)))
-        weight &= s > -np.minimum(outer, REACH * blur[:, None] + 1)
+        weight = np.asarray(inside & (s < np.minimum(inner, reach)))
+        weight &= s > -np.minimum(outer, reach)
         for near in (edges.before, edges.after):
             apart = place - near[:, None, 0]
             clear = np.einsum("npk,nk->np", apart, _right_of(near[:, 1]))
-            weight &= clear > np.maximum(CLEAR * blur, 0.5)[:, None]
+            weight &= clear > np.maximum(settings.clearance * blur, 0.5)[:, None]
         weight &= np.abs(t) < 1
         level = np.zeros_like(t)
-        if np.any(weight & (s > inner - REACH * blur[:, None])):
+        if np.any(weight & (s > inner - settings.reach * blur[:, None])):
             # the cells behind the strip, blurred along the edge
             sharp = (half / blur)[:, None, None]
             passed = scipy.special.ndtr(sharp * (t[:, :, None] - edges.far[:, None]))
@@ -223,7 +258,7 @@ class _Pixels:
         return cls(*(x.astype(np.float32) for x in (s, t, grey[v, u], weight, inner, outer, level)))
 
 
-def _start(pixels, edges, blur, coarse):
+def _start(pixels: _Pixels, blur: Float[np.ndarray, " n"], coarse: bool) -> Theta:
     """Start values: levels from both sides, and for `coarse` the line from the steepest changes."""
     theta = np.zeros((len(blur), UNKNOWNS))
     w, s, g = pixels.weight, pixels.s, pixels.grey
@@ -233,7 +268,9 @@ def _start(pixels, edges, blur, coarse):
         far = w * side * (most > 0.5 * most.max(1, keepdims=True))
         theta[:, column] = (far * g).sum(1) / np.maximum(far.sum(1), 1)
     if coarse:
-        # the area between the levels tells where the step is, also from far away
+        # Pixels between the levels, weighted by q·(1 − q) of their place q between them, lie about
+        # the step, also from far away; a line through them, robust by 1/(1 + d²) (Cauchy) of their
+        # distances d in pixels against those of other edges.
         rate = (g - theta[:, 3:4]) / np.where(
             np.abs(theta[:, 5:6] - theta[:, 3:4]) > 1, theta[:, 5:6] - theta[:, 3:4], np.inf
         )
@@ -249,25 +286,34 @@ def _start(pixels, edges, blur, coarse):
     return theta
 
 
-def _prior_weights(edges, curvature):
-    """Weights 1/σ² of weak pseudo-observations: c by the lens, V like any level, τ of a lens
-    in focus; they matter where the pixels say nothing."""
-    p = np.zeros((len(edges.start), UNKNOWNS))
+def _pseudo_observations(
+    edges: StraightEdges, curvature: float, settings: EdgeSettings
+) -> tuple[Theta, Theta]:
+    """Weights 1/σ² and values of weak pseudo-observations, for where the pixels say nothing: c =
+    curvature·half²/2 by the lens, the change of a level along the edge ±20 grey values, V ±100, τ
+    that of a lens in focus to a factor of e."""
+    p, expected = np.zeros((2, len(edges.start), UNKNOWNS))
     p[:, 2] = (curvature * edges.half**2 / 2) ** -2.0
     p[:, 4] = p[:, 6] = 20.0**-2
     p[:, 7] = 100.0**-2
     p[:, 8] = 1.0
-    return p
+    expected[:, 8] = np.log(settings.blur_in_focus)
+    return p, expected
 
 
-def _model(theta, pixels):
+def _model(
+    theta: Theta, pixels: _Pixels
+) -> tuple[Float[np.ndarray, "n pixels"], Float[np.ndarray, "n pixels 9"]]:
     """Grey values of the pixels, and their derivatives [n, pixels, unknowns]."""
     a, b, c, W, W1, B, B1, V, lntau = (x[:, None] for x in theta.T.astype(np.float32))
     tau, t = np.exp(lntau), pixels.t
     s = pixels.s - (a + t * (b + t * c))
     W, B = W + W1 * t, B + B1 * t
     z, far, out = s / tau, (s - pixels.inner) / tau, (s + pixels.outer) / tau
-    ndtr, density = scipy.special.ndtr, lambda z: np.exp(-z * z / 2) * DENSITY
+    ndtr, density = (
+        scipy.special.ndtr,
+        lambda z: np.exp(-z * z / 2) * np.float32((2 * np.pi) ** -0.5),
+    )
     q = pixels.level
     F, f, zf = ndtr(z), density(z), 0.0
     zf = z * f
@@ -295,12 +341,18 @@ def _model(theta, pixels):
     return W + step * F + V * beyond, J
 
 
-def _consistent_parts(J, r, weight, part):
+def _consistent_parts(
+    J: Float[np.ndarray, "n pixels 9"],
+    r: Float[np.ndarray, "n pixels"],
+    weight: Float[np.ndarray, "n pixels"],
+    part: Int[np.ndarray, "n pixels"],
+    settings: EdgeSettings,
+) -> tuple[Float[np.ndarray, "n pixels"], Float[np.ndarray, " n"]]:
     """1 for pixels of parts that agree with the edge, and by how much the parts scatter more than
     the noise says."""
-    n = len(r)
-    of = part + PARTS * np.arange(n)[:, None]
-    add = lambda x: np.bincount(of.ravel(), x.ravel(), n * PARTS).reshape(n, PARTS)
+    n, parts = len(r), settings.parts
+    index = (part + parts * np.arange(n)[:, None]).ravel()
+    add = lambda x: np.bincount(index, x.ravel(), n * parts).reshape(n, parts)
     information = add(weight * J[:, :, 0] ** 2)
     known = information > 0.02 * information.max(1, keepdims=True)
     shift = add(weight * J[:, :, 0] * r) / np.where(known, information, np.inf)
@@ -309,13 +361,14 @@ def _consistent_parts(J, r, weight, part):
     # the median over the known parts: unknown ones come last
     order = np.sort(np.where(known, np.abs(z), np.inf), axis=1)
     middle = np.maximum(known.sum(1) - 1, 0) // 2
+    # as σ: the median of |z| of a normal z is Φ⁻¹(¾) = 1/1.4826
     spread = 1.4826 * np.take_along_axis(order, middle[:, None], 1)
-    good = known & (np.abs(z) < OUTLIER * np.maximum(spread, 1.0))
-    spare = good.sum(1) - 3
+    good = known & (np.abs(z) < settings.max_part_shift * np.maximum(spread, 1.0))
+    redundancy = good.sum(1) - 3  # a, b, c
     chi2 = np.where(good, z, 0.0) ** 2
-    excess = np.sqrt(chi2.sum(1) / np.maximum(spare, 1))
+    excess = np.sqrt(chi2.sum(1) / np.maximum(redundancy, 1))
     # not where it is within the spread of χ² itself, √(2/f), twice
-    significant = excess**2 > 1 + 2 * np.sqrt(2 / np.maximum(spare, 1))
-    excess = np.where((spare > 2) & significant, excess, 1.0)
+    significant = excess**2 > 1 + 2 * np.sqrt(2 / np.maximum(redundancy, 1))
+    excess = np.where((redundancy > 2) & significant, excess, 1.0)
     keep = np.take_along_axis(good | ~known, part, 1)
     return keep.astype(float), excess

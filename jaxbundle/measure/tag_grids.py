@@ -8,6 +8,7 @@ left, and borders of one bit, are recognised.
 Source: Olson (2011), AprilTag, ICRA; Kalibr's wiki, "Calibration targets".
 """
 
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,19 +16,13 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.board_points import BoardPoints, make_points
-from jaxbundle.measure.boards import MARKER, Board
+from jaxbundle.measure.boards import Board
 from jaxbundle.measure.saddles import fit_saddles
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
-BORDERS = (2, 1)
-"""Bits of the border: of Kalibr, of other printed tags."""
-FEWEST = 4
-"""Fewest tags of a grid."""
-NEIGHBOURS = 9
-"""Tags whose middles give the places of the corners of a tag."""
-LARGEST_OFFSET = 0.25
-"""Largest distance of a corner from its place by the homography, in sides of its tag."""
+MIN_TAGS = 4
+"""Four middles, not in one row, determine the homography of the grid."""
 
 
 def get_dictionary(name: str) -> Any:
@@ -42,34 +37,39 @@ def get_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def find_tags(cv2, grey: Grey, board: Board) -> BoardPoints:
+def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
     """The corners of the tags in a photograph.
 
     **Raises:** `InputError` for fewer than four tags, or tags in one row.
     """
+    # Kalibr prints borders of two bits, everybody else of one
     ids, seen = max(
-        (_read_tags(cv2, grey, board, bits) for bits in BORDERS), key=lambda found: len(found[0])
+        (_read_tags(cv2, grey, board, bits) for bits in (2, 1)), key=lambda found: len(found[0])
     )
     rows, columns = np.divmod(ids, board.columns)
-    if len(ids) < FEWEST or not (np.ptp(rows) and np.ptp(columns)):
+    if len(ids) < MIN_TAGS or not (np.ptp(rows) and np.ptp(columns)):
         raise InputError(
-            f"fewer than {FEWEST} tags of a grid of {board.columns} × {board.rows} tags "
+            f"fewer than {MIN_TAGS} tags of a grid of {board.columns} × {board.rows} tags "
             f"({board.dictionary}), or only of one row, found"
         )
     for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
-        corners = _corners_of_tags(board, place, columns)
+        # points of the board that are the corners of the tags, by their row from the top
+        i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
+        corners: Int[np.ndarray, "tags 4"] = i * 2 * board.columns + j
         near = _places(cv2, board.points[corners, :2], seen)
         if near is not None:
             break
     else:
         raise InputError(f"the tags found are not those of a flat grid: {board}")
     side = np.linalg.norm(np.diff(seen, axis=1), axis=2).min(1)
-    marker = board.marker or MARKER * board.square
-    gap = min(1.0, board.square / marker - 1)
+    # the squares of the gaps end where the next tag begins, in sides of a tag
+    gap = min(1.0, board.square / board.marker_side - 1)
     xy, rows, lines = [], [], []
     for which, there, four, length in zip(corners, near, seen, side):
         apart = np.linalg.norm(there[:, None] - four, axis=2)
-        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < LARGEST_OFFSET * length:
+        # in sides of the tag; larger: wrongly read tags pass; smaller: tags at the edge of a wide
+        # lens are lost, where the homographies fit worst; not critical
+        if len({*apart.argmin(1).tolist()}) == 4 and apart.min(1).max() < 0.25 * length:
             xy += list(there)  # OpenCV's corners reach into the squares of the gaps
             rows += which.tolist()
             along = gap * (np.roll(there, -1, 0) - there)
@@ -80,7 +80,7 @@ def find_tags(cv2, grey: Grey, board: Board) -> BoardPoints:
 
 
 def _read_tags(
-    cv2, grey, board: Board, bits: int
+    cv2: ModuleType, grey: Grey, board: Board, bits: int
 ) -> tuple[Int[np.ndarray, " tags"], Float[np.ndarray, "tags 4 2"]]:
     """Numbers and corners of the tags of a board; those read twice are left out."""
     parameters = cv2.aruco.DetectorParameters()
@@ -93,13 +93,9 @@ def _read_tags(
     return ids[once], seen[once]
 
 
-def _corners_of_tags(board: Board, rows, columns) -> Int[np.ndarray, "tags 4"]:
-    """The points of the board that are the corners of tags, by their row from the top."""
-    i, j = (2 * rows[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0])
-    return i * 2 * board.columns + j
-
-
-def _places(cv2, X, seen) -> Float[np.ndarray, "tags 4 2"] | None:
+def _places(
+    cv2: ModuleType, X: Float[np.ndarray, "tags 4 2"], seen: Float[np.ndarray, "tags 4 2"]
+) -> Float[np.ndarray, "tags 4 2"] | None:
     """Corners [tags, 4, 2] by homographies of the middles of neighbouring tags, so that distortion
     matters little; None for a mirror image."""
     middle, there = X.mean(1), seen.mean(1)
@@ -108,7 +104,9 @@ def _places(cv2, X, seen) -> Float[np.ndarray, "tags 4 2"] | None:
         return None
     found = np.empty(X.shape)
     for tag, four in enumerate(X):
-        near = np.argsort(np.linalg.norm(middle - middle[tag], axis=1))[:NEIGHBOURS]
+        # 3 × 3 tags about this one: over more, distortion bends the homography; over fewer, the
+        # places scatter by the noise of the middles
+        near = np.argsort(np.linalg.norm(middle - middle[tag], axis=1))[:9]
         flat = np.linalg.matrix_rank(middle[near] - middle[tag]) == 2
         local = cv2.findHomography(middle[near], there[near])[0] if flat and len(near) > 3 else H
         found[tag] = cv2.perspectiveTransform(four[None], H if local is None else local)[0]

@@ -22,23 +22,46 @@ import dataclasses
 
 import numpy as np
 import scipy  # its parts are loaded on use
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Real
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.measure.spots import MARGIN, find_spot
+from jaxbundle.measure.spots import MARGIN, Spot, find_spot
 
-REACH = 3.5
-"""Pixels are used to this distance from the rim, in τ, and one more, but not beyond `MARGIN` pixels
-outside, nor 0.8 of the shorter semi-axis inside."""
-SECTORS, OUTLIER = 16, 3.5
-"""Sectors of the rim that are compared, and the limit of their shifts in standard deviations:
-others are left out."""
-STEPS, CONVERGED = 15, 1e-3
-"""Most steps, and the last change of the centre in pixels."""
-LEAST_SEEN = 0.6
-"""Part of the rim that must be used."""
 UNKNOWNS = 10
+"""x, y, the three elements of M, G, C, ln τ, and the two of m."""
+Theta = Float[np.ndarray, " 10"]
+Pixels = Float[np.ndarray, " pixels"]
+
+
+@dataclasses.dataclass(frozen=True)
+class DiscSettings:
+    """How a blurred disc is fitted to the rim of a target.
+
+    Half and double were tried on rendered discs (`tests/measure/test_corner_accuracy.py`), 48 with
+    an RMS error of 0.0075 pixel: no difference, but for half of `reach`, 0.0079, and of
+    `max_sector_shift`, 0.0077.
+
+    **Fields:**
+
+    - `reach`: pixels are used to this distance from the rim, in τ, and one more, but not beyond
+      `MARGIN` pixels outside, nor 0.8 of the shorter semi-axis inside. Φ(−3.5) = 0.02 %: the
+      blurred step is complete.
+    - `sectors`, even: of the rim, compared with each other and left out singly.
+    - `max_sector_shift`: of a sector in standard deviations, beyond which it is left out: Φ(−3.5)
+      is once in 130 targets of 16 sectors.
+    - `min_seen`: part of the rim that must be used. Half of an ellipse hardly determines its centre
+      across the gap.
+    - `max_steps`, `last_step`: end of the iterations: evaluations, and the change of the centre in
+      pixels; the next is then far smaller (Gauss-Newton), and σ of a good target 0.005.
+    """
+
+    reach: float = 3.5
+    sectors: int = 16
+    max_sector_shift: float = 3.5
+    min_seen: float = 0.6
+    max_steps: int = 15
+    last_step: float = 1e-3
 
 
 @print_in_one_screen
@@ -67,7 +90,9 @@ class Target:
         return np.sqrt(np.diagonal(self.covariance))
 
 
-def centre_by_grey_values(grey, near) -> Target:
+def centre_by_grey_values(
+    grey: Real[np.ndarray, "rows columns"], near: Real[np.ndarray, "2"]
+) -> Target:
     """The centre of the target nearest to `near` (column, row) as the centre of its grey values.
 
     **Arguments:** `grey` [rows, columns]; `near`: within a few pixels of the target.
@@ -83,20 +108,33 @@ def centre_by_grey_values(grey, near) -> Target:
     return _target(spot, xy, covariance, *_axes_of(spread))
 
 
-def centre_by_ellipse(grey, near) -> Target:
+def centre_by_ellipse(
+    grey: Real[np.ndarray, "rows columns"],
+    near: Real[np.ndarray, "2"],
+    settings: DiscSettings | None = None,
+) -> Target:
     """The centre of the target nearest to `near` (column, row) by an ellipse through its
     edge; arguments and errors as in `centre_by_grey_values`."""
+    settings = settings or DiscSettings()
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, _ = _moments(spot)
-    centre, covariance, axes, angle, seen = _fit_disc(spot, xy, *_axes_of(spread))
-    if seen < LEAST_SEEN:
-        raise InputError(f"{_place(spot, xy)}: the edge of the target is not fully visible")
+    centre, covariance, axes, angle, seen = _fit_disc(spot, xy, *_axes_of(spread), settings)
+    where = "at ({:.1f}, {:.1f})".format(*(xy + spot.corner))
+    if seen < settings.min_seen:
+        raise InputError(f"{where}: the edge of the target is not fully visible")
+    # the centre of grey values is that of the ellipse, but for a neighbour in the window
     if not np.isfinite(covariance).all() or np.linalg.norm(centre - xy) > 0.3 * axes[0] + 1:
-        raise InputError(f"{_place(spot, xy)}: the edge of the target is not an ellipse")
+        raise InputError(f"{where}: the edge of the target is not an ellipse")
     return _target(spot, centre, covariance, axes, angle)
 
 
-def _target(spot, xy, covariance, axes, angle):
+def _target(
+    spot: Spot,
+    xy: Float[np.ndarray, "2"],
+    covariance: Float[np.ndarray, "2 2"],
+    axes: Float[np.ndarray, "2"],
+    angle: float,
+) -> Target:
     return Target(
         xy=xy + spot.corner,
         covariance=covariance,
@@ -109,21 +147,18 @@ def _target(spot, xy, covariance, axes, angle):
     )
 
 
-def _place(spot, xy):
-    x, y = xy + spot.corner
-    return f"at ({x:.1f}, {y:.1f})"
-
-
-def _region(spot):
+def _region(spot: Spot) -> Bool[np.ndarray, "rows columns"]:
     return scipy.ndimage.binary_dilation(spot.inside, np.ones((3, 3)), iterations=MARGIN)
 
 
-def _places(spot):
+def _places(spot: Spot) -> Float[np.ndarray, "2 rows columns"]:
     rows, columns = np.indices(spot.grey.shape)
     return np.stack([columns, rows]).astype(float)
 
 
-def _moments(spot):
+def _moments(
+    spot: Spot,
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float]:
     """Centre, second central moments and sum of the relative grey values."""
     w = np.where(_region(spot), (spot.grey - spot.background) / spot.contrast, 0.0)
     places, total = _places(spot), w.sum()
@@ -132,80 +167,96 @@ def _moments(spot):
     return xy, away @ away.T / spot.inside.sum(), total
 
 
-def _axes_of(spread):
-    """Semi-axes and angle of the ellipse with these second moments: an axis a has a²/4."""
+def _axes_of(spread: Float[np.ndarray, "2 2"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """Semi-axes and angle of the ellipse with these second moments: an axis a has a²/4, and the
+    area of a pixel adds its own, 1/12."""
     values, vectors = np.linalg.eigh(spread + np.eye(2) / 12)
     x, y = vectors[:, 1]
     return 2 * np.sqrt(values[::-1]), np.arctan2(y, x)
 
 
-def _fit_disc(spot, xy, axes, angle):
+def _fit_disc(
+    spot: Spot,
+    xy: Float[np.ndarray, "2"],
+    axes: Float[np.ndarray, "2"],
+    angle: float,
+    settings: DiscSettings,
+) -> tuple[Theta, Float[np.ndarray, "2 2"], Float[np.ndarray, "2"], float, float]:
     """Centre, its covariance, semi-axes, angle, and the part of the rim that was used."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     M = turn @ np.diag(np.asarray(axes) ** -2.0) @ turn.T
     theta = np.array([*xy, M[0, 0], M[0, 1], M[1, 1], spot.background, spot.contrast, 0.0, 0, 0])
-    scale = np.array(
-        [
-            1,
-            1,
-            *[2 / axes[1] ** 3] * 3,
-            abs(spot.contrast),
-            abs(spot.contrast),
-            1,
-            spot.noise,
-            spot.noise,
-        ]
-    )
+    # changes of the unknowns that move the rim by a pixel, or the grey values by as much as the
+    # noise: N is then well scaled
+    contrast = abs(spot.contrast)
+    curved = 2 / axes[1] ** 3
+    scale = np.array([1, 1, curved, curved, curved, contrast, contrast, 1, spot.noise, spot.noise])
     places, grey = _places(spot).reshape(2, -1), spot.grey.ravel()
-    theta, A, r, weight, sector = _iterate(theta, scale, places, grey, 1.0)
-    kept = _consistent_sectors(A, r, weight, sector)
-    if not kept.all():
-        theta, A, r, weight, sector = _iterate(theta, scale, places, grey, kept)
+    theta, A, r, weight, sector = _iterate(theta, scale, places, grey, 1.0, settings)
+    consistent = _consistent_sectors(A, r, weight, sector, settings)
+    if not consistent.all():
+        theta, A, r, weight, sector = _iterate(theta, scale, places, grey, consistent, settings)
+    # grey values are rounded: variance 1/12
     noise = max(np.sqrt(r @ r / max(weight.sum() - UNKNOWNS, 1)), 12**-0.5)
     inverse = np.linalg.inv(_normal_matrix(A))
-    covariance = (noise * _excess(A, r, inverse, sector, noise)) ** 2 * inverse[:2, :2]
-    seen = np.unique(sector[weight > 0]).size / SECTORS
+    excess = _excess(A, r, inverse, sector, noise, settings.sectors)
+    covariance = (noise * excess) ** 2 * inverse[:2, :2]
+    seen = np.unique(sector[weight > 0]).size / settings.sectors
     values, vectors = np.linalg.eigh([[theta[2], theta[3]], [theta[3], theta[4]]])
     angle = np.arctan2(vectors[1, 0], vectors[0, 0])
     angle = np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2
     return theta[:2], covariance, values**-0.5, angle, seen
 
 
-def _iterate(theta, scale, places, grey, kept):
-    """The disc that fits the kept pixels: its parameters, scaled derivatives, residuals, and pixels
-    used."""
+def _iterate(
+    theta: Theta,
+    scale: Theta,
+    places: Float[np.ndarray, "2 pixels"],
+    grey: Pixels,
+    consistent: float | Pixels,
+    settings: DiscSettings,
+) -> tuple[Theta, Float[np.ndarray, "10 pixels"], Pixels, Pixels, Int[np.ndarray, " pixels"]]:
+    """The disc that fits the consistent pixels: its parameters, scaled derivatives, residuals,
+    pixels used, and the sectors of all.
+
+    Gauss-Newton, since the start by moments is within a pixel; steps are shortened to a pixel, to
+    a factor of 1.5 of the blur, and until the conic is an ellipse."""
     step = 0
     while True:
-        g, J, d, sector, minor = _blurred_disc(theta, places)
-        reach = REACH * np.exp(theta[7]) + 1
-        weight = kept * ((d < min(reach, 0.8 * minor)) & (d > -min(reach, MARGIN)))
+        g, J, d, sector, minor = _blurred_disc(theta, places, settings.sectors)
+        reach = settings.reach * np.exp(theta[7]) + 1
+        weight = consistent * ((d < min(reach, 0.8 * minor)) & (d > -min(reach, MARGIN)))
         r = weight * (grey - g)
         A = J * (weight * scale[:, None])
         change = scale * np.linalg.solve(_normal_matrix(A), A @ r)
         change[:2] = np.clip(change[:2], -1, 1)
         change[7] = np.clip(change[7], -0.4, 0.4)
-        while _is_no_ellipse(theta + change) and np.abs(change).max() > 1e-12:
+        while not _is_ellipse(*(theta + change)[2:5]) and np.abs(change).max() > 1e-12:
             change = change / 2
         theta = theta + change
+        # a pixel's area alone has τ = 1/√12 = 0.29; a blur of half the disc leaves no rim
         theta[7] = np.clip(theta[7], np.log(0.35), np.log(0.5 * minor + 1))
         step += 1
-        if step == STEPS or step > 3 and np.abs(change[:2]).max() < CONVERGED:
+        still = np.abs(change[:2]).max() < settings.last_step
+        if step == settings.max_steps or step > 3 and still:
             return theta, A, r, weight, sector
 
 
-def _normal_matrix(A):
+def _normal_matrix(A: Float[np.ndarray, "10 pixels"]) -> Float[np.ndarray, "10 10"]:
     """A·Aᵀ, and a millionth of its trace on the diagonal: few pixels may leave a level open."""
     N = A @ A.T
     return N + 1e-6 * np.trace(N) * np.eye(UNKNOWNS)
 
 
-def _is_no_ellipse(theta) -> bool:
-    A, B, C = theta[2:5]
-    return not (A > 0 and C > 0 and A * C > 1.01 * B * B)
+def _is_ellipse(A: float, B: float, C: float) -> bool:
+    # A·C = B² is a pair of lines; 1 % away from it 1/|M·(p − x)| is still harmless
+    return A > 0 and C > 0 and A * C > 1.01 * B * B
 
 
-def _blurred_disc(theta, places):
+def _blurred_disc(
+    theta: Theta, places: Float[np.ndarray, "2 pixels"], sectors: int
+) -> tuple[Pixels, Float[np.ndarray, "10 pixels"], Pixels, Int[np.ndarray, " pixels"], float]:
     """Grey values of the pixels, their derivatives [unknowns, pixels], distances from the rim,
     sector, and the shorter semi-axis."""
     x, y, A, B, C, ground, contrast, lntau, mx, my = theta
@@ -232,29 +283,43 @@ def _blurred_disc(theta, places):
             v,
         ]
     )
-    sector = ((np.arctan2(v, u) / np.pi + 1) / 2 * SECTORS).astype(int) % SECTORS
+    sector = ((np.arctan2(v, u) / np.pi + 1) / 2 * sectors).astype(int) % sectors
     half, other = (A + C) / 2, np.hypot((A - C) / 2, B)
     return ground + contrast * step + mx * u + my * v, J, d, sector, (half + other) ** -0.5
 
 
-def _consistent_sectors(J, r, weight, sector):
+def _consistent_sectors(
+    J: Float[np.ndarray, "10 pixels"],
+    r: Pixels,
+    weight: Pixels,
+    sector: Int[np.ndarray, " pixels"],
+    settings: DiscSettings,
+) -> Pixels:
     """1 for pixels of sectors whose rim agrees with the ellipse, within the noise or the scatter of
     all."""
     normal = np.hypot(J[0], J[1]) * weight
-    information = np.bincount(sector, normal**2, SECTORS)
-    shift = np.bincount(sector, normal * r * np.sign(J[6]), SECTORS)
+    information = np.bincount(sector, normal**2, settings.sectors)
+    shift = np.bincount(sector, normal * r * np.sign(J[6]), settings.sectors)
     z = shift / np.sqrt(np.maximum(information, 1e-12))
     noise = np.sqrt(max(r @ r / max(weight.sum() - UNKNOWNS, 1), 1 / 12))
-    spread = max(1.4826 * np.median(np.abs(z)), noise)
-    return (np.abs(z) < OUTLIER * spread)[sector].astype(float)
+    spread = max(1.4826 * np.median(np.abs(z)), noise)  # 1/Φ⁻¹(¾): a median of |z| as σ
+    return (np.abs(z) < settings.max_sector_shift * spread)[sector].astype(float)
 
 
-def _excess(A, r, inverse, sector, noise):
+def _excess(
+    A: Float[np.ndarray, "10 pixels"],
+    r: Pixels,
+    inverse: Float[np.ndarray, "10 10"],
+    sector: Int[np.ndarray, " pixels"],
+    noise: float,
+    sectors: int,
+) -> float:
     """By how much the centres from opposite pairs of sectors scatter more than the noise says (1:
     not); what is alike on opposite sides does not move the centre."""
-    score = np.stack([np.bincount(sector, a * r, SECTORS) for a in A])
-    pairs = inverse[:2] @ (score[:, : SECTORS // 2] + score[:, SECTORS // 2 :])
+    score = np.stack([np.bincount(sector, a * r, sectors) for a in A])
+    pairs = inverse[:2] @ (score[:, : sectors // 2] + score[:, sectors // 2 :])
     ratio = np.einsum("is,ij,js->", pairs, np.linalg.inv(inverse[:2, :2]), pairs)
-    ratio /= (SECTORS - 2) * noise**2
-    spread = np.sqrt(2 / SECTORS)
+    ratio /= (sectors - 2) * noise**2
+    # χ²/f has the σ √(2/f), and the pairs have f = sectors coordinates: only beyond 3 of it
+    spread = np.sqrt(2 / sectors)
     return np.sqrt(ratio) if ratio > 1 + 3 * spread else 1.0

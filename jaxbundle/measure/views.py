@@ -10,7 +10,7 @@ from math import prod
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
@@ -34,13 +34,10 @@ from jaxbundle.types import Progress
 
 SEARCHING = "searching the board"
 """The stage in reports of progress."""
-SAME, ALIKE = 0.02, 0.8
-"""Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
-the board. JPEG at quality 70 moves corners by 0.015; two photographs of one pose, with noise of
-their own, agree to 0.022 and more (real ones, a contrast of 100 grey values)."""
-MOST_SEARCHED = 3
+MAX_SEARCHED = 3
 """Number of photographs searched for boards of other sizes: those without a board, if few
-have it, and the others, whether their board is a part of a larger one."""
+have it, and the others, whether their board is a part of a larger one. A search takes longest where
+there is nothing to find; most of three decide about a larger board."""
 
 Look = tuple[tuple[int, int], Float[np.ndarray, "points 2"]] | str
 """Search result of a board in a photograph: image size and image points, or why none."""
@@ -97,7 +94,9 @@ class BoardViews:
         """Which points were found."""
         return np.all(np.isfinite(self.xy), axis=2)
 
-    def take(self, rows, why: str = "") -> "BoardViews":
+    def take(
+        self, rows: Bool[np.ndarray, " views"] | Int[np.ndarray, " rows"], why: str = ""
+    ) -> "BoardViews":
         """Some of the views (a mask or indices); the others count as failed if `why` is given."""
         keep = np.zeros(len(self), bool)
         keep[rows] = True
@@ -148,7 +147,7 @@ def measure_boards(
     file_of = name_photographs(files)
     repeated = _find_repeated(file_of)
 
-    def search(name) -> tuple[Look, bool]:
+    def search(name: str) -> tuple[Look, bool]:
         return (repeated[name], False) if name in repeated else _search(file_of[name], board)
 
     looks, negatives = {}, {}
@@ -213,7 +212,7 @@ def search_board(path: str | Path, board: Board) -> Look:
     return _search(path, board)[0]
 
 
-def _search(path, board) -> tuple[Look, bool]:
+def _search(path: str | Path, board: Board) -> tuple[Look, bool]:
     """The search result, and whether the board is a negative."""
     try:
         with image_errors(path):
@@ -260,16 +259,19 @@ def _find_repeated(paths: Mapping[str, Path]) -> dict[str, str]:
 
 def _find_saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
     """Views with the same points as an earlier one: one photograph in another
-    compression or format."""
+    compression or format.
+
+    JPEG at quality 70 moves corners by 0.015 pixels (RMS); two photographs of one pose, with noise
+    of their own, agree to 0.022 and more (real ones, a contrast of 100 grey values)."""
     found: dict[str, str] = {}
     for i, (name, xy) in enumerate(used):
         for other, earlier in used[:i]:
             away = np.linalg.norm(xy - earlier, axis=1)
             same = np.isfinite(away)
-            if other in found or same.mean() < ALIKE:
+            if other in found or same.mean() < 0.8:  # most of the board
                 continue
             rms = float(np.sqrt(np.mean(away[same] ** 2)))
-            if rms < SAME:
+            if rms < 0.02:
                 found[name] = (
                     f"shows the board where {other} does, to {rms:.1g} px: the same photograph "
                     "saved again, or another of the same pose; one is used"
@@ -285,10 +287,12 @@ def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
     return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
 
 
-def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
+def _other_boards(
+    paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]
+) -> dict[str, str]:
     """Reasons of some photographs without the board, with the size of another board in them."""
     sizes = {}
-    for name in list(failed)[:MOST_SEARCHED]:
+    for name in list(failed)[:MAX_SEARCHED]:
         try:
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
@@ -308,11 +312,13 @@ def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, 
     }
 
 
-def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[str, ...]:
+def _part_of_a_larger(
+    paths: Mapping[str, Path], used: Sequence[str], board: Board
+) -> tuple[str, ...]:
     """A warning if most of some photographs show the same larger board; one may be wrong."""
     if board.kind != "chessboard":
         return ()
-    few = used[:MOST_SEARCHED]
+    few = used[:MAX_SEARCHED]
     sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in few)
     (other, times), *_ = sizes.most_common(1) or [(None, 0)]
     if other is None or times <= len(few) / 2:

@@ -1,5 +1,7 @@
 """Batches of cameras against a dense least-squares solution, OpenCV, and themselves."""
 
+from functools import partial
+
 import cv2
 import jax
 import numpy as np
@@ -305,11 +307,13 @@ def test_object_points_may_be_repeated_for_every_view(three):
 @pytest.mark.further
 def test_few_views_are_not_filled_up_to_many(three, solved, monkeypatch):
     """The first camera keeps every other view, the last all: each by itself or together."""
-    monkeypatch.setattr(batch_input, "ON_CPU", 2)
+    small = partial(batch_input.PortionSettings, cameras_on_cpu=2)
+    monkeypatch.setattr(batch_input, "PortionSettings", small)
     visible = np.ones(three[0].shape[:3], bool)
     visible[0, ::2] = False
     together = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible)
-    monkeypatch.setattr(batch_input, "WORTH_COMPILING", 0)
+    small = partial(small, points_worth_compiling=0)
+    monkeypatch.setattr(batch_input, "PortionSettings", small)
     apart = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible)
     np.testing.assert_array_equal(apart.views, visible.any(2))
     np.testing.assert_array_equal(apart.views, together.views)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.batch.misfit import NORMAL, axes_remark, far_outside, misfits
-from jaxbundle.batch.normal import Calibration, Sightings, design
+from jaxbundle.batch.normal import CameraUnknowns, Sightings, design
 from jaxbundle.batch.test_values import point_tests
 from jaxbundle.batch.weakness import weak_geometry
 from jaxbundle.cameras import get_model
@@ -201,7 +201,7 @@ def test_tests_are_those_of_a_dense_adjustment(clean, plain):
     used = np.asarray(seen.weight).copy()
     used[1, 5] = used[4, 20] = 0
     rotation = np.stack([np.eye(4)[1] + rng.normal(0, 0.1, 4) for _ in range(VIEWS)])
-    at = Calibration(
+    at = CameraUnknowns(
         jnp.asarray(plain.interior[0]),
         jnp.asarray(rotation / np.linalg.norm(rotation, axis=1, keepdims=True)),
         jnp.asarray(rng.normal([0, 0, -0.4], 0.02, (VIEWS, 3))),

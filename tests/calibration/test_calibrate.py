@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.calibration import Board, BoardViews, calibrate
+from jaxbundle.calibration.affinity import find_missing_affinity
 from jaxbundle.calibration.calibrate import board_network
-from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
@@ -316,7 +316,7 @@ def test_an_affinity_that_is_left_out_is_told(ratio):
     free = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
     views = simulated(lens)
     found = calibrate(views, model="brown", pixel_size=0.01, free=free, snooping=None)
-    missed = left_out(found.adjustment)
+    missed = find_missing_affinity(found.adjustment)
     assert missed.names == ("b1", "b2")
     np.testing.assert_array_less(np.abs(missed.values - [ratio - 1, 0]), 4 * missed.sigma)
     assert missed.missed == (ratio != 1)

@@ -12,16 +12,17 @@ mounting reveals.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.arguments import show
-from jaxbundle.batch.epochs import FEWEST, contradicting, epoch_keys
+from jaxbundle.batch.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
+from jaxbundle.calibration import quality
 from jaxbundle.calibration.pixels import unit_size
-from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
 from jaxbundle.calibration.rig.result import RigCalibration
@@ -33,6 +34,7 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
 def calibrate_rig(
@@ -55,6 +57,33 @@ def calibrate_rig(
     `NotSolvedError` if an adjustment does not converge.
     """
     check_test(snooping, significance)
+    _check(calibrations)
+    keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
+    epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
+    # M and X0 of every camera at every epoch it saw
+    poses = {
+        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
+        for name, one in calibrations.items()
+    }
+    base, turn = _start_of_mountings(list(calibrations), poses)
+    rig = _start(calibrations, keys, poses, base, turn, epochs)
+    rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
+    cameras = [one.camera for one in calibrations.values()]
+    size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in cameras])
+    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
+    # each time from the start values: a wrong epoch may have led the adjustment far away
+    while (bad := _contradictions(rig, found, size)) and snooping:
+        why = "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
+        left_out += [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
+        found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
+    if snooping:
+        found = snoop_rig(found, snooping, significance, max_iterations)
+    why = "kept, but does not fit the mounting (RMS {:.1f} px)"
+    tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
+    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated)
+
+
+def _check(calibrations: Mapping[str, Calibration]) -> None:
     if not isinstance(calibrations, Mapping):
         raise InputError(
             f"calibrations are {show(calibrations)}; expected a mapping from the "
@@ -71,44 +100,12 @@ def calibrate_rig(
         if not one.converged:
             why = one.adjustment.termination
             raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
-    keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
-    epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
-    poses = _poses(calibrations, keys)
-    base, turn = _start_of_mountings(list(calibrations), poses)
-    rig = _start(calibrations, keys, poses, base, turn, epochs)
-    rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
-    size = {
-        name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
-        for name, one in calibrations.items()
-    }
-    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
-    while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
-        left_out += [
-            (
-                rig.epochs[e],
-                f"does not fit the mounting (RMS {rms:.1f} px): photographs not simultaneous?",
-            )
-            for e, rms in bad.items()
-        ]
-        found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
-    if snooping:
-        found = snoop_rig(found, snooping, significance, max_iterations)
-    return RigCalibration(
-        dict(calibrations),
-        rig,
-        found,
-        left_out,
-        [
-            (rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
-            for e, rms in bad.items()
-        ],
-    )
 
 
 def require_solved(found: Result) -> Result:
-    """The same.
+    """The result of an adjustment that converged.
 
-    **Raises:** `NotSolvedError` where it is not solved."""
+    **Raises:** `NotSolvedError` for another one."""
     if not found.converged:
         names = found.undetermined
         what = f"; not determined: {list_some(names, 8, str)}" if names else ""
@@ -120,31 +117,28 @@ def require_solved(found: Result) -> Result:
     return found
 
 
-def _poses(calibrations, keys):
-    """M and X0 of every camera at every epoch it saw."""
-    return {
-        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
-        for name, one in calibrations.items()
-    }
-
-
-def _start_of_mountings(names, poses):
+def _start_of_mountings(
+    names: Sequence[str], poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """b and R of every camera, from the epochs it shares with one that has them already."""
     base, turn = {names[0]: np.zeros(3)}, {names[0]: np.eye(3)}
     while len(base) < len(names):
         pairs = [(placed, name) for placed in base for name in names if name not in base]
         common = lambda pair: poses[pair[0]].keys() & poses[pair[1]].keys()
+        # the pair with most common epochs next (a maximal spanning tree): the start values of a
+        # camera may come through another one
         best = max(pairs, key=lambda pair: len(common(pair)))
         shared = [key for key in poses[best[0]] if key in common(best)]
-        if len(shared) < min(FEWEST, len(poses[best[1]])) or not shared:
+        if len(shared) < min(MIN_SHARED_EPOCHS, len(poses[best[1]])) or not shared:
             raise InputError(
-                f"camera {best[1]!r} shares {len(shared)} epochs with the others; {FEWEST} "
-                "photographs must be simultaneous"
+                f"camera {best[1]!r} shares {len(shared)} epochs with the others; "
+                f"{MIN_SHARED_EPOCHS} photographs must be simultaneous"
             )
         placed, name = best
         both = [(poses[placed][key], poses[name][key]) for key in shared]
         R = np.array([M2 @ M1.T for (M1, _), (M2, _) in both])
         b = np.array([M1 @ (X2 - X1) for (M1, X1), (_, X2) in both])
+        # the medoid, not a mean: a wrong epoch does not move it, and it needs no mean of rotations
         size = np.median(np.linalg.norm(b, axis=1)) + 1e-12
         apart = np.linalg.norm(R[:, None] - R, axis=(2, 3))
         apart += np.linalg.norm(b[:, None] - b, axis=2) / size
@@ -154,7 +148,14 @@ def _start_of_mountings(names, poses):
     return base, turn
 
 
-def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
+def _start(
+    calibrations: Mapping[str, Calibration],
+    keys: Mapping[str, Sequence[str]],
+    poses: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    base: Mapping[str, np.ndarray],
+    turn: Mapping[str, np.ndarray],
+    epochs: Sequence[str],
+) -> Rig:
     """The rig with start values, and the image points that the calibration of each camera kept."""
     names, board = list(calibrations), next(iter(calibrations.values())).views.board
     middle = board.points.mean(0)
@@ -166,6 +167,8 @@ def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
         rotation.append(turn[name].T @ M)
         centre.append(X0 - M.T @ turn[name] @ base[name] - middle)
     place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
+    # points that the calibration of a camera removed as gross stay out: data snooping of the rig
+    # finds only what the mounting reveals
     rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
     epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
     free = {
@@ -190,26 +193,30 @@ def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
 
 
 @partial(compile_once, static=())
-def _quaternions(matrices):
+def _quaternions(matrices: Float[AnyArray, "n 3 3"]) -> Float[Array, "n 4"]:
     return jax.vmap(quaternion_from_matrix)(matrices)
 
 
-def _rays(calibration: Calibration, keys, epochs):
+def _rays(
+    calibration: Calibration, keys: Sequence[str], epochs: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
     network, views = calibration.adjustment.problem.network, calibration.views
-    rays, kept = network.observations, kept_rays(calibration.adjustment)
+    rays, used = network.observations, quality.used_rays(calibration.adjustment.problem)
     row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
     epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
-    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[kept]]
+    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[used]]
     return (
         epoch,
-        np.array([point[id] for id in network.points.id])[rays.point[kept]],
-        rays.xy[kept],
-        rays.sigma[kept],
+        np.array([point[id] for id in network.points.id])[rays.point[used]],
+        rays.xy[used],
+        rays.sigma[used],
     )
 
 
-def _contradictions(rig: Rig, found, size):
+def _contradictions(
+    rig: Rig, found: Result, size: Float[np.ndarray, "cameras 2"]
+) -> dict[int, float]:
     """Epochs seen by several cameras that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
     v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
@@ -217,5 +224,6 @@ def _contradictions(rig: Rig, found, size):
     np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
+    # only epochs that several cameras saw can contradict the mounting
     bad = contradicting(rms, rays > 0, (number > 0).sum(1) > 1)
     return {int(e): float(rms[e]) for e in bad}

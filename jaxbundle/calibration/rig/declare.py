@@ -20,7 +20,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
@@ -36,7 +36,7 @@ from jaxbundle.network.tables import EXTERIOR, Camera
 POSES = ("epoch", "mounting")
 
 
-def _scale(motion, mounting: PoseValue) -> PoseValue:
+def _scale(motion: Float[Array, "7"], mounting: PoseValue) -> PoseValue:
     """The bases scale with the object."""
     return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
 
@@ -122,12 +122,14 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
     return tables, observations
 
 
-def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
+def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
     """Adjust a rig from its start values; `options` are those of the solver.
 
     **Returns:** the result; not `converged` if undetermined.
     """
+    # only points that are seen carry the datum; the bases scale with them (`FLOATING`)
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
+    # the epochs, with six unknowns each and by far the most, are eliminated
     return adjust(
         *declare_rig(rig),
         eliminate="epoch",
@@ -142,7 +144,9 @@ def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
     return np.all(rig.in_order(problem.data.weight), axis=1)
 
 
-def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:
+def leave_out(
+    rig: Rig, found: Result, rays: Bool[np.ndarray, " n"], max_iterations: int = 50
+) -> Result:
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
     removed = [
@@ -158,9 +162,10 @@ def snoop_rig(found: Result, test: str, significance: float, max_iterations: int
     """The result without blunders found by a test.
 
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
+    # each round from the last solution: a removed blunder moves it little
     minimum = found.minimum
 
-    def again(problem, values) -> Solution:
+    def again(problem: Problem, values: Any) -> Solution:
         nonlocal minimum
         minimum = find_minimum(problem, values, max_steps=max_iterations + 1)
         return Result(problem, minimum).solution

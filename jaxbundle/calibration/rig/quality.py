@@ -12,46 +12,64 @@ with the covariance of the common adjustment, as `jaxbundle.statistics.projectio
 """
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
-from jaxbundle.cameras import get_model, image_ray, project
+from jaxbundle.cameras import CameraModel, get_model, image_ray, project
 from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.statistics.projection import interior_covariance_of_images
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray, Scalar, present
+
+if TYPE_CHECKING:
+    from jaxbundle.calibration.rig.result import RigCalibration
 
 FRAMES = ("rig", "camera", "rotation")
 
 
 @partial(compile_once, static=0)
-def _slopes(model, p, mounting: PoseValue, xy, nearness):
+def _slopes(
+    model: CameraModel,
+    p: Float[AnyArray, " parameters"],
+    mounting: PoseValue,
+    xy: Float[AnyArray, "n 2"],
+    nearness: Scalar,
+) -> Float[Array, "n 2 k"]:
     """∂x/∂(δb, δθ, p) [n, 2, 6 + parameters] of points at the distance 1/nearness, whose images
     are `xy`."""
     space = Pose()
     # Relative to the camera, in units of the distance.
     block = space.prepare(mounting._replace(position=jnp.zeros(3)))
 
-    def one(xy):
+    def derive(xy: Float[AnyArray, "2"]) -> Float[Array, "2 k"]:
         ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
 
-        def image(change, p):
+        def image(
+            change: Float[Array, "6"], p: Float[AnyArray, " parameters"]
+        ) -> Float[Array, "2"]:
             moved = space.move(block, (*(nearness * change[:3]), *change[3:]))
             return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
 
         return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)
 
-    return jax.vmap(one)(xy)
+    return jax.vmap(derive)(xy)
 
 
 def rig_uncertainty(
-    rig, name: str, distance: float = np.inf, frame: str = "rig", grid: tuple[int, int] = GRID
+    rig: "RigCalibration",
+    name: str,
+    distance: float = np.inf,
+    frame: str = "rig",
+    grid: tuple[int, int] = GRID,
 ) -> UncertaintyMap:
     """The uncertainty of a projected point over the image of a camera of a rig, pixels.
 
@@ -65,10 +83,10 @@ def rig_uncertainty(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: a positive distance is expected")
     k = _index(rig, name)
-    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).space
+    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).vector
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
-    uv = grid_of(given.image_size, *grid)
+    uv = grid_of(present(given.image_size), *grid)
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
     C = rig.covariance(name)
     if frame == "rig":
@@ -84,19 +102,19 @@ def rig_uncertainty(
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
 
 
-def rig_points(rig, name: str):
+def rig_points(rig: "RigCalibration", name: str) -> Float[np.ndarray, "n 2"]:
     """The image points of a camera used in the rig adjustment, pixels [n, 2]."""
     own, given = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
     model = get_model(given.model)
     return in_pixels(rig.rig.xy[own], model, given.image_size, given.pixel_size)
 
 
-def rig_coverage(rig, name: str) -> Coverage:
+def rig_coverage(rig: "RigCalibration", name: str) -> Coverage:
     """Coverage of the image of a camera by points of the rig."""
-    return coverage(rig_points(rig, name), rig.camera(name).image_size)
+    return coverage(rig_points(rig, name), present(rig.camera(name).image_size))
 
 
-def _index(rig, name: str) -> int:
+def _index(rig: "RigCalibration", name: str) -> int:
     if name not in rig.names:
         raise InputError(f"camera {name!r} is not of the rig{did_you_mean(name, rig.names)}")
     return rig.names.index(name)

@@ -5,11 +5,12 @@ import functools
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle import plotting
 from jaxbundle.bundle import tables as result_tables
@@ -29,6 +30,9 @@ from jaxbundle.statistics.blunders import Removed, either_of
 from jaxbundle.statistics.inspection import Tested
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 POSE = Pose.width
 DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
@@ -160,7 +164,7 @@ class RigCalibration:
             )
         return result_tables.concatenate(parts)
 
-    def pope(self, w):
+    def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """τ = w/σ0."""
         return w / self.sigma0
 
@@ -191,7 +195,7 @@ class RigCalibration:
         nominal = next(iter(self.cameras.values())).views.board.points
         return self.values("point") + nominal.mean(0)
 
-    def values(self, table: str):
+    def values(self, table: str) -> Any:
         """The adjusted rows of a table of unknowns."""
         return jax.tree.map(np.asarray, self.result.minimum.values[table])
 
@@ -230,6 +234,8 @@ class RigCalibration:
             for start, width, (k, table, row) in zip(starts, widths, places):
                 rows["mounting"][start : start + POSE, k] = np.eye(POSE)
                 rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
+            # unit rows for the wanted unknowns: only these columns of the cofactor matrix are
+            # computed
             Q = self.result.solution.propagate_rows(rows)
             self._covariances[names] = self.sigma0**2 * Q
         return self._covariances[names]
@@ -270,7 +276,7 @@ class RigCalibration:
         return rig_coverage(self, name)
 
     def uncertainty(
-        self, name: str, distance: float = np.inf, frame: str = "rig", grid=GRID
+        self, name: str, distance: float = np.inf, frame: str = "rig", grid: tuple[int, int] = GRID
     ) -> UncertaintyMap:
         """Uncertainty of a projected point over the image of a camera, pixels; frames: see
         `jaxbundle.calibration.rig.quality`."""
@@ -289,12 +295,14 @@ class RigCalibration:
         )
         return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
 
-    def plot_coverage(self, name: str, ax=None):
+    def plot_coverage(self, name: str, ax: "Axes | None" = None) -> "Axes":
         """Coverage of the image of a camera by points of the rig; matplotlib axes."""
         size = self.cameras[name].views.image_size
         return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
 
-    def plot_uncertainty(self, name: str, distance: float = np.inf, frame: str = "rig", ax=None):
+    def plot_uncertainty(
+        self, name: str, distance: float = np.inf, frame: str = "rig", ax: "Axes | None" = None
+    ) -> "Axes":
         """σ of a projected point over the image of a camera; matplotlib axes."""
         found, one = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name]
         unit = one.adjustment.network.object_unit
@@ -311,19 +319,21 @@ class RigCalibration:
 
 
 @partial(compile_once, static=())
-def _to_angles(mounting: PoseValue):
+def _to_angles(mounting: PoseValue) -> tuple[Array, Array, Array]:
     """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
     block = Pose().prepare(mounting)
     R = block.rotation.matrix()
+    # angles near the given ones, so that κ does not jump by a full turn in the derivatives
     given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
     change = lambda d: exterior(Pose().move(block, tuple(d)), given)
     return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
 
 
-def _mounting(at: PoseValue, C) -> Mounting:
+def _mounting(at: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
     R, angles, J = map(np.asarray, _to_angles(at))
     base = np.asarray(at.position)
     J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
+    # σ of |b|: the variance along b
     along = base / length if length else np.zeros(3)
     return Mounting(
         base,

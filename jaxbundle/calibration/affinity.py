@@ -12,18 +12,18 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
 from jaxbundle.display import print_in_one_screen
+from jaxbundle.types import present
 
 AFFINE = ("b1", "b2")
-CRITICAL = 4.0
-"""|b|/σ above which a parameter is missing."""
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class LeftOut:
+class MissingAffinity:
     """Parameters that were held at 0: their estimates, σ, and the largest image displacement they
     cause, pixels."""
 
@@ -34,7 +34,9 @@ class LeftOut:
 
     @property
     def missed(self) -> bool:
-        return bool((np.abs(self.values) > CRITICAL * self.sigma).any())
+        # from 4 σ: σ0 contains the neglected affinity itself, and other errors of the model; by
+        # chance once in 16 000
+        return bool((np.abs(self.values) > 4.0 * self.sigma).any())
 
     def __str__(self) -> str:
         each = ", ".join(
@@ -47,7 +49,7 @@ class LeftOut:
         )
 
 
-def left_out(adjustment) -> LeftOut | None:
+def find_missing_affinity(adjustment: Adjustment) -> MissingAffinity | None:
     """The affine parameters of an adjusted camera that are not free; None if it has none.
 
     **Arguments:** the adjustment of one camera, with `image_size` and `pixel_size`.
@@ -61,10 +63,12 @@ def left_out(adjustment) -> LeftOut | None:
     columns = tuple(model.parameters.index(name) for name in names)
     found = linearise_image_points(adjustment.problem, adjustment.values, columns)
     score, S = lagrange_multipliers(adjustment, found, found.by_columns)
+    # S is the normal matrix of b after the elimination of all other unknowns (Schur): its inverse
+    # is the cofactor matrix of b as if it had been estimated with them
     cofactor = np.linalg.inv(S)
     b = -cofactor @ score
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))
     # Δx = b1·x̄ + b2·ȳ, largest in a corner
-    half = np.multiply(given.image_size, given.pixel_size) / 2
+    half = np.multiply(present(given.image_size), given.pixel_size) / 2
     reach = [half[AFFINE.index(name)] for name in names]
-    return LeftOut(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))
+    return MissingAffinity(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))
