@@ -9,7 +9,7 @@ from jaxbundle.leastsquares.quality.distributions import (
 )
 from jaxbundle.network.columns import count
 from jaxbundle.refinement import UNIT_OF_WEIGHT, Refinement
-from jaxbundle.refinement.check_points import CheckPoints
+from jaxbundle.refinement.check_points import RefinementCheckPoints
 from jaxbundle.report.layout import significant
 from jaxbundle.report.verdict import (
     DOUBTFUL,
@@ -59,7 +59,7 @@ def _blunders(result: Refinement, found: dict, w: np.ndarray) -> Finding:
     return Finding("Blunders", DOUBTFUL if largest > limit else GOOD, words, likely)
 
 
-def _check_points(check: CheckPoints) -> Finding:
+def _check_points(check: RefinementCheckPoints) -> Finding:
     ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
     largest = np.fmax.reduce(ratio, initial=np.nan)
     limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)

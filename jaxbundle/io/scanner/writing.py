@@ -15,7 +15,7 @@ from jaxbundle.io.text.sections import toml_text
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.interpolation import TimeTable
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.types import AnyArray
 
@@ -86,7 +86,7 @@ def write_scanner_image(
     return path
 
 
-def _options(table: Table, method: str | None = None) -> dict[str, Any]:
+def _options(table: TimeTable, method: str | None = None) -> dict[str, Any]:
     options: dict[str, Any] = {"interpolation": method or table.method}
     if options["interpolation"] in ("lagrange", "usgscsm"):
         options["order"] = table.order
