@@ -16,6 +16,7 @@ poses returned are ours, [r, s, q] = M·X + t with q < 0 in front.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -217,7 +218,8 @@ def _pose_of_flat(columns: Sequence[Column]) -> tuple[tuple[Column, ...], list[B
     """Columns of R, and t, from K⁻¹·H; the first two made perpendicular without preference."""
     size = 2 / (_norm(columns[0]) + _norm(columns[1]))
     first, second = _perpendicular(_unit(columns[0]), _unit(columns[1]))
-    return (first, second, cross(first, second)), [size * c for c in columns[2]]
+    third: Any = cross(cast(Any, first), cast(Any, second))
+    return (first, second, third), [size * c for c in columns[2]]
 
 
 def _pose_of_solid(columns: Sequence[Column]) -> tuple[tuple[Column, ...], list[ByView]]:

@@ -195,7 +195,7 @@ def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
     """What start values of images show about units and axes of a solution, in words."""
     images = result.problem.network.images
     known = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
-    free = {id for id, free in zip(given.images.id, known) if free}
+    free = {given.images.id[k] for k in np.flatnonzero(known)}
     found = {id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free}
     return tuple(
         filter(None, (name_unit_of_positions(given, found), name_other_side(given, found)))

@@ -239,7 +239,7 @@ class Calibration:
         span = float(self.distances.min()), float(self.distances.max())
         distances, middle, corners, reported = self.uncertainty_curves()
         return plotting.uncertainty_curve(
-            distances, middle, corners, span, self._unit, self.name, ax, reported=reported
+            distances, middle, corners, span, self._unit, self.name, ax, reported=tuple(reported)
         )
 
     def plot_halves(self, ax: "Axes | None" = None) -> "Axes":

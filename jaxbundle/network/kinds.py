@@ -14,6 +14,7 @@ the other kinds are the datum defect.
 """
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -85,7 +86,7 @@ class MovingImagePoint(ImagePoint):
         time = read_out[0] * line
         centre = tuple(c + v * time for c, v in zip(pose.centre, velocity[:3]))
         ray = Posed(pose.rotation, centre).ray(point)
-        turned = turn_by(tuple(w * time for w in velocity[3:]), ray)
+        turned: Any = turn_by(tuple(w * time for w in velocity[3:]), ray)
         return cameras.residual(cameras.get_model(self.model), self.domain, interior, turned, xy)
 
 

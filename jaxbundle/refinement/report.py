@@ -137,7 +137,7 @@ def _tests(rows: list[dict], most: int) -> Iterator[str]:
         pair = lambda values, form: " ".join(
             format(x, form) if np.isfinite(x) else f"{'–':>{form.split('.')[0]}}" for x in values
         )
-        mdb = pair(minimal_detectable(1.0, row["r"]), "6.1f")
+        mdb = pair(minimal_detectable(np.ones(1), row["r"]), "6.1f")
         yield (
             f"  {row['image']:12s} {row['point']:12s} {pair(row['v'], '8.3f')} "
             f"{pair(row['r'], '5.2f')} {pair(row['w'], '7.2f')} {mdb}"

@@ -7,7 +7,7 @@ is requested.
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -40,11 +40,11 @@ SYMBOLS = {"pope": "τ", "baarda": "w"}
 # --- residuals ------------------------------------------------------------------------------
 
 
-def residuals(adjustment: "Adjustment", limit: float, test: str, max_rows: int = 100) -> list[str]:
+def residuals(adjustment: Any, limit: float, test: str, max_rows: int = 100) -> list[str]:
     """Residuals over the limit, the largest first, then the distribution of all.
 
-    **Arguments:** `max_rows`: of more residuals the largest are listed, two pages; the tables have
-    all.
+    **Arguments:** `adjustment`: an `Adjustment` or a calibrated rig; `max_rows`: of more residuals
+    the largest are listed, two pages; the tables have all.
     """
     found, symbol = adjustment.residuals, SYMBOLS[test]
     size = np.abs(np.nan_to_num(found[TESTS[test]]))
@@ -135,7 +135,7 @@ def count_by_class(
 # --- reliability ----------------------------------------------------------------------------
 
 
-def redundancy(adjustment: "Adjustment", max_rows: int = 8) -> list[str]:
+def redundancy(adjustment: Any, max_rows: int = 8) -> list[str]:
     """Redundancy numbers: their sum, their range, and the `max_rows` observations that are least
     controlled: enough to see which kind or point they belong to."""
     found = adjustment.residuals
@@ -195,7 +195,7 @@ def components(adjustment: "Adjustment") -> list[str]:
     return lines
 
 
-def removals(adjustment: "Adjustment") -> list[str]:
+def removals(adjustment: Any) -> list[str]:
     """Observations removed by data snooping, in order, and insignificant parameters that were
     fixed."""
     lines = []

@@ -26,6 +26,7 @@ from jaxbundle.orientation import many
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.system.compilation import quick_jit
+from jaxbundle.types import AnyArray
 
 PAIRS, SLOTS = 8, 64
 """Padded numbers of pairs used together, and of matches of each: 512 misclosures for 2 + 8·5
@@ -72,7 +73,7 @@ class CoplanaritySettings:
     leads farther away has found another minimum."""
 
 
-State = tuple[Float[Array, "2"], Float[Array, "pairs 3 3"], Float[Array, "pairs 3"]]
+State = tuple[Float[Array, "2"], Float[AnyArray, "pairs 3 3"], Float[AnyArray, "pairs 3"]]
 """Changes of ln c and K1; M and b of every pair."""
 
 
