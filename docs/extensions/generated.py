@@ -48,7 +48,7 @@ def add_contents(text: str) -> str:
 
 
 def names_of(room: types.ModuleType) -> list[str]:
-    """What a module offers: what its `__init__` imports as itself, or defines."""
+    """What a module offers: what its `__init__` lists, imports as itself, or defines."""
     tree = inspect.getsource(room)
     offered = re.findall(r"\b(\w+) as \1\b", tree)
     defined = [
@@ -56,7 +56,8 @@ def names_of(room: types.ModuleType) -> list[str]:
         for name, value in vars(room).items()
         if getattr(value, "__module__", None) == room.__name__ and not name.startswith("_")
     ]
-    return sorted({*offered, *defined}, key=str.casefold)
+    listed = getattr(room, "__all__", ())
+    return sorted({*listed, *offered, *defined}, key=str.casefold)
 
 
 def list_names(names: list[str]) -> str:
