@@ -2,6 +2,7 @@
 measurements, and satellite positions with an offset on the axes that control has."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float, Int
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.network.further import Antennas, ExteriorPriors
 from jaxbundle.network.sightings import keep_points
-from jaxbundle.network.tables import Distances, Network, Points, Source
+from jaxbundle.network.tables import Distances, LeftOut, Network, Points, Source
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.reconstruction.control_choice import ControlChoice
 from jaxbundle.reconstruction.oriented_block import MeasuredPoint, OrientedBlock
@@ -80,8 +81,25 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         datum_points=(),
         object_unit="m",
         warnings=whole.warnings,
-        notes=whole.notes,
+        notes=tuple(note for note in whole.notes if not says_left_out(note, added.id)),
+        left_out=without_names(network.left_out, added.id),
     )
+
+
+def says_left_out(note: str, ids: tuple[str, ...]) -> bool:
+    """Whether a note says that points were left out that come back: its last words are names."""
+    return note.startswith("left out ") and any(f" {id} " in f"{note} " for id in ids)
+
+
+def without_names(given: Sequence[LeftOut], ids: tuple[str, ...]) -> tuple[LeftOut, ...]:
+    """What is left out although these points come back."""
+    changed = (
+        dataclasses.replace(one, names=tuple(n for n in one.names if n not in ids))
+        if "point" in one.thing
+        else one
+        for one in given
+    )
+    return tuple(one for one in changed if one.names)
 
 
 def _gather_points(

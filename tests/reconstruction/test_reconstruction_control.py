@@ -10,9 +10,11 @@ import pytest
 from jaxbundle import read_network
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import select_checks
+from jaxbundle.network.tables import LeftOut
 from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
+from jaxbundle.reconstruction.controlled_network import says_left_out, without_names
 from jaxbundle.reconstruction.named import NamedMeasurements, name_unused, read_distances
 from jaxbundle.reconstruction.satellite_positions import find_positions
 
@@ -161,3 +163,17 @@ def test_distances(tmp_path):
     assert rows == [{"from": "45", "to": "51", "value": 1.25, "sigma": 0.0001}]
     with pytest.raises(InputError, match="'sigma' is missing"):
         read_distances(written(tmp_path, "from,to,value\n1,2,3\n"))
+
+
+def test_control_that_comes_back_is_not_said_to_be_left_out():
+    """One ray gives no point, but known coordinates and one ray are an observation."""
+    notes = (
+        LeftOut("point", ("gcp00", "17"), "for which no start values were found"),
+        LeftOut("tie point", ("gcp00",), "with one ray"),
+        LeftOut("image point", ("gcp00 in a.jpg",), "that contradict"),
+    )
+    found = without_names(notes, ("gcp00",))
+    assert [one.names for one in found] == [("17",), ("gcp00 in a.jpg",)]
+    text = "left out 1 point for which no start values were found: gcp00 (seen in 1 placed image)"
+    assert says_left_out(text, ("gcp00",)) and not says_left_out(text, ("gcp0", "seen in"))
+    assert not says_left_out("gcp00 is at the place of gcp01", ("gcp00",))
