@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from jaxbundle import Camera
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.minimum import minimise
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.results import result_json
 from jaxbundle.io.results.result_json import result_dict, result_text, without_nan
 from jaxbundle.io.text import csv_tables
 from jaxbundle.leastsquares.quality.distributions import tau_quantile
@@ -310,7 +312,8 @@ def test_an_unknown_of_no_such_name(result, name, said):
 @pytest.mark.parametrize("portion", [7, 10_000])
 @pytest.mark.parametrize("brief", [False, True])
 def test_json_text_in_pieces_is_that_of_the_whole(result, monkeypatch, portion, brief):
-    monkeypatch.setattr(csv_tables, "PORTION", portion)
+    in_portions = partial(csv_tables.take_portions, portion=portion)
+    monkeypatch.setattr(result_json, "take_portions", in_portions)
     text = "".join(result_text(result, brief))
     assert json.loads(text) == without_nan(result_dict(result, brief))
     assert text.endswith("}\n") and text.count("\n") == 1

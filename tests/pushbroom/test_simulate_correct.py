@@ -191,12 +191,11 @@ def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
     system, search, plane = MapSystem(None, None), make_search(image, None), Plane()
     grid, maps, windows = map_of(image, plane, system, 8.0), [], []
     part = correction._parts
-    monkeypatch.setattr(correction, "_parts", lambda *args: [
-        windows.append([b - a for a, b in window]) or (where, window)
-        for where, window in part(*args)
-    ])  # fmt: skip
-    for most in (correction.WINDOW, 6000):
-        monkeypatch.setattr(correction, "WINDOW", most)
+    for most in (2**21, 3000):
+        monkeypatch.setattr(correction, "_parts", lambda line, pixel, image, _, most=most: [
+            windows.append([b - a for a, b in window]) or (where, window)
+            for where, window in part(line, pixel, image, most)
+        ])  # fmt: skip
         windows.clear()
         target = tmp_path / f"{most}.tif"
         write_corrected(source, target, image, search, plane, system, grid)
