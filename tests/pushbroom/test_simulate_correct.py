@@ -192,9 +192,9 @@ def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
     grid, maps, windows = map_of(image, plane, system, 8.0), [], []
     part = correction._parts
     for most in (2**21, 3000):
-        monkeypatch.setattr(correction, "_parts", lambda line, pixel, image, _, most=most: [
+        monkeypatch.setattr(correction, "_parts", lambda line, pixel, image, _, *rest, most=most: [
             windows.append([b - a for a, b in window]) or (where, window)
-            for where, window in part(line, pixel, image, most)
+            for where, window in part(line, pixel, image, most, *rest)
         ])  # fmt: skip
         windows.clear()
         target = tmp_path / f"{most}.tif"
