@@ -32,7 +32,7 @@ def cloud_perspective(
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
     drawn = view.scatter(*few.X.T, c=sigma, s=1.0, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
     view.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
-    view.figure.colorbar(drawn, view=view, label=f"σ{axis}", shrink=0.6)
+    view.figure.colorbar(drawn, ax=view, label=f"σ{axis}", shrink=0.6)
     for name in "xyz":
         label_coordinates(view, name, "")
     return view
