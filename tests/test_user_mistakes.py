@@ -262,6 +262,7 @@ def test_control_in_mm_beside_images_in_m_is_named_although_all_fits():
     assert name_unit_of_positions(given, found) == name_unit_of_positions(given, {}) == ""
     said = name_unit_of_positions(given, {id: 999.7 * X for id, X in found.items()})
     assert "are 999.7 times their start values: is the control in mm" in said
+    assert name_unit_of_positions(given, {id: 600 * X for id, X in found.items()}) == ""
 
 
 def test_images_that_went_to_the_other_side_of_the_control_are_named():

@@ -75,7 +75,11 @@ def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray,
         return ""
     given = np.linalg.norm(network.images.position[rows], axis=1)
     found = np.linalg.norm([images[network.images.id[k]] for k in rows], axis=1)
-    if not all(_thousand(a, b) for a, b in zip(given, found)):
+    # Start values that are wrong in their unit only are good to a tenth; poor ones are not 1000
+    # times too small all together.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        decades = np.abs(np.log10(found / given))
+    if not (np.abs(decades - 3) < np.log10(1.1)).all():
         return ""
     return (
         f"the adjusted projection centres are {found[0] / given[0]:.4g} times their start values: "
