@@ -32,7 +32,7 @@ ATOL = 1e-5
 def prepare(path: str, evaluations: int, reduction: str | None):
     """The problem, and the function that solves it."""
     network = jaxbundle.check_network(jaxbundle.read_network(path))
-    problem = jaxbundle.make_problem(network, reduction=reduction).system
+    problem = jaxbundle.make_problem(network, reduction=reduction)
     solver = make_solver(problem, max_steps=evaluations, atol=ATOL)
     if len(jax.devices()) > 1:
         shards = distribute(problem)

@@ -31,9 +31,10 @@ def main() -> int:
     parser.add_argument("--json", type=machine.target, help="file for the figures; - for stdout")
     options = parser.parse_args()
     import jaxbundle
-    from jaxbundle.bundle.minimum import minimise
     from jaxbundle.bundle.result import Adjustment
     from jaxbundle.calibration.bias import find_bias
+    from jaxbundle.leastsquares.problem import with_data
+    from jaxbundle.leastsquares.solution import find_minimum
 
     jaxbundle.enable_x64()
     tests = Path(__file__).parent.parent / "tests"
@@ -56,9 +57,9 @@ def main() -> int:
         first = jaxbundle.calibrate(views, snooping=None, cross_validation=False, **given)
         problem, found = first.adjustment.problem, [first.bias]
         for seed in range(1, options.draws):
-            xy = simulated(lens, points=points, seed=seed).xy.reshape(problem.data.image_xy.shape)
-            again = problem.with_data(dataclasses.replace(problem.data, image_xy=xy))
-            one = Adjustment(problem.network, again, minimise(again, first.adjustment.values))
+            xy = simulated(lens, points=points, seed=seed).xy.reshape(-1, 2)
+            again = with_data(problem, problem.with_image_coordinates(problem.data, xy))
+            one = Adjustment(problem.network, again, find_minimum(again, first.adjustment.values))
             found.append(find_bias(one, taken.BOARD.grid))
         rate = lambda of, found=found: float(np.mean([bool(of(bias)) for bias in found]))
         figures[name] = {

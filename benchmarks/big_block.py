@@ -26,9 +26,9 @@ import machine
 import numpy as np
 
 import jaxbundle
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.leastsquares.datum.conditions import move_to_datum
 from jaxbundle.leastsquares.problem import pad_values
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.planning.simulate import Simulation, simulate_with_truth
 from jaxbundle.planning.stations import aerial_block, cloud_of_targets
@@ -96,12 +96,12 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
     )
     memory["preparation"] = machine.peak_mb()
 
-    solve = lambda: minimise(problem, problem.data.start)  # noqa: E731
+    solve = lambda: find_minimum(problem, problem.data.start)  # noqa: E731
     minimum, first_s = timed(solve)
     memory["solution"] = machine.peak_mb()
     solve_s = best(solve, repeat)
-    compiled_move, system = eqx.filter_jit(move_to_datum), problem.system
-    ends = problem.layout.tables(minimum.values), problem.layout.tables(problem.data.start)
+    compiled_move, system = eqx.filter_jit(move_to_datum), problem
+    ends = minimum.values, problem.data.start
     values, start = (jax.device_put(pad_values(system, tables)) for tables in ends)
     move = lambda: compiled_move(system.declared, system.plan, values, start)  # noqa: E731
     jax.block_until_ready(move())

@@ -8,7 +8,6 @@ Luhmann et al. 2014, section 3.7), with the best radius and height under the sam
 networks are simulated and adjusted 200 times.
 """
 
-import dataclasses
 import itertools
 import sys
 import time
@@ -17,6 +16,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network_design.pairs import make_pairs
 from jaxbundle.network_design.proof import prove
 from jaxbundle.network_design.realise import problem_of
@@ -72,7 +72,7 @@ def textbook(network: jaxbundle.Network, aim: jaxbundle.Aim) -> tuple[float, tup
             continue
         values = placed(start, stations, origin)
         measured = pairs.measured(values)
-        rays = np.bincount(pairs.problem.point[measured], minlength=len(start.point))
+        rays = np.bincount(pairs.problem.point[measured], minlength=len(start["point"]))
         if rays.min() < 2:
             continue
         found = pairs.aim_at(measured, values)
@@ -92,7 +92,7 @@ def placed(start, stations, origin):
     """The start values with these stations."""
     rotation = np.array([quaternion_from_matrix(matrix_from_omega_phi_kappa(a))
                          for a in stations.angles])  # fmt: skip
-    return dataclasses.replace(start, position=stations.position - origin, rotation=rotation)
+    return start | {"image": PoseValue(stations.position - origin, rotation)}
 
 
 def show(title: str, designed: jaxbundle.Design, seconds: float, least: float) -> bool:

@@ -166,7 +166,7 @@ def _problem(part: str, bal: Path | None):
         made = [sys.executable, str(HERE / "scenes.py"), kind, str(images), str(points), "0", path]
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
     network = jaxbundle.check_network(jaxbundle.read_network(str(path)))
-    return jaxbundle.make_problem(network).system
+    return jaxbundle.make_problem(network)
 
 
 def _timed(jax, run, least=3, seconds=5.0):

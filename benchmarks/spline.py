@@ -70,7 +70,7 @@ def main() -> int:
 
     jaxbundle.enable_x64()
     given = network(options.columns, options.rows, options.images)
-    system = jaxbundle.make_problem(given).system
+    system = jaxbundle.make_problem(given)
     data, found, wrong = pad_data(system, system.data), {}, []
     figures = {"machine": machine.machine(), "image points": len(given.observations.xy),
                "knots": options.columns * options.rows}  # fmt: skip

@@ -16,7 +16,6 @@ from jaxbundle.lazy import import_on_use
 TYPE_CHECKING = False  # avoids importing typing
 
 if TYPE_CHECKING:
-    from jaxbundle.adjustment import Problem as Problem
     from jaxbundle.adjustment import make_problem as make_problem
     from jaxbundle.adjustment import solve as solve
     from jaxbundle.adjustment.gradients import check_gradients as check_gradients
@@ -46,10 +45,11 @@ if TYPE_CHECKING:
     from jaxbundle.io import convert as convert
     from jaxbundle.io import read_network as read_network
     from jaxbundle.io import write_project as write_project
+    from jaxbundle.leastsquares import Data as Data
+    from jaxbundle.leastsquares import Problem as Problem
+    from jaxbundle.leastsquares import Values as Values
     from jaxbundle.network import Camera as Camera
     from jaxbundle.network import Network as Network
-    from jaxbundle.network.arrays import Data as Data
-    from jaxbundle.network.arrays import Values as Values
     from jaxbundle.network.build import add_further as add_further
     from jaxbundle.network.build import make_network as make_network
     from jaxbundle.network.check import check_network as check_network
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from jaxbundle.system.progress import show_progress as show_progress
 
 _HOME = {
-    "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
+    "jaxbundle.adjustment": ("make_problem", "solve"),
     "jaxbundle.batch.calibrate": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.batch.calibrate_rigs": ("RigBatch", "calibrate_rigs"),
     "jaxbundle.bundle.adjust": ("adjust",),
@@ -94,7 +94,7 @@ _HOME = {
     "jaxbundle.adjustment.gradients": ("check_gradients",),
     "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),
-    "jaxbundle.network.arrays": ("Data", "Values"),
+    "jaxbundle.leastsquares": ("Data", "Problem", "Values"),
     "jaxbundle.network.build": ("add_further", "make_network"),
     "jaxbundle.network.check": ("check_network",),
     "jaxbundle.network_design.aims": ("Aim",),
@@ -123,4 +123,4 @@ _HOME = {
 # before they start.
 __getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -82,7 +82,7 @@ def test_listed_precision_of_the_angles(result):
     """φ, ω, κ of the photographs; BINGO's own sequence, M = R3(κ)·R1(ω)·R2(φ)."""
 
     def angles(values):
-        matrices = jax.vmap(matrix_from_quaternion)(values.rotation)
+        matrices = jax.vmap(matrix_from_quaternion)(values["image"].rotation)
         return jax.vmap(phi_omega_kappa_from_matrix)(matrices).ravel()
 
     variance = np.diagonal(result.covariance_of(angles)).reshape(-1, 3)

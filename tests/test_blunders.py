@@ -14,7 +14,6 @@ import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.bundle import far_points
 from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.choices import ESTIMATORS
 from jaxbundle.geometry import matrix_from_quaternion
@@ -100,7 +99,7 @@ def test_baarda_finds_them_too(network):
 def test_what_agrees_comes_back(network):
     """Removed observations that agree with an adjustment without them are restored."""
     spoilt, bad, _ = with_blunders(network, 1)
-    whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt)).system
+    whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
     wrong, right = np.flatnonzero(bad), np.flatnonzero(~bad)[::97]
     removed = [Removed("image", int(row), None, 9.0) for row in (*wrong, *right)]
     less = without(whole, removed)
@@ -114,16 +113,18 @@ def test_predicted_test_of_an_observation(network):
     """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
     problem = jaxbundle.make_problem(jaxbundle.check_network(network))
     row, data = 123, problem.data
-    less = problem.with_system(without(problem.system, [Removed("image", row, None, 0.0)]))
-    minimum = minimise(less, data.start, max_steps=101)
+    less = without(problem, [Removed("image", row, None, 0.0)])
+    minimum = find_minimum(less, data.start, max_steps=101)
     found = Inspection(less, minimum.values).solution
-    predicted = found.predicted_tests(problem.system.data)["image"][row]
+    predicted = found.predicted_tests(problem.data)["image"][row]
     i, p = problem.image[row], problem.point[row]
     model = get_model("brown")
 
     def misclosure(v):
-        ray = matrix_from_quaternion(v.rotation[i]) @ (v.point[p] - v.position[i])
-        return jnp.stack(residual(model, "corrected", tuple(v.camera[0]), ray, data.image_xy[row]))
+        position, rotation = v["image"]
+        ray = matrix_from_quaternion(rotation[i]) @ (v["point"][p] - position[i])
+        xy = data.measured["image"][row]
+        return jnp.stack(residual(model, "corrected", tuple(v["camera"][0]), ray, xy))
 
     result = jaxbundle.Adjustment(less.network, less, minimum)
     h = np.diagonal(result.covariance_of(misclosure)) / result.sigma0**2 / SIGMA**2
@@ -153,11 +154,11 @@ def test_huber_minimises_his_function(network):
     found = adjust(spoilt, robust="huber")
     problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
     lengths = residual_lengths(Inspection(problem, found.values).solution)
-    scale = robust_scale(problem.system, lengths)
+    scale = robust_scale(problem, lengths)
 
     def total(step):
-        moved = found.values.camera.at[0, 0].add(step)
-        values = eqx.tree_at(lambda v: v.camera, found.values, moved)
+        moved = found.values["camera"].at[0, 0].add(step)
+        values = eqx.tree_at(lambda v: v["camera"], found.values, moved)
         t = Inspection(problem, values).lengths / scale
         return np.where(t < 3, t**2 / 2, 3 * t - 4.5).sum()
 
@@ -197,7 +198,7 @@ def test_either_of_two_rays(network):
     point, images = network.points.id[62], [network.images.id[i] for i in rays.image[pair]]
     assert removed.name.startswith("either of ") and len(removed.rows) == 2
     assert all(f"point {point} in image {image}" in removed.name for image in images)
-    assert not (np.asarray(found.problem.data.image_weight)[list(removed.rows)] > 0).any()
+    assert not (found.problem.image_weights[list(removed.rows)] > 0).any()
     assert "either of" in text(found) and "does not show which" in text(found)
     assert f"do not determine them: {point}." in " ".join(text(found).split())
     assert np.isnan([found.points[name][62] for name in ("X", "sX", "rms")]).all()
@@ -241,8 +242,8 @@ def test_rays_that_cannot_mask_each_other_go_together(network):
     """More than one of an image at a time, but one of a point; and they are the blunders."""
     spoilt, bad, _ = with_blunders(network, 1)
     problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
-    found = Solution(problem.system, find_minimum(problem.system, max_steps=101).values)
-    worst = _worst(found, _Touched(problem.system), found.sigma0, 4.5, 3.29)
+    found = Solution(problem, find_minimum(problem, max_steps=101).values)
+    worst = _worst(found, _Touched(problem), found.sigma0, 4.5, 3.29)
     rows = np.array([r.row for r in worst])
     image, point = problem.image[rows], problem.point[rows]
     assert np.bincount(image).max() > 1 and len(set(point)) == len(rows)
@@ -255,8 +256,9 @@ def test_a_large_network_takes_single_steps(network, options, monkeypatch):
     spoilt, _, _ = with_blunders(network, 1)
     usual = adjust(spoilt, **options)
     monkeypatch.setattr(snooping, "SINGLE_STEPS_FROM", 0)
-    calls, whole = [], far_points.minimise
-    monkeypatch.setattr(far_points, "minimise", lambda *a, **k: calls.append(1) or whole(*a, **k))
+    calls, whole = [], far_points.find_minimum
+    counted = lambda *a, **k: calls.append(1) or whole(*a, **k)
+    monkeypatch.setattr(far_points, "find_minimum", counted)
     found = adjust(spoilt, **options)
     assert len(calls) <= 3
     names = lambda result: {r.name for r in (*result.removed, *result.suspects)}

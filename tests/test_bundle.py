@@ -10,13 +10,14 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera
 from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results import result_json
 from jaxbundle.io.results.result_json import result_dict, result_text, without_nan
 from jaxbundle.io.text import csv_tables
+from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.quality.distributions import tau_quantile
 from jaxbundle.leastsquares.quality.names import undetermined
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.tables import EXTERIOR
 
 SIGMA = 0.002
@@ -98,7 +99,7 @@ def test_covariance_of_a_function(result):
     block = result.covariance(a, b)
     ids = list(result.points["id"])
     i, j = ids.index("8"), ids.index("9")
-    total = result.covariance_of(lambda v: v.point[i, 0] + v.point[j, 1])
+    total = result.covariance_of(lambda v: v["point"][i, 0] + v["point"][j, 1])
     assert total[0, 0] == pytest.approx(block.sum(), rel=1e-9)
 
 
@@ -227,7 +228,7 @@ def test_gauss_newton_that_strays_is_not_taken_for_a_minimum(simulation):
         network = simulation.network.replace(points=dataclasses.replace(points, position=moved))
         found = adjust(network, method="gauss-newton")
         if found.converged:
-            again = minimise(found.problem, found.values, max_steps=101)
+            again = find_minimum(found.problem, found.values, max_steps=101)
             lowest = 2 * np.nanmin(again.history.cost)
             assert found.vtpv == pytest.approx(lowest, rel=1e-8)
 
@@ -247,9 +248,9 @@ def test_a_wild_coordinate_ends_without_a_result(simulation):
 
 def test_numbers_that_overflow_have_no_names(result):
     problem = result.problem
-    data = dataclasses.replace(problem.data, image_weight=1e200 * problem.data.image_weight)
-    problem = problem.with_data(data)
-    assert undetermined(problem.system, problem.system.data.start) == []
+    data = problem.with_image_weights(problem.data, 1e200 * problem.data.weight["image"])
+    problem = with_data(problem, data)
+    assert undetermined(problem, problem.data.start) == []
 
 
 def test_an_undetermined_parameter_is_named():

@@ -98,10 +98,13 @@ def test_derivatives():
     assert by_hand == pytest.approx(reported, rel=1e-6)
     assert page["reported"] == pytest.approx(reported, rel=1e-6)
     data, slopes, h = page["data"], page["slopes"], 1e-6
-    moved = lambda t: dataclasses.replace(data, image_xy=data.image_xy.at[page["ray"], 0].add(t))
+    xy = data.measured["image"]
+    moved = lambda t: dataclasses.replace(
+        data, measured=data.measured | {"image": xy.at[page["ray"], 0].add(t)}
+    )
     ends = [page["sigma_of_sigma"](moved(t))[0] for t in (-h, h)]
     difference = (ends[1] - ends[0]) / (2 * h)
-    assert slopes.image_xy[page["ray"], 0] == pytest.approx(float(difference), rel=1e-4)
+    assert slopes.measured["image"][page["ray"], 0] == pytest.approx(float(difference), rel=1e-4)
 
 
 @pytest.mark.further

@@ -72,7 +72,7 @@ def test_heights_are_those_of_object_space(network, alone):
     moved = network.replace(points=_shifted(network.points), images=_shifted(network.images))
     points, images = moved.points.id, moved.images.id
     Z = alone.point_values[3, 2] + 5e6 + 0.25
-    M = np.stack([np.asarray(matrix_from_quaternion(q)) for q in alone.values.rotation])
+    M = np.stack([np.asarray(matrix_from_quaternion(q)) for q in alone.values["image"].rotation])
     result = jaxbundle.adjust(moved, also=[
         height(rows=([points[3]],), measured=np.array([Z]), sigma=1e-3),
         plumb(rows=(images,), measured=M[:, :2, 2], sigma=1e-3),

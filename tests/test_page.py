@@ -19,6 +19,7 @@ from page_reader import Page, column, decode
 import jaxbundle
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cli.outputs import check_targets
+from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.report.head import NO_RESULT
 from jaxbundle.report.page import InputFile, Origin, compose, compose_failure, fingerprint_files
 from jaxbundle.report.page.columns import Column, encode_table, encode_values
@@ -187,10 +188,8 @@ def test_the_worst_finding_makes_the_verdict():
 def test_a_fit_that_the_test_refuses_is_not_met(convergent4):
     """χ² with 23 degrees of freedom: 95 % are between 11.69 and 38.08 (published tables)."""
     problem = convergent4.problem
-    scaled = dataclasses.replace(
-        problem.data, image_weight=1.5 * np.asarray(problem.data.image_weight)
-    )
-    problem, network = problem.with_data(scaled), problem.network
+    scaled = problem.with_image_weights(problem.data, 1.5 * problem.image_weights)
+    problem, network = with_data(problem, scaled), problem.network
     rays = dataclasses.replace(network.observations, sigma_origin="stated")
     problem = dataclasses.replace(problem, network=network.replace(observations=rays))
     changed = Adjustment(convergent4.network, problem, convergent4.minimum)

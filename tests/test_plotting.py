@@ -131,7 +131,7 @@ def test_sigma_of_the_profile(convergent4):
     sigma = np.sqrt(direction @ C[np.ix_(P, P)] @ direction)
     np.testing.assert_allclose(found.decentring_sigma, sigma * r**2, rtol=1e-7, atol=1e-15)
     problem = convergent4.problem
-    away = np.asarray(problem.data.image_xy)[problem.camera == 0] - [p["x0"], p["y0"]]
+    away = problem.image_coordinates()[problem.camera == 0] - [p["x0"], p["y0"]]
     assert r[-1] == pytest.approx(np.hypot(*away.T).max())
 
 
@@ -290,11 +290,11 @@ def test_pyramids_are_the_corners_of_the_images(convergent4):
     np.testing.assert_allclose(edges.mean(1), size)
     model = get_model("brown")
     p = tuple(convergent4.camera_parameters("cam").values())
-    M = jax.vmap(matrix_from_quaternion)(convergent4.values.rotation)
+    M = jax.vmap(matrix_from_quaternion)(convergent4.values["image"].rotation)
     rays = np.einsum("iab,icb->ica", M, pyramids[:, 1:] - pyramids[:, :1])
     image_of = jax.jit(jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, p, *ray)))))
     xy = np.asarray(image_of(rays))
-    measured = np.asarray(convergent4.problem.data.image_xy)
+    measured = convergent4.problem.image_coordinates()
     for corners in xy:
         np.testing.assert_allclose(corners.min(0), measured.min(0), atol=1e-9)
         np.testing.assert_allclose(corners.max(0), measured.max(0), atol=1e-9)

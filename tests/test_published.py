@@ -14,8 +14,8 @@ import pytest
 import jaxbundle
 from jaxbundle.adjustment import make_problem
 from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 
 pytestmark = pytest.mark.slow
@@ -44,7 +44,7 @@ def network():
 @pytest.mark.parametrize("free, domain, redundancy, vtv, sigma0", SOLUTIONS)
 def test_the_solutions_of_the_four_photographs(network, free, domain, redundancy, vtv, sigma0):
     problem = make_problem(check_network(with_free(network, free, domain)))
-    minimum = minimise(problem, problem.data.start)
+    minimum = find_minimum(problem, problem.data.start)
     assert converged(int(minimum.termination))
     vtpv = 2 * np.nanmin(minimum.history.cost)
     assert problem.counts.redundancy == redundancy

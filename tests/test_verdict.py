@@ -180,7 +180,7 @@ def test_handheld_control_is_an_uncertain_georeference_and_no_weak_network():
     # The mean of four control points; σ0 is a posteriori.
     value = float(told.split("uncertain to ")[1].split(" ")[0])
     assert value == pytest.approx(0.05 * result.sigma0, rel=0.1)
-    X = lambda values: values.point.mean(0)  # As propagated.
+    X = lambda values: values["point"].mean(0)  # As propagated.
     largest = np.sqrt(np.linalg.eigvalsh(result.covariance_of(X))[-1])
     assert value == pytest.approx(largest, rel=0.05)
     control = finding(result, "Control")
@@ -188,7 +188,7 @@ def test_handheld_control_is_an_uncertain_georeference_and_no_weak_network():
     assert "georeference uncertain to" in result.verdict.words
     # What is said of the images holds: ratios of distances, which no datum changes.
     def ratio(values):
-        X0 = values.position
+        X0 = values["image"].position
         away = lambda i, k: jnp.linalg.norm(X0[i] - X0[k])
         return jnp.stack([away(0, 1) / away(1, 2), away(2, 3) / away(1, 2)])
 

@@ -7,6 +7,6 @@ statistics.
 from jaxbundle.adjustment.equations import design_matrix as design_matrix
 from jaxbundle.adjustment.equations import residuals as residuals
 from jaxbundle.adjustment.problem import Counts as Counts
-from jaxbundle.adjustment.problem import Problem as Problem
+from jaxbundle.adjustment.problem import NetworkProblem as NetworkProblem
 from jaxbundle.adjustment.problem import make_problem as make_problem
 from jaxbundle.adjustment.solve import solve as solve

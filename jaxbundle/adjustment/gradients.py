@@ -2,19 +2,19 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import solve
 from jaxbundle.arguments import integer, positive, show
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Data
+from jaxbundle.leastsquares.indexing.rows import Data
+from jaxbundle.leastsquares.problem import Problem
 
 MOST_HALVINGS = 10
 """The shortest step is 2¹⁰ = 1000 times shorter than the given one: from 1e-4 to 1e-7, whose
@@ -64,8 +64,8 @@ def check_gradients(
 
     - `function`: any function of arrays (pytrees) to arrays; or a `CameraModel` with the
       arguments (parameters, ray) of `jaxbundle.cameras.project`; or a `Problem`, whose adjusted
-      unknowns are differentiated with respect to `Data` (its own if no argument is given;
-      `options` go to `jaxbundle.solve`).
+      unknowns are differentiated with respect to `Data`, or to its measurements by set of
+      observations (its own if no argument is given; `options` go to `jaxbundle.solve`).
     - `step`: the longest of the differences, relative to the size of each leaf of the arguments;
       for the arguments of a camera model, which have many units, relative to the change that
       would move the image point by its distance from the origin. It is halved until the
@@ -85,13 +85,12 @@ def check_gradients(
         arguments = tuple(jnp.asarray(leaf, float) for leaf in arguments)
     elif isinstance(function, Problem):
         problem = function
-        arguments = arguments or (problem.data.image_xy,)
-        if len(arguments) == 1 and not isinstance(arguments[0], Data):
-            function = lambda xy: solve(
-                problem, eqx.tree_at(lambda d: d.image_xy, problem.data, xy), **options
-            )
-        else:
+        arguments = arguments or (problem.data.measured,)
+        if isinstance(arguments[0], Data):
             function = lambda data: solve(problem, data, **options)
+        else:
+            with_measured = partial(dataclasses.replace, problem.data)
+            function = lambda measured: solve(problem, with_measured(measured=measured), **options)
     x, unravel = ravel_pytree(tuple(jax.tree.map(jnp.asarray, arguments)))
     sizes = ravel_pytree(
         jax.tree.map(lambda a: jnp.full(jnp.shape(a), _size(a)), tuple(arguments))

@@ -1,10 +1,13 @@
-"""A network prepared for the engine: plan, arrays, datum and counts of rows."""
+"""A network prepared for the engine: plan, data and datum, with its names, units and origin."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
@@ -13,18 +16,21 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
+from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.leastsquares.datum.defect import CannotHold
 from jaxbundle.leastsquares.datum.motions import SEVEN
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.leastsquares.indexing.rows import Data, Values
+from jaxbundle.network.camera_tables import CameraTable
 from jaxbundle.network.datum_words import open_directions_in_words
-from jaxbundle.network.declare import Layout, declare, order_cameras
-from jaxbundle.network.further.base import among
-from jaxbundle.network.further.rolling_shutter import RollingShutter
+from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
+from jaxbundle.network.kinds.base import among
+from jaxbundle.network.kinds.image_points import image_coordinates
+from jaxbundle.network.kinds.rolling_shutter import RollingShutter
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
-from jaxbundle.types import present
+from jaxbundle.types import AnyArray, present
 
 HELD = 1e-6
 """Below this part of a motion a datum direction counts as none."""
@@ -32,7 +38,8 @@ HELD = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """Rows and columns of the adjustment; redundancy = rows + datum conditions − unknowns."""
+    """Rows and columns of the adjustment of a network; redundancy = rows + datum conditions −
+    unknowns. `observations`: image coordinates."""
 
     observations: int
     control: int
@@ -54,24 +61,24 @@ class Counts:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Problem:
-    """The input of `jaxbundle.solve`: a network as the engine sees it.
+class NetworkProblem(engine.Problem):
+    """A problem of the engine that knows its network.
 
-    `network` is the network as adjusted (cameras in the order of the arrays); `data` its numbers,
-    `system` the engine's problem, `layout` the mapping between their arrays; `origin`
-    [3] was subtracted from all object coordinates.
+    `network`: as adjusted (cameras in the order of the arrays); the others are those of
+    `network.declare.DeclaredNetwork`. Names of tables and sets of observations: see there.
     """
 
     network: Network
-    system: engine.Problem
-    layout: Layout
-    data: Data
+    cameras: tuple[CameraTable, ...]
+    image_rows: Mapping[str, Int[np.ndarray, " rows"]]
+    further_sets: tuple[str, ...]
+    further_tables: tuple[str, ...]
     origin: Float[np.ndarray, "3"]
-    counts: Counts
+    lengths: Float[np.ndarray, " points"] | None
 
     @property
     def image(self) -> Int[np.ndarray, " rays"]:
-        """The image of every image point, in the order of `data` and of the network."""
+        """The image of every image point, in the order of the network."""
         return self.network.observations.image
 
     @property
@@ -84,64 +91,145 @@ class Problem:
         """The camera of every image point."""
         return self.network.images.camera[self.image]
 
+    def image_points(self, by_set: Mapping[str, Any]) -> Any:
+        """A quantity of the image points [rays, …] in the order of the network, from those of the
+        sets: such as `data.weight`, or residuals."""
+        return self._in_order({name: by_set[name] for name in self.image_rows})
+
+    def image_coordinates(self, data: Data | None = None) -> Any:
+        """Measured x and y [rays, 2] in the order of the network; by default those of the problem,
+        on the host."""
+        measured = (self.data if data is None else data).measured
+        xy = self._in_order({name: image_coordinates(measured[name]) for name in self.image_rows})
+        return np.asarray(xy) if data is None else xy
+
+    def with_image_coordinates(self, data: Data, xy: AnyArray) -> Data:
+        """Data with other x and y [rays, 2]."""
+        measured = dict(data.measured)
+        for name, rows in self.image_rows.items():
+            given = measured[name]
+            measured[name] = (xy[rows], given[1]) if isinstance(given, tuple) else xy[rows]
+        return dataclasses.replace(data, measured=measured)
+
+    def with_image_weights(self, data: Data, weight: AnyArray) -> Data:
+        """Data with other weights 1/σ [rays, 2] of image coordinates."""
+        changed = {name: weight[rows] for name, rows in self.image_rows.items()}
+        return dataclasses.replace(data, weight={**data.weight, **changed})
+
+    def _in_order(self, parts: Mapping[str, Any]) -> Any:
+        if len(parts) == 1:
+            return next(iter(parts.values()))
+        shape = np.shape(next(iter(parts.values()), np.zeros((0, 2))))[1:]
+        if any(isinstance(part, Tracer) for part in parts.values()):
+            found = jnp.zeros((len(self.image), *shape))
+            for name, part in parts.items():
+                found = found.at[self.image_rows[name]].set(part)
+            return found
+        found = np.zeros((len(self.image), *shape))
+        for name, part in parts.items():
+            found[self.image_rows[name]] = np.asarray(part)
+        return found
+
+    @property
+    def image_weights(self) -> Float[np.ndarray, "rays 2"]:
+        """1/σ of the image coordinates, 0 for those that take no part."""
+        return np.asarray(self.image_points(self.data.weight))
+
+    @property
+    def used(self) -> Bool[np.ndarray, " rays"]:
+        """Which image points take part in the adjustment."""
+        return np.asarray((self.image_weights > 0).any(1))
+
+    def interior_orientation(self, values: Values) -> AnyArray:
+        """The parameters of all cameras, in the order of those of their models, padded with 0."""
+        if len(self.cameras) == 1:
+            return values[self.cameras[0].name]
+        width = max(len(table.parameters) for table in self.cameras)
+        rows = [values[table.name] for table in self.cameras]
+        module = jnp if any(isinstance(part, Tracer) for part in rows) else np
+        wide = [module.pad(part, [(0, 0), (0, width - part.shape[1])]) for part in rows]
+        places = np.argsort(np.concatenate([table.cameras for table in self.cameras]))
+        return module.concatenate(wide)[places]
+
+    def with_interior_orientation(self, values: Values, rows: AnyArray) -> Values:
+        """Values with other parameters of all cameras, as `interior_orientation` gives them."""
+        return values | {
+            table.name: rows[table.cameras, : len(table.parameters)] for table in self.cameras
+        }
+
+    def table_of_camera(self, c: int) -> tuple[CameraTable, int]:
+        """The table of a camera of the network, and its row there."""
+        table = next(table for table in self.cameras if c in table.cameras)
+        return table, int(np.flatnonzero(table.cameras == c)[0])
+
+    def free_parameters(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
+        """The parameters free in any camera of the table of a camera, and which of them are free in
+        this camera."""
+        table, row = self.table_of_camera(c)
+        given = self.table(table.name)
+        return given.parameters, np.flatnonzero(given.free[row])
+
     @property
     def at_any_distance(self) -> Bool[np.ndarray, " points"]:
         """Which points are parametrised as directions and inverse distances."""
-        lengths = self.layout.lengths
-        return np.zeros(len(self.network.points), bool) if lengths is None else lengths > 0
+        if self.lengths is None:
+            return np.zeros(len(self.network.points), bool)
+        return self.lengths > 0
 
     @property
     def excluded(self) -> Bool[np.ndarray, " points"]:
         """Which points data snooping left with too few rays, or with rays that do not determine
         them."""
-        rays = np.bincount(
-            self.point[(np.asarray(self.data.image_weight) > 0).any(1)],
-            minlength=len(self.network.points),
-        )
-        held = ~self.system.table("point").free.any(1)
+        rays = np.bincount(self.point[self.used], minlength=len(self.network.points))
+        held = ~self.table("point").free.any(1)
         return ~self.network.points.has_role("fixed") & held & (rays == 0)
 
-    def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
-        """The parameters free in any camera of the model, and which of them are free in this
-        camera."""
-        table = next(t for t in self.layout.cameras if c in t.cameras)
-        given = self.system.table(table.name)
-        row = int(np.flatnonzero(table.cameras == c)[0])
-        return given.parameters, np.flatnonzero(given.free[row])
+    def cofactors_of_coordinates(
+        self, points: Float[AnyArray, "points width"], Q: Float[AnyArray, "points 3 3"]
+    ) -> Float[AnyArray, "points 3 3"]:
+        """The cofactors of X, Y, Z of all points, from those of their directions of change."""
+        if self.lengths is None:
+            return Q
+        A = jax.vmap(derivative)(jnp.asarray(points))
+        return A @ Q @ A.transpose(0, 2, 1)
 
     @property
     def reduction(self) -> str:
         """Solver of the reduced system."""
-        return present(self.system.plan.reduction)
+        return present(self.plan.reduction)
 
-    def with_system(self, system: engine.Problem) -> "Problem":
-        """The same problem with a changed system: weights, held unknowns and their values."""
-        data = self.layout.with_weights(self.data, system.data.weight)
-        if self.layout.lengths is not None:
-            data = dataclasses.replace(data, start=self.layout.values(system.data.start))
-        return self._with(system, data)
+    @property
+    def rows_and_unknowns(self) -> Counts:
+        """How many rows with weight of every kind, datum conditions and free unknowns there are."""
+        number: dict[str, int] = dict.fromkeys(("image", *PSEUDO_OBSERVATIONS), 0)
+        for name in set(self.data.weight) - set(self.further_sets):
+            number[name.partition(",")[0]] += int((np.asarray(self.data.weight[name]) > 0).sum())
+        return Counts(
+            observations=number["image"],
+            control=number["control"],
+            exterior=number["exterior"],
+            interior=number["interior"],
+            distances=number["distance"],
+            other=self.counts.observations - sum(number.values()),
+            datum=self.counts.datum,
+            unknowns=self.counts.unknowns,
+        )
 
-    def with_factor(self) -> "Problem":
-        """The same problem with a reduced system that can be factorised for the statistics;
-        unchanged if no factor fits into memory."""
-        return self.with_system(engine.with_factor(self.system))
 
-    def with_data(self, data: Data) -> "Problem":
-        """The same problem with other data (except start values that define the datum)."""
-        return self._with(engine.with_data(self.system, self.layout.data(data)), data)
+PSEUDO_OBSERVATIONS = ("control", "exterior", "interior", "distance")
+"""The sets of a network beside image points; with cameras of several models "interior, MODEL"."""
 
-    def hold(self, table: str, rows, columns: slice | Sequence[int] = slice(None)) -> "Problem":
-        """The same problem with some unknowns held at their start values."""
-        return self._with(engine.hold(self.system, table, rows, columns), self.data)
 
-    def with_free(self, table: str, free) -> "Problem":
-        """The same problem with only these unknowns of a table free, the others held at their start
-        values."""
-        return self._with(engine.with_free(self.system, table, free), self.data)
+def coordinates(values: Values) -> Float[AnyArray, "points 3"]:
+    """X, Y, Z of all points, relative to the origin."""
+    return values["point"][:, :3]
 
-    def _with(self, system, data: Data) -> "Problem":
-        counts = count_rows(self.layout, system)
-        return dataclasses.replace(self, system=system, data=data, counts=counts)
+
+def with_coordinates(
+    rows: Float[AnyArray, "points width"], X: Float[AnyArray, "points 3"]
+) -> Float[AnyArray, "points width"]:
+    """Rows of the table of points with other coordinates."""
+    return jax.device_put(np.concatenate([np.asarray(X), np.asarray(rows)[:, 3:]], 1))
 
 
 def make_problem(
@@ -150,8 +238,8 @@ def make_problem(
     reduction: str | None = None,
     also: Sequence[Table | Observations] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
-) -> Problem:
-    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check.check_network`).
+) -> NetworkProblem:
+    """Plan, data and datum of a checked network (see `jaxbundle.network.check.check_network`).
 
     Check points and their rays are excluded.
 
@@ -172,7 +260,7 @@ def make_problem(
         chosen, origin = chosen & (lengths == 0), np.round(network.images.position.mean(0))
     declared = declare(network, origin, also, lengths)
     try:
-        system = engine.make_problem(
+        problem = engine.make_problem(
             declared.tables,
             declared.observations,
             "point",
@@ -187,12 +275,26 @@ def make_problem(
             f"{error.defect} of 7 parameters are open: give at least three free points that "
             "are not collinear (datum_points), or omit the setting"
         ) from None
-    data = jax.device_put(declared.data)
-    counts = count_rows(declared.layout, system)
-    return Problem(network, system, declared.layout, data, declared.origin, counts)
+    return _of_network(problem, network, declared)
 
 
-def _datum_points(network: Network):
+def _of_network(
+    problem: engine.Problem, network: Network, declared: DeclaredNetwork
+) -> NetworkProblem:
+    own = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)}
+    return NetworkProblem(
+        **own,
+        network=network,
+        cameras=declared.cameras,
+        image_rows=declared.image_rows,
+        further_sets=declared.further_sets,
+        further_tables=declared.further_tables,
+        origin=declared.origin,
+        lengths=declared.lengths,
+    )
+
+
+def _datum_points(network: Network) -> Bool[np.ndarray, " points"]:
     """Which points carry the datum if it is open."""
     points = network.points
     if network.datum_points:
@@ -201,7 +303,12 @@ def _datum_points(network: Network):
     return chosen if chosen.any() else points.has_role("control")
 
 
-def _datum(network: Network, gauge, origin, chosen):
+def _datum(
+    network: Network,
+    gauge: Float[np.ndarray, "7 defect"],
+    origin: Float[np.ndarray, "3"],
+    chosen: Bool[np.ndarray, " points"],
+) -> tuple[dict[str, Float[np.ndarray, "points 3"]], bool]:
     """The datum constraints; refused if the setting requires the observations to fix the datum."""
     if network.datum == "control":
         points = network.points
@@ -221,35 +328,16 @@ def _datum(network: Network, gauge, origin, chosen):
     return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
 
 
-def count_rows(layout: Layout, system: engine.Problem) -> Counts:
-    """Rows with weight, datum conditions, free unknowns."""
-    fields = "image", "control", "exterior", "interior", "distance"
-    number: dict[str, int] = dict.fromkeys(fields, 0)
-    for s in layout.sets:
-        number[s.field] += int((np.asarray(system.data.weight[s.name]) > 0).sum())
-    return Counts(
-        observations=number["image"],
-        control=number["control"],
-        exterior=number["exterior"],
-        interior=number["interior"],
-        distances=number["distance"],
-        other=system.counts.observations - sum(number.values()),
-        datum=system.counts.datum,
-        unknowns=system.counts.unknowns,
-    )
-
-
-def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
+def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:
     """A problem of other points of the network with the orientations and cameras of `values`,
     without priors and datum: for excluded points."""
-    moving = tuple(f for f in network.further if isinstance(f, RollingShutter))
-    declared = declare(network.replace(further=moving), like.origin)
-    layout = declared.layout
-    start = dataclasses.replace(values, point=declared.data.start.point)
-    start = layout.tables(jax.tree.map(np.asarray, start))
-    tables = tuple(dataclasses.replace(t, value=start[t.name]) for t in declared.tables)
-    seen = len([s for s in layout.sets if s.field == "image"])
-    system = engine.make_problem(tables, declared.observations[:seen], "point")
-    layout = dataclasses.replace(layout, sets=layout.sets[:seen], others=())
-    counts = count_rows(layout, system)
-    return Problem(network, system, layout, declared.data, like.origin, counts)
+    shutters = tuple(one for one in network.further if isinstance(one, RollingShutter))
+    declared = declare(network.replace(further=shutters), like.origin)
+    known: dict[str, Any] = {name: jax.tree.map(np.asarray, rows) for name, rows in values.items()}
+    tables = tuple(
+        table if table.name == "point" else dataclasses.replace(table, value=known[table.name])
+        for table in declared.tables
+    )
+    observations = tuple(o for o in declared.observations if o.name in declared.image_rows)
+    problem = engine.make_problem(tables, observations, "point")
+    return _of_network(problem, network, dataclasses.replace(declared, further_sets=()))

@@ -1,12 +1,12 @@
-"""`solve`: arrays in, adjusted arrays out, differentiable, under jit and vmap."""
+"""`solve`: data in, adjusted tables out, differentiable, under jit and vmap."""
 
-from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import one_of, show
 from jaxbundle.choices import METHODS
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
+from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality import derivatives
-from jaxbundle.network.arrays import Data, Values
 
 
 def solve(
@@ -26,31 +26,30 @@ def solve(
     **Arguments:**
 
     - `problem`: from `make_problem`.
-    - `data`: numbers that replace `problem.data` (same shapes); object coordinates relative to
-      `problem.origin`.
+    - `data`: numbers that replace `problem.data` (same shapes): start values, measurements and
+      weights by name; object coordinates relative to `problem.origin`.
     - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
       `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation, first order only); see
       `jaxbundle.leastsquares.quality.derivatives`.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
 
-    **Returns:** `Values`; all NaN, including derivatives, if the solver did not converge, so that a
-    failure is never mistaken for a solution.
+    **Returns:** the tables by name (`network.declare`): `values["point"]`, `values["camera"]`,
+    `values["image"].position` and `.rotation`; all NaN, including derivatives, if the solver did
+    not converge, so that a failure is never mistaken for a solution.
 
     **Raises:** `InputError` for invalid arguments, and for a second derivative of the Gauss–Newton
     form.
     """
     check_given(problem, data)
     one_of("method", method, METHODS)
-    data = problem.data if data is None else data
-    tables = derivatives.solve(
-        problem.system,
-        problem.layout.data(data),
+    return derivatives.solve(
+        problem,
+        data,
         sensitivity=sensitivity,
         max_iterations=max_iterations,
         atol=atol,
         search=SEARCHES[method],
     )
-    return problem.layout.values(tables)
 
 
 def check_given(problem: Problem, data: Data | None) -> None:

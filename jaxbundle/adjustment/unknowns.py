@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -15,13 +15,13 @@ from jaxbundle.geometry import (
     omega_phi_kappa_near,
     retract_quaternion,
 )
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.names import Name
-from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 
 
-def find_unknowns(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
+def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
     """Unknowns by name, e.g. `("camera", "cam", "c")`, `("image", "12", "kappa")`,
     `("point", "7", "Z")`.
 
@@ -43,7 +43,7 @@ def find_unknowns(problem: Problem, names: Sequence[tuple[str, str, str]]) -> li
     return wanted
 
 
-def require_located(problem: Problem, name: Name) -> None:
+def require_located(problem: NetworkProblem, name: Name) -> None:
     """Refuse an unknown of a point that data snooping excluded.
 
     **Raises:** `InputError`."""
@@ -51,7 +51,7 @@ def require_located(problem: Problem, name: Name) -> None:
         raise InputError(f"point {name.id} was excluded by data snooping: it has no coordinates")
 
 
-def value_of(problem: Problem, name: Name, values: Values):
+def value_of(problem: NetworkProblem, name: Name, values: Values):
     """The unknown with this name; exterior orientation as X0, Y0, Z0, ω, φ, κ (radians).
 
     **Raises:** `KeyError` for an unknown name."""
@@ -59,15 +59,17 @@ def value_of(problem: Problem, name: Name, values: Values):
     if name.kind == "camera":
         c = place_of(name.id, [camera.id for camera in network.cameras], "camera")
         parameters = get_model(network.cameras[c].model).parameters
-        return values.camera[c, place_of(name.parameter, parameters, "camera parameter")]
+        table, row = problem.table_of_camera(c)
+        return values[table.name][row, place_of(name.parameter, parameters, "camera parameter")]
     if name.kind == "image":
         i = place_of(name.id, network.images.id, "image")
-        angles = angles_near(values.rotation[i], jnp.zeros(3), network.images.angles[i])
-        pose = jnp.concatenate([values.position[i], angles])
+        position, rotation = values["image"]
+        angles = angles_near(rotation[i], jnp.zeros(3), network.images.angles[i])
+        pose = jnp.concatenate([position[i], angles])
         return pose[place_of(name.parameter, EXTERIOR, "image parameter")]
     if name.kind == "point":
         p = place_of(name.id, network.points.id, "point")
-        return values.point[p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
+        return values["point"][p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
     raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
 
 

@@ -29,7 +29,7 @@ from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.network.build import make_network
-from jaxbundle.network.further.rolling_shutter import VELOCITY
+from jaxbundle.network.kinds.rolling_shutter import VELOCITY
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 
 UNEXPECTED = (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError)
@@ -186,7 +186,7 @@ def _contradicting(rig: RigViews, result: Adjustment, settings: RigSettings) -> 
     place = {id: e for of in rig.images for e, id in enumerate(of)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
     of_ray = epoch[result.problem.image]
-    lengths = settings.sigma * np.hypot(*np.asarray(result.inspection.residuals.image).T)
+    lengths = settings.sigma * np.hypot(*result.inspection.image_residuals.T)
     number = np.bincount(of_ray, minlength=len(rig.epochs))
     rms = np.sqrt(np.bincount(of_ray, lengths**2, len(rig.epochs)) / np.maximum(number, 1))
     shared = np.bincount(epoch, minlength=len(rig.epochs)) > 1
@@ -197,8 +197,8 @@ def _residual_lengths(result: Adjustment | None, settings: RigSettings) -> Float
     """Residual lengths of the image points used, pixels."""
     if result is None:
         return np.zeros(0)
-    used = (np.asarray(result.problem.data.image_weight) > 0).all(1)
-    v = settings.sigma * np.asarray(result.inspection.residuals.image)
+    used = (result.problem.image_weights > 0).all(1)
+    v = settings.sigma * result.inspection.image_residuals
     return np.hypot(*v.T)[used]
 
 

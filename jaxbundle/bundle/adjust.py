@@ -3,11 +3,11 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.bundle.exclusions import (
     Undetermined,
@@ -26,7 +26,6 @@ from jaxbundle.bundle.minimum import (
     adjusted_cameras,
     inspect_solution,
     is_misjudged,
-    minimise,
     name_inseparable,
     names_of_defects,
     start_with,
@@ -44,11 +43,13 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.problem import with_factor
 from jaxbundle.leastsquares.quality.snooping import check_test
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
@@ -169,7 +170,7 @@ def adjust(
     first = _First(reduction, also, oriented, told)
     problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **told)
-    found = _Found(problem.network, problem.with_factor(), minimum, method, problem.reduction)
+    found = _Found(problem.network, with_factor(problem), minimum, method, problem.reduction)
     if robust:
         found.weight_robustly(again, robust, significance)
     if found.inspection:
@@ -207,7 +208,7 @@ def _try_mirrored(reduction: str | None, options, network: Network) -> float | N
     problem, minimum, _ = _First(reduction, (), _place(orient(network)), options).find(
         network, outliers=False
     )
-    solved = inspect_solution(problem.with_factor(), minimum)
+    solved = inspect_solution(with_factor(problem), minimum)
     return _sigma0(problem, minimum) if solved else None
 
 
@@ -220,7 +221,7 @@ class _First:
     oriented: Oriented | None
     options: Mapping[str, Any]
 
-    def find(self, given: Network, outliers: bool) -> tuple[Problem, Minimum, tuple]:
+    def find(self, given: Network, outliers: bool) -> tuple[NetworkProblem, Minimum, tuple]:
         """Adjust from the start values of `given`, which may contain `outliers`, or those computed
         for it: the problem, where its iterations ended, check points and their image points."""
         network = given if self.oriented is None else self.oriented.network
@@ -232,21 +233,21 @@ class _First:
             if network is fewer:
                 break
             found = self._minimise(network, partial(start_with, cameras=cameras))
-        if outliers and not inspect_solution(found[0].with_factor(), found[1]):
+        if outliers and not inspect_solution(with_factor(found[0]), found[1]):
             screened = screen(network)
             if len(screened.observations) < len(network.observations):
                 found, network = self._minimise(screened), screened
         left_out = network is not given and network.left_out[len(given.left_out) :]
         return self._try_again(given, found) if left_out or found[3] else found[:3]
 
-    def _try_again(self, given: Network, found) -> tuple[Problem, Minimum, tuple]:
+    def _try_again(self, given: Network, found) -> tuple[NetworkProblem, Minimum, tuple]:
         """Adjust again, with everything left out because of start values that agrees with the
         adjusted orientation, until nothing more does."""
         if self.oriented is not None:
             given = given.note(f"start values found, {self.oriented.frame}")
             given = given.warn(*filter(None, [self.oriented.finding]))
         rounds, final = 0, Undetermined()
-        while inspect_solution(found[0].with_factor(), found[1]):
+        while inspect_solution(with_factor(found[0]), found[1]):
             problem, minimum, check, gone, current = found
             if rounds:  # Here they were left out at the end of an adjustment with them.
                 final += gone
@@ -267,7 +268,7 @@ class _First:
                     return dataclasses.replace(problem, network=network), minimum, check
                 carried = partial(carry, before=problem, values=minimum.values)
                 again = self._minimise(whole, carried, look=False)
-                solved = inspect_solution(again[0].with_factor(), again[1])
+                solved = inspect_solution(with_factor(again[0]), again[1])
             except (InputError, NotSolvedError):
                 solved = None
             if not solved:
@@ -280,8 +281,11 @@ class _First:
         return found[:3]
 
     def _minimise(
-        self, network: Network, begin: Callable[[Problem], Values] | None = None, look: bool = True
-    ) -> tuple[Problem, Minimum, tuple, Undetermined, Network]:
+        self,
+        network: Network,
+        begin: Callable[[NetworkProblem], Values] | None = None,
+        look: bool = True,
+    ) -> tuple[NetworkProblem, Minimum, tuple, Undetermined, Network]:
         """The minimum of a network without what its rays do not determine, the check points, what
         was left out, and the network with its check points; `look`: also before the minimum."""
         gone, factor = Undetermined(), None
@@ -300,7 +304,7 @@ class _First:
             more = find(problem, start, factor) if look else Undetermined()
             if not more and look and may_be_undetermined(problem, start):
                 options = {**self.options, "max_steps": min(EVALUATIONS_BEFORE_A_LOOK, left)}
-                legs, look = [minimise(problem, start, **options)], False
+                legs, look = [find_minimum(problem, start, **options)], False
                 left -= int(legs[0].iterations)
                 factor, start = _noise_factor(problem, legs[0]), legs[0].values
                 more = find(problem, start, factor)
@@ -330,13 +334,13 @@ class _Found:
     """State of an adjustment; each step changes it."""
 
     network: Network
-    problem: Problem
+    problem: NetworkProblem
     minimum: Minimum
     method: str
     reduction: str
     said: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Arguments of the `Adjustment`."""
-    inspected: tuple[Problem, Minimum, Inspection | None] | None = None
+    inspected: tuple[NetworkProblem, Minimum, Inspection | None] | None = None
 
     @property
     def inspection(self) -> Inspection | None:
@@ -350,7 +354,7 @@ class _Found:
     def weight_robustly(self, again, robust: str, significance: float) -> None:
         found, self.minimum = adjust_robustly(self.problem, self.minimum, again, robust)
         suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
-        self.problem = self.problem.with_system(found.found.problem)
+        self.problem = cast(NetworkProblem, found.found.problem)
         doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
         self.said |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
         self.said["doubts"] = (doubt,) if doubt else ()
@@ -430,7 +434,7 @@ def check_options(
 
 
 def _likely_causes(
-    problem: Problem, minimum: Minimum, inspection: Inspection | None
+    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
 ) -> tuple[str, ...]:
     """Likely causes of a missing solution or a bad fit, in words."""
     network = problem.network
@@ -439,7 +443,9 @@ def _likely_causes(
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
     if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
         # Settled far from its start, it may be a mirror image; or σ is in a larger unit.
-        start = np.sqrt(2 * np.asarray(minimum.history.cost)[0] / problem.counts.observations)
+        start = np.sqrt(
+            2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
+        )
         far = start * noise_of_rays(problem) > LARGEST_START_MISFIT
         sigma0 = _sigma0(problem, minimum)
         poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
@@ -462,7 +468,7 @@ def _likely_causes(
 
 
 def _name_conventions(
-    problem: Problem, minimum: Minimum, inspection: Inspection | None
+    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
 ) -> tuple[str, ...]:
     """Units and conventions in which a badly fitting network would fit, in words."""
     network = problem.network
@@ -477,13 +483,13 @@ def _name_conventions(
     return tuple(filter(None, causes))
 
 
-def _noise_factor(problem: Problem, minimum: Minimum) -> float:
+def _noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
     """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
     of the rays."""
     return min(_sigma0(problem, minimum), MISFIT)
 
 
-def _sigma0(problem: Problem, minimum: Minimum) -> float:
+def _sigma0(problem: NetworkProblem, minimum: Minimum) -> float:
     """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
     cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
     accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.adjustment.problem import HELD, Problem
+from jaxbundle.adjustment.problem import HELD, NetworkProblem, coordinates
 from jaxbundle.adjustment.unknowns import angles_near
 from jaxbundle.arguments import number, show
 from jaxbundle.bundle.result import Adjustment
@@ -39,8 +39,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.geometry.similarity import compose, helmert_point
 from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
-from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, data_frame, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
@@ -330,15 +330,17 @@ def _frames(a: Adjustment, b: Adjustment, held: Sequence[str]):
 _move = compile_once(jax.vmap(transform_point, (None, 0)), ())
 
 
-def _scale_is_open(problem: Problem) -> bool:
-    datum = problem.system.plan.datum
+def _scale_is_open(problem: NetworkProblem) -> bool:
+    datum = problem.plan.datum
     return datum is not None and np.abs(np.asarray(datum.gauge)[SCALE]).max() > HELD
 
 
 class _Chosen(eqx.Module):
-    """Unknowns of a network as one vector, in a frame: (camera, column) pairs, images, points."""
+    """Unknowns of a network as one vector, in a frame: the (row, column) pairs of every table of
+    cameras, and their `order` in the vector; images, points."""
 
-    cameras: Int[Array, "k 2"]
+    cameras: dict[str, Int[Array, "k 2"]]
+    order: Int[Array, " parameters"]
     images: Int[Array, " n"]
     points: Int[Array, " m"]
     angles: Float[Array, "n 3"]
@@ -346,8 +348,8 @@ class _Chosen(eqx.Module):
     frame: _Frame | None
 
     def __call__(self, values: Values) -> Float[Array, " size"]:
-        place, turn = values.position + self.shift, values.rotation
-        points = values.point + self.shift
+        position, turn = values["image"]
+        place, points = position + self.shift, coordinates(values) + self.shift
         if self.frame is not None:
             for tau in (self.frame.tau, self.frame.small(points)):
                 place, turn = jax.vmap(transform_pose, (None, 0, 0))(tau, place, turn)
@@ -355,7 +357,8 @@ class _Chosen(eqx.Module):
         near = lambda q, given: angles_near(q, jnp.zeros(3), given)
         angles = jax.vmap(near)(turn[self.images], self.angles)
         poses = jnp.concatenate([place[self.images], angles], 1)
-        cameras = values.camera[self.cameras[:, 0], self.cameras[:, 1]]
+        found = [values[table][at[:, 0], at[:, 1]] for table, at in sorted(self.cameras.items())]
+        cameras = jnp.concatenate([jnp.zeros(0), *found])[self.order]
         return jnp.concatenate([cameras, poses.ravel(), points[self.points].ravel()])
 
 
@@ -365,18 +368,23 @@ class _In:
 
     result: Adjustment
     frame: _Frame | None
-    problem: Problem
-    like: Problem
+    problem: NetworkProblem
+    like: NetworkProblem
 
     def choose_rows(self, rows: _Common, angles) -> _Chosen:
         network = self.problem.network
         of = lambda ids, table: np.array(
             [{id: k for k, id in enumerate(table)}[id] for id in ids], int
         )
-        camera = {c.id: (k, get_model(c.model).parameters) for k, c in enumerate(network.cameras)}
-        cameras = [(camera[id][0], camera[id][1].index(name)) for id, name in rows.cameras]
+        place = {c.id: self.problem.table_of_camera(k) for k, c in enumerate(network.cameras)}
+        pairs: dict[str, list[tuple[int, int, int]]] = {}
+        for k, (id, name) in enumerate(rows.cameras):
+            table, row = place[id]
+            pairs.setdefault(table.name, []).append((row, table.parameters.index(name), k))
+        order = np.array([k for _, at in sorted(pairs.items()) for *_, k in at], int)
         return _Chosen(
-            jnp.asarray(np.array(cameras, int).reshape(-1, 2)),
+            {table: jnp.asarray(np.array(at)[:, :2]) for table, at in pairs.items()},
+            jnp.asarray(np.argsort(order)),
             jnp.asarray(of(rows.images, network.images.id)),
             jnp.asarray(of(rows.points, network.points.id)),
             jnp.asarray(angles),

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
 from jaxbundle.bundle.far_points import (
     NARROW,
     PARALLEL,
@@ -22,8 +22,9 @@ from jaxbundle.bundle.far_points import (
     angle_of_rays,
     noise_of_rays,
 )
-from jaxbundle.bundle.minimum import adjusted_cameras
-from jaxbundle.network.arrays import Values
+from jaxbundle.bundle.minimum import adjusted_cameras, are_finite
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.sightings import equations_of, keep_images, keep_points, leave_out
 from jaxbundle.network.tables import LeftOut, Network
@@ -89,7 +90,9 @@ class Undetermined:
         return network
 
 
-def find_undetermined(problem: Problem, values: Values, factor: float | None) -> Undetermined:
+def find_undetermined(
+    problem: NetworkProblem, values: Values, factor: float | None
+) -> Undetermined:
     """The tie points whose rays are one line, and the images whose points are on a line.
 
     **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
@@ -105,7 +108,7 @@ def find_undetermined(problem: Problem, values: Values, factor: float | None) ->
     return Undetermined(_notes(network, seen, points, one_place, images))
 
 
-def may_be_undetermined(problem: Problem, values: Values) -> bool:
+def may_be_undetermined(problem: NetworkProblem, values: Values) -> bool:
     """Whether start values show points or images that rays may not determine: worth a look after a
     few iterations, before they cost many. Rays of poor start values converge in appearance, so that
     all narrow points count that would be narrow at the usual distance as well, unless some are
@@ -116,12 +119,14 @@ def may_be_undetermined(problem: Problem, values: Values) -> bool:
     return bool(narrow.any() or flat.any() or (near.any() and not (angle < PARALLEL).any()))
 
 
-def _parallax_at_usual_distance(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
+def _parallax_at_usual_distance(
+    problem: NetworkProblem, values: Values
+) -> Float[np.ndarray, " points"]:
     """The largest angle at which a projection centre of a point is seen off the common line of its
     rays, from the median distance of the points of its image; radians."""
     point, image, n = problem.point, problem.image, len(problem.network.points)
-    X0 = np.asarray(values.position)[image]
-    to_point = np.asarray(values.point)[point] - X0
+    X0 = np.asarray(values["image"].position)[image]
+    to_point = np.asarray(coordinates(values))[point] - X0
     s = np.linalg.norm(to_point, axis=1)
     usual = np.full(len(problem.network.images), np.inf)
     order = np.lexsort((s, image))
@@ -140,18 +145,17 @@ def _parallax_at_usual_distance(problem: Problem, values: Values) -> Float[np.nd
     return largest
 
 
-def _find_candidates(problem: Problem, values: Values, factor: float | None):
+def _find_candidates(problem: NetworkProblem, values: Values, factor: float | None):
     """Tie points with nearly parallel rays, and images whose points are nearly on a line, that
     nothing but image points determines: found without the rays, which are rarely needed."""
     network = problem.network
     ties, one = network.points.has_role("tie"), len(network.images)
     none = np.zeros(len(ties), bool), np.zeros(one, bool)
     noise = noise_of_rays(problem)
-    finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
-    if not finite or factor is None and noise > LARGEST_SIGMA:
+    if not are_finite(problem, values) or factor is None and noise > LARGEST_SIGMA:
         return none
     noise *= VAGUE * (factor or 1.0)
-    free = ties & ~problem.system.kept_rows & (equations_of(network, "POINTS") == 0)
+    free = ties & ~problem.kept_rows & (equations_of(network, "POINTS") == 0)
     free[network.distances.points.ravel()] = False
     narrow = free & (angle_of_rays(problem, values) < noise)
     return narrow, _have_only_rays(problem) & (_width_of_points(problem, values) < noise)
@@ -173,18 +177,18 @@ def _notes(network: Network, seen: Sights, points, one_place, images) -> tuple[L
     return tuple(group for group in groups if group.names)
 
 
-def _have_only_rays(problem: Problem) -> Bool[np.ndarray, " images"]:
+def _have_only_rays(problem: NetworkProblem) -> Bool[np.ndarray, " images"]:
     """Images whose exterior orientation nothing but image points determines."""
     network = problem.network
     own = np.isnan(network.images.sigma).all(1) & (equations_of(network, "IMAGES") == 0)
-    return ~own & own if problem.layout.others else own
+    return ~own & own if problem.further_sets else own
 
 
-def _width_of_points(problem: Problem, values: Values) -> Float[np.ndarray, " images"]:
+def _width_of_points(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " images"]:
     """The RMS angle between the points of every image and their best line, radians."""
     image, n = problem.image, len(problem.network.images)
-    X = np.asarray(values.point)[problem.point]
-    away = np.linalg.norm(X - np.asarray(values.position)[image], axis=1)
+    X = np.asarray(coordinates(values))[problem.point]
+    away = np.linalg.norm(X - np.asarray(values["image"].position)[image], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.nan_to_num(1 / away, posinf=0.0)
     total = lambda v: np.stack([np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1)
@@ -195,7 +199,9 @@ def _width_of_points(problem: Problem, values: Values) -> Float[np.ndarray, " im
     return np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:, 1], 0) / number)
 
 
-def _adjusted_model(problem: Problem, values: Values, network: Network, seen: Sights) -> Model:
+def _adjusted_model(
+    problem: NetworkProblem, values: Values, network: Network, seen: Sights
+) -> Model:
     """The adjusted images and points, as rows of `network`."""
     model = Model.empty(seen)
     images, points = (
@@ -208,15 +214,16 @@ def _adjusted_model(problem: Problem, values: Values, network: Network, seen: Si
             )
         )
     )
-    M = many.matrices_of_quaternions(np.asarray(values.rotation))
-    model.place(images, np.asarray(values.position) + problem.origin, M)
-    X = np.asarray(values.point) + problem.origin
+    position, rotation = map(np.asarray, values["image"])
+    M = many.matrices_of_quaternions(rotation)
+    model.place(images, position + problem.origin, M)
+    X = np.asarray(coordinates(values)) + problem.origin
     model.X[points], model.known[points] = X, np.isfinite(X).all(1)
     return model
 
 
 def take_back(
-    given: Network, current: Network, problem: Problem, values: Values, factor: float
+    given: Network, current: Network, problem: NetworkProblem, values: Values, factor: float
 ) -> Network:
     """The given network with everything that agrees with adjusted images and points, and notes of
     what does not.
@@ -288,7 +295,7 @@ def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
     return np.isin(key(given, places), key(current, places))
 
 
-def carry(problem: Problem, before: Problem, values: Values) -> Values:
+def carry(problem: NetworkProblem, before: NetworkProblem, values: Values) -> Values:
     """Start values of a problem: those at which another of the same network ended, by name; its own
     for what that did not have."""
     start = problem.data.start
@@ -305,11 +312,14 @@ def carry(problem: Problem, before: Problem, values: Values) -> Values:
     network, old, shift = problem.network, before.network, before.origin - problem.origin
     images, points = (network.images.id, old.images.id), (network.points.id, old.points.id)
     cameras = [c.id for c in network.cameras], [c.id for c in old.cameras]
-    width = start.camera.shape[1]
-    return dataclasses.replace(
-        start,
-        camera=taken(start.camera, cameras[0], np.asarray(values.camera)[:, :width], cameras[1]),
-        position=taken(start.position, images[0], values.position, images[1], shift),
-        rotation=taken(start.rotation, images[0], values.rotation, images[1]),
-        point=taken(start.point, points[0], values.point, points[1], shift),
+    own, other = problem.interior_orientation(start), before.interior_orientation(values)
+    other = np.asarray(other)[:, : own.shape[1]]
+    found = problem.with_interior_orientation(start, taken(own, cameras[0], other, cameras[1]))
+    position, rotation = start["image"]
+    at, turned = values["image"]
+    image = PoseValue(
+        taken(position, images[0], at, images[1], shift),
+        taken(rotation, images[0], turned, images[1]),
     )
+    X = taken(coordinates(start), points[0], coordinates(values), points[1], shift)
+    return found | {"image": image, "point": with_coordinates(start["point"], X)}

@@ -13,17 +13,19 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.adjustment.problem import Problem
-from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution, minimise
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
+from jaxbundle.bundle.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import History, Minimum
 from jaxbundle.leastsquares.iterations.stopping import LIMIT
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.problem import with_data, with_factor, with_free
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.orientation.many import matrices_of_quaternions
 from jaxbundle.orientation.sights import sights
-from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.types import present
 
 NARROW, PARALLEL = 0.03, 1e-3
@@ -45,21 +47,21 @@ MOST_RELEASES = 10
 
 
 def minimise_at_any_distance(
-    problem: Problem, start: Values, make: Callable, *, max_steps: int, **options
-) -> tuple[Problem, Minimum]:
+    problem: NetworkProblem, start: Values, make: Callable, *, max_steps: int, **options
+) -> tuple[NetworkProblem, Minimum]:
     """Iterate from `start` with points with parallel rays at any distance; without convergence,
     with all narrow ones. Returns that problem if it was solved, else the given one.
     `make(lengths=…)`: makes the problem (see `make_problem`)."""
     angle = angle_of_rays(problem, start)
     if not (angle < NARROW).any():
-        return problem, minimise(problem, start, max_steps=max_steps, **options)
+        return problem, find_minimum(problem, start, max_steps=max_steps, **options)
     mostly = lambda narrow: 2 * narrow.sum() >= (angle < np.pi).sum()
     legs, parallel = [], angle < max(PARALLEL, min(VAGUE * noise_of_rays(problem), NARROW))
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
             patience = EVALUATIONS_BEFORE_RELEASE * (2 if mostly(angle < NARROW) else 1)
-            plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
-            if inspect_solution(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
+            plain = find_minimum(problem, start, max_steps=min(patience, max_steps), **options)
+            if inspect_solution(with_factor(problem), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
             legs, start = [plain], plain.values
             chosen = angle_of_rays(problem, start) < NARROW
@@ -67,26 +69,26 @@ def minimise_at_any_distance(
         far = _with_far_points(problem, start, chosen, make)
         if far is not None:
             found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
-            if inspect_solution(found.with_factor(), minimum):
+            if inspect_solution(with_factor(found), minimum):
                 return found, join_legs([*legs, minimum])
     if int(legs[0].termination) != LIMIT:
         return problem, legs[0]
-    return problem, join_legs([*legs, minimise(problem, start, max_steps=left, **options)])
+    return problem, join_legs([*legs, find_minimum(problem, start, max_steps=left, **options)])
 
 
 def minimise_with_infinity(
-    problem: Problem, start: Values, *, max_steps: int, **options
-) -> tuple[Problem, Minimum]:
+    problem: NetworkProblem, start: Values, *, max_steps: int, **options
+) -> tuple[NetworkProblem, Minimum]:
     """Iterate from `start`; points at any distance that are pulled beyond infinity are held there,
     also in the returned problem."""
-    if problem.layout.lengths is None:
-        return problem, minimise(problem, start, max_steps=max_steps, **options)
+    if problem.lengths is None:
+        return problem, find_minimum(problem, start, max_steps=max_steps, **options)
     held = _held(problem)
     legs, released, steps = [], np.zeros(len(held), int), EVALUATIONS_BETWEEN_CHECKS
     problem = _hold_at_infinity(problem, held, start)  # One program for all rounds.
     while True:
         left = max_steps - sum(int(leg.iterations) for leg in legs)
-        legs.append(minimise(problem, start, max_steps=min(steps, left), **options))
+        legs.append(find_minimum(problem, start, max_steps=min(steps, left), **options))
         start = legs[-1].values
         there = at_infinity(problem, start)
         if there.any():
@@ -103,7 +105,7 @@ def minimise_with_infinity(
             problem = _hold_at_infinity(problem, held, start)
 
 
-def noise_of_rays(problem: Problem) -> float:
+def noise_of_rays(problem: NetworkProblem) -> float:
     """The median a priori σ of an image coordinate, in principal distances."""
     network = problem.network
     c = np.array(
@@ -118,16 +120,16 @@ def noise_of_rays(problem: Problem) -> float:
     return float(np.median(network.observations.sigma.max(1) / np.abs(c[problem.camera])))
 
 
-def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
+def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " points"]:
     """Approximately the largest angle between two rays of every tie point, radians; 180° for other
     points and points with fewer than two rays."""
-    rays = (np.asarray(problem.data.image_weight) > 0).any(1)
-    point, image = problem.point[rays], problem.image[rays]
-    ray = _unit_vectors(np.asarray(values.point)[point] - np.asarray(values.position)[image])
-    first = np.zeros((len(values.point), 3))
+    point, image = problem.point[problem.used], problem.image[problem.used]
+    X0, X = np.asarray(values["image"].position), np.asarray(coordinates(values))
+    ray = _unit_vectors(X[point] - X0[image])
+    first = np.zeros_like(X)
     first[point[::-1]] = ray[::-1]  # Lines: a point between two images has opposite rays.
     ray *= np.where((ray * first[point]).sum(1) < 0, -1.0, 1.0)[:, None]
-    middle = np.zeros((len(values.point), 3))
+    middle = np.zeros_like(X)
     np.add.at(middle, point, ray)
     off = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)
     widest = np.zeros(len(middle))
@@ -137,79 +139,81 @@ def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " point
     return np.where(tie, 2 * widest, np.pi)
 
 
-def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
+def _with_far_points(problem: NetworkProblem, values: Values, chosen, make: Callable):
     """The problem and its values with these points at any distance, except those whose coordinates
     other observations touch; None if none is left, or too few others for the datum.
     """
-    lengths = np.where(chosen & ~problem.system.kept_rows, _unit(problem), 0.0)
+    lengths = np.where(chosen & ~problem.kept_rows, _unit(problem), 0.0)
     if not lengths.any():
         return None
     try:
         far = make(lengths=lengths)
     except InputError:
         return None
-    if values.other:  # Frames and other tables would have to move with the origin.
+    if problem.further_tables:  # Frames and other tables would have to move with the origin.
         return far, far.data.start
     shift = problem.origin - far.origin
-    point = np.asarray(values.point) + shift
-    moved = dataclasses.replace(values, position=values.position + shift, point=point)
-    return far, dataclasses.replace(moved, point=_in_front(far, moved))
+    position, rotation = map(np.asarray, values["image"])
+    moved = values | {"image": PoseValue(position + shift, rotation)}
+    X = _in_front(far, moved, np.asarray(coordinates(values)) + shift)
+    return far, moved | {"point": with_coordinates(far.data.start["point"], X)}
 
 
-def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]:
-    """The points, with those at any distance that drifted to or beyond infinity put at infinity."""
-    network, X = problem.network, np.asarray(values.point)
+def _in_front(
+    problem: NetworkProblem, values: Values, X: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "points 3"]:
+    """The points X, with those at any distance that drifted to or beyond infinity put at
+    infinity."""
+    network = problem.network
+    position, rotation = map(np.asarray, values["image"])
     seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
-    M = matrices_of_quaternions(np.asarray(values.rotation))[seen.image]
+    M = matrices_of_quaternions(rotation)[seen.image]
     ray = np.einsum("nij,ni->nj", M, seen.ray)
-    depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
+    depth = (ray * (X[seen.point] - position[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = LARGEST_DISTANCE * present(problem.layout.lengths)
+    most = LARGEST_DISTANCE * present(problem.lengths)
     move = (most > 0) & ((sides < 0) | (length > most))
     factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
     return X * factor[:, None]
 
 
-def at_infinity(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+def at_infinity(problem: NetworkProblem, values: Values) -> Bool[np.ndarray, " points"]:
     """Which points are at infinity."""
-    if problem.layout.lengths is None:
+    if problem.lengths is None:
         return problem.at_any_distance
-    return is_at_infinity(np.asarray(values.point), problem.layout.lengths)
+    return is_at_infinity(np.asarray(coordinates(values)), problem.lengths)
 
 
-def _held(problem: Problem) -> Bool[np.ndarray, " points"]:
+def _held(problem: NetworkProblem) -> Bool[np.ndarray, " points"]:
     """Which points at any distance are held at infinity."""
-    held = problem.system.table("point").free[:, 2] == 0
+    held = problem.table("point").free[:, 2] == 0
     return problem.at_any_distance & ~problem.excluded & held
 
 
-def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
+def _hold_at_infinity(problem: NetworkProblem, held, values: Values) -> NetworkProblem:
     """These points held at infinity, the others not."""
     start, far = problem.data.start, problem.at_any_distance & ~problem.excluded
-    point = np.where(held[:, None], np.asarray(values.point), np.asarray(start.point))
-    problem = problem.with_data(
-        dataclasses.replace(problem.data, start=dataclasses.replace(start, point=point))
-    )
-    free = problem.system.table("point").free.copy()
+    point = np.where(held[:, None], np.asarray(values["point"]), np.asarray(start["point"]))
+    start = start | {"point": jax.device_put(point)}
+    problem = with_data(problem, dataclasses.replace(problem.data, start=start))
+    free = problem.table("point").free.copy()
     free[:, 2] = np.where(far, ~held, free[:, 2])
-    return problem.with_free("point", free)
+    return with_free(problem, "point", free)
 
 
-def _are_pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndarray, " points"]:
     """Whether vᵀPv decreases with the distance of a point."""
-    free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
-    solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))
-    for s in problem.layout.sets:
-        if s.field == "image":
-            rows = slice(None) if s.rows is None else s.rows
-            along = solution.residuals[s.name] * solution.by_eliminated[s.name][:, :, 2]
-            along = along.sum(1)
-            np.add.at(slope, problem.point[rows], along)
+    number = len(problem.network.points)
+    free = _hold_at_infinity(problem, np.zeros(number, bool), values)
+    solution, slope = Solution(free, values), np.zeros(number)
+    for name, rows in problem.image_rows.items():
+        along = solution.residuals[name] * solution.by_eliminated[name][:, :, 2]
+        np.add.at(slope, problem.point[rows], along.sum(1))
     return slope > 0
 
 
-def _unit(problem: Problem) -> float:
+def _unit(problem: NetworkProblem) -> float:
     """RMS distance of the projection centres from their centroid."""
     centres = problem.network.images.position
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.bundle.sensitivity import inspection_of
 from jaxbundle.bundle.tables import observations
@@ -73,12 +73,12 @@ class Influence:
         return data_frame(self.table(result))
 
 
-def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
+def influence(given: Adjustment | NetworkProblem, of: Any = CAMERAS) -> Influence:
     """The influence of every measurement on each result.
 
     **Arguments:**
 
-    - `given`: an `Adjustment`; or a `Problem`, a design.
+    - `given`: an `Adjustment`; or a `NetworkProblem`, a design.
     - `of`: results by name as in `jaxbundle.sensitivity`, `"cameras"`, or a function of `Values`.
       The cost is one solution per result, regardless of the number of measurements.
 
@@ -93,13 +93,10 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
         raise InputError(
             "influence: name single results, such as point:7:Z; a mean over all has no derivative"
         )
-    found, problem = inspection.solution, inspection.problem
-    by_set = pull_back(found, found.slopes(inspection.of_tables(results.function)))
-    of_result = [
-        problem.layout.rows({o: x[r] for o, x in by_set.items()}, problem.data)
-        for r in range(len(results.asked))
-    ]
-    parts = list(observations(problem, *of_result))
+    found = inspection.solution
+    by_set = pull_back(found, found.slopes(results.function))
+    of_result = [{o: x[r] for o, x in by_set.items()} for r in range(len(results.asked))]
+    parts = list(observations(inspection.problem, *of_result))
     weight = np.concatenate([np.ravel(weight) for *_, weight in (part[:5] for part in parts)])
     effects = np.stack(
         [

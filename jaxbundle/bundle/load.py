@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.bundle.storage import CLASSES, FORMAT, State, Stored, with_own_models
@@ -67,14 +67,16 @@ def load_adjustment(
     return result
 
 
-def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Path) -> Problem:
+def _problem(
+    found: Stored, also: Sequence[Table | Observations], path: str | Path
+) -> NetworkProblem:
     """The problem as the adjustment left it."""
     state = found.state
     problem = make_problem(
         found.network, reduction=state.reduction, also=also, lengths=state.lengths
     )
-    tables = tuple(t.name for t in problem.system.tables)
-    kinds = tuple(o.kind.name for o in problem.system.observations)
+    tables = tuple(t.name for t in problem.tables)
+    kinds = tuple(o.kind.name for o in problem.observations)
     if (tables, kinds) != (state.tables, state.kinds):
         other = set(state.tables + state.kinds) ^ set(tables + kinds)
         raise InputError(
@@ -82,17 +84,17 @@ def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Pa
             f"({list_some(sorted(other))}); give the same as also=[…]"
         )
     start = _tree(problem.data.start, state.start)
-    problem = problem.with_data(dataclasses.replace(problem.data, start=start))
-    for table, free in zip(problem.system.tables, state.free):
+    problem = engine.with_data(problem, dataclasses.replace(problem.data, start=start))
+    for table, free in zip(problem.tables, state.free):
         if not np.array_equal(np.asarray(table.free), free):
-            problem = problem.with_free(table.name, free)
-    system, names = problem.system, [o.name for o in problem.system.observations]
-    weight = _tree([system.data.weight[o] for o in names], state.weights)
-    data = dataclasses.replace(system.data, weight=dict(zip(names, weight, strict=True)))
-    return problem.with_system(engine.with_data(system, data))
+            problem = engine.with_free(problem, table.name, free)
+    names = [o.name for o in problem.observations]
+    weight = _tree([problem.data.weight[o] for o in names], state.weights)
+    data = dataclasses.replace(problem.data, weight=dict(zip(names, weight, strict=True)))
+    return engine.with_data(problem, data)
 
 
-def _restore(found: Stored, problem: Problem) -> Adjustment:
+def _restore(found: Stored, problem: NetworkProblem) -> Adjustment:
     state: State = found.state
     history = History(*(jax.device_put(column) for column in state.history))
     values = _tree(problem.data.start, state.values)

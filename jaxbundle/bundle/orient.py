@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.bundle.minimum import minimise
+from jaxbundle.adjustment.problem import coordinates, make_problem
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Distances, Network
@@ -70,17 +70,18 @@ def _adjust(network: Network, sights: Sights, model: Model) -> None:
     try:
         part = check_network(_part(network, model, use, sights.row[agree & use[sights.point]]))
         problem = make_problem(part)
-        values = minimise(problem, problem.data.start, max_steps=STEPS).values
+        values = find_minimum(problem, max_steps=STEPS).values
     except (InputError, NotSolvedError):
         return
-    X0, X = np.asarray(values.position), np.asarray(values.point)
+    X0, rotation = map(np.asarray, values["image"])
+    X = np.asarray(coordinates(values))
     if not (np.isfinite(X0).all() and np.isfinite(X).all()):
         return
     images = [network.images.id.index(id) for id in part.images.id]
     index = {id: k for k, id in enumerate(network.points.id)}
     points = np.array([index[id] for id in problem.network.points.id])
     model.X0[images] = X0 + problem.origin
-    model.M[images] = many.matrices_of_quaternions(np.asarray(values.rotation))
+    model.M[images] = many.matrices_of_quaternions(rotation)
     model.X[points] = X + problem.origin
 
 

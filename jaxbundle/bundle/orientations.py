@@ -14,13 +14,13 @@ def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
     """Joint covariance of X0 … kappa (radians) of all images and the free camera parameters,
     including tied ones; None if nothing was free, or if it is too large."""
     problem, network = result.problem, result.network
-    free = np.asarray(problem.system.table("image").free, bool)
+    free = np.asarray(problem.table("image").free, bool)
     unknowns: list[Unknown] = [("image", id, n) for id in network.images.id for n in EXTERIOR]
     places = [("image", k, j) for k in range(len(network.images)) for j in range(6)]
     repeated = list(range(len(places)))
-    for table in problem.layout.cameras:
+    for table in problem.cameras:
         for row, c in enumerate(table.cameras):
-            names, columns = problem.interior(c)
+            names, columns = problem.free_parameters(c)
             for j in columns:
                 same = [g[1:] for g in network.cameras[c].tie if g[0] == names[j]]
                 for name in (names[j], *(tied for group in same for tied in group)):
@@ -31,7 +31,7 @@ def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
         return None
     if len(places) * 3 * len(network.points) > LARGEST_PRODUCT:
         return None
-    rows = {t.name: np.zeros((len(places), t.rows, t.space.width)) for t in problem.system.tables}
+    rows = {t.name: np.zeros((len(places), t.rows, t.space.width)) for t in problem.tables}
     for n, (name, row, column) in enumerate(places):
         rows[name][n, row, column] = 1.0
     C = result.sigma0**2 * result.cofactors.solution.propagate_rows(rows)

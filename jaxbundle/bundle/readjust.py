@@ -2,16 +2,18 @@
 
 import dataclasses
 from collections.abc import Iterable
+from typing import cast
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.bundle.minimum import inspect_solution, require_solved
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.components import (
     ROUNDS,
     Component,
@@ -22,7 +24,6 @@ from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.robust import residual_lengths, reweight, robust_scale
 from jaxbundle.leastsquares.quality.snooping import Removed, snoop, without
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.blunders import image_points_removed, name_removed
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
@@ -37,7 +38,7 @@ def snoop_network(
 
     `doubtful`: image and point, by id, of initially removed image points."""
     problem, whole, doubt = found.problem, found.solution, None
-    repeat = _Repeat(problem, again, "after data snooping", minimum)
+    repeat = _Repeat(again, "after data snooping", minimum)
     solution, removed = snoop(
         whole,
         repeat,
@@ -48,12 +49,16 @@ def snoop_network(
     removed = [name_removed(problem, r) for r in removed]
     counts = problem.counts
     if test == "baarda" and counts.redundancy > 0:
-        scale = _scale_of_good(whole, _Repeat(problem, again, "after data snooping", minimum))
+        scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
         rays = sum(len(r.rows) for r in removed if r.kind == "image")
         doubt = doubt_of_baarda(
-            scale, rays, counts.observations // 2, counts.redundancy, significance
+            scale,
+            rays,
+            problem.rows_and_unknowns.observations // 2,
+            counts.redundancy,
+            significance,
         )
-    return problem.with_system(solution.problem), repeat.minimum, removed, doubt
+    return cast(NetworkProblem, solution.problem), repeat.minimum, removed, doubt
 
 
 def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
@@ -78,12 +83,12 @@ def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
     return robust_scale(without(problem, suspects), lengths)
 
 
-def adjust_robustly(problem: Problem, minimum, again, estimator: str):
+def adjust_robustly(problem: NetworkProblem, minimum, again, estimator: str):
     """The solution with the weights of a robust estimator, and its minimum. The first weights come
     from the minimum, or from the start values without a solution."""
-    repeat = _Repeat(problem, again, "by robust estimation", minimum)
+    repeat = _Repeat(again, "by robust estimation", minimum)
     first = minimum.values if inspect_solution(problem, minimum) else problem.data.start
-    reweighted = reweight(problem.system, problem.layout.tables(first), repeat, estimator)
+    reweighted = reweight(problem, first, repeat, estimator)
     if not reweighted.rests:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not converge; use "
@@ -93,20 +98,19 @@ def adjust_robustly(problem: Problem, minimum, again, estimator: str):
 
 
 class _Repeat:
-    """Adjusts a changed system of a problem and keeps the minimum."""
+    """Adjusts a changed problem of the network and keeps the minimum."""
 
-    def __init__(self, problem: Problem, again, when: str, minimum):
-        self.problem, self.again, self.when, self.minimum = problem, again, when, minimum
+    def __init__(self, again, when: str, minimum):
+        self.again, self.when, self.minimum = again, when, minimum
 
-    def __call__(self, system, tables) -> Solution:
-        problem = self.problem.with_system(system)
-        problem, self.minimum = self.again(problem, self.problem.layout.values(tables))
-        return require_solved(problem, self.minimum, self.when).solution
+    def __call__(self, problem: Problem, values: Values) -> Solution:
+        of_network, self.minimum = self.again(problem, values)
+        return require_solved(of_network, self.minimum, self.when).solution
 
 
-def with_components(problem: Problem, minimum, again):
+def with_components(problem: NetworkProblem, minimum, again):
     """The problem with estimated σ of every group, its minimum, and the factors of σ by group."""
-    repeat = _Repeat(problem, again, "with the estimated variance components", minimum)
+    repeat = _Repeat(again, "with the estimated variance components", minimum)
     whole, of = Inspection(problem, minimum.values).solution, groups(problem)
     found, factors, unsettled = estimate(whole, of, repeat)
     components = variance_components(found, of, factors)
@@ -116,7 +120,7 @@ def with_components(problem: Problem, minimum, again):
             f"the variance components did not converge in {ROUNDS} rounds "
             f"({', '.join(unsettled)}): their σ are not final"
         )
-    problem = dataclasses.replace(problem.with_system(found.problem), network=network)
+    problem = dataclasses.replace(cast(NetworkProblem, found.problem), network=network)
     return problem, repeat.minimum, factors
 
 
@@ -147,22 +151,21 @@ def eliminate_parameters(problem, minimum, again, critical_t):
         require_solved(problem, minimum, f"without {weak[0]}")
 
 
-def _without_parameter(problem: Problem, values: Values, name: Name):
+def _without_parameter(problem: NetworkProblem, values: Values, name: Name):
     c = [camera.id for camera in problem.network.cameras].index(name.id)
     model = get_model(problem.network.cameras[c].model)
     column = model.parameters.index(name.parameter)
     tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
     columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
     value = default_parameters(model)[name.parameter]
-    with_value = lambda camera: jnp.asarray(camera).at[c, columns].set(value)
-    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, with_value(v.camera))
-    data = dataclasses.replace(problem.data, start=reset(problem.data.start))
-    row = np.flatnonzero(problem.layout.given["interior"] == c)
-    if len(row):
-        weight = jnp.asarray(data.interior_weight).at[row[0], column].set(0.0)
-        data = dataclasses.replace(data, interior_weight=weight)
-    table = next(t for t in problem.layout.cameras if c in t.cameras)
-    row = np.flatnonzero(table.cameras == c)
-    moving = problem.system.table(table.name).vector.moving.index(column)
-    problem = problem.with_data(data).hold(table.name, row, [moving])
-    return problem, reset(values)
+    table, row = problem.table_of_camera(c)
+    rows_with_value = lambda rows: jnp.asarray(rows).at[row, columns].set(value)
+    reset = lambda values: values | {table.name: rows_with_value(values[table.name])}
+    weight = dict(problem.data.weight)
+    if table.interior_set in weight:
+        (prior,) = np.nonzero(problem.observations_of(table.interior_set).rows[0] == row)
+        given = jnp.asarray(weight[table.interior_set])
+        weight[table.interior_set] = given.at[prior, column].set(0.0)
+    data = dataclasses.replace(problem.data, start=reset(problem.data.start), weight=weight)
+    moving = problem.table(table.name).vector.moving.index(column)
+    return hold(with_data(problem, data), table.name, row, [moving]), reset(values)

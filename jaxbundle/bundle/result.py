@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle import plotting, report
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates
 from jaxbundle.adjustment.unknowns import (
     angles_near,
     find_unknowns,
@@ -27,20 +27,20 @@ from jaxbundle.arguments import at_least_zero
 from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle import tables as result_tables
 from jaxbundle.bundle.storage import network_fingerprint, store
-from jaxbundle.cameras import get_model
 from jaxbundle.display import print_anywhere
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.iterations.stopping import converged as reached_minimum
 from jaxbundle.leastsquares.quality.components import Component, variance_components
 from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.leastsquares.quality.reliability import Reliability
 from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
-from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import data_frame, list_some
 from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import ESTIMATED, UNIT, Network, Observations, Points, units_of
@@ -52,7 +52,7 @@ from jaxbundle.statistics.check_points import CheckPoints, intersect_check_point
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.far_points import FarPoints, find_far_points
 from jaxbundle.statistics.global_test import chi_squared_test, is_tested
-from jaxbundle.statistics.inspection import Inspection, OfNetwork
+from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_fit, doubt_of_unit
 from jaxbundle.statistics.validity import Reach, distortion_reach
 from jaxbundle.statistics.weakness import Weakness, weakness
@@ -92,7 +92,7 @@ class Adjustment:
     def __init__(
         self,
         network: Network,
-        problem: Problem,
+        problem: NetworkProblem,
         minimum: Minimum,
         *,
         removed: tuple[Removed, ...] = (),
@@ -193,7 +193,7 @@ class Adjustment:
 
     @functools.cached_property
     def _scale(self) -> float:
-        return robust_scale(self.problem.system, residual_lengths(self.inspection.solution))
+        return robust_scale(self.problem, residual_lengths(self.inspection.solution))
 
     @functools.cached_property
     def doubts(self) -> tuple[str, ...]:
@@ -221,7 +221,7 @@ class Adjustment:
     @property
     def counts(self):
         """Rows and unknowns of the adjustment."""
-        return self.problem.counts
+        return self.problem.rows_and_unknowns
 
     @property
     def redundancy(self) -> int:
@@ -300,15 +300,15 @@ class Adjustment:
         **Raises:** `NotSolvedError`."""
         if self.problem.reduction not in FACTORS:
             raise NotSolvedError(
-                f"the reduced system of {self.problem.system.reduced_size} unknowns was solved "
+                f"the reduced system of {self.problem.reduced_size} unknowns was solved "
                 "by iteration and its factor does not fit into memory: only coordinates, σ0 "
                 "and covariances of single unknowns (`covariance`) are available"
             )
         return self.inspection
 
     @property
-    def reliability(self) -> OfNetwork:
-        """Redundancy numbers and w of all observations, in the order of the arrays."""
+    def reliability(self) -> Reliability:
+        """Redundancy numbers and w of all observations, by set (`network.declare`)."""
         return self.cofactors.reliability
 
     @functools.cached_property
@@ -332,8 +332,7 @@ class Adjustment:
     def image_values(self) -> Float[np.ndarray, "images 6"]:
         """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start
         values)."""
-        values = self.values
-        position = np.asarray(values.position) + self.problem.origin
+        position = np.asarray(self.values["image"].position) + self.problem.origin
         return np.concatenate([position, np.asarray(self._angles[0])], 1)
 
     @functools.cached_property
@@ -342,7 +341,7 @@ class Adjustment:
         networks share the program."""
         given = self.problem.network.images.angles
         rows = max(round_up(len(given)), LEAST_IMAGES)
-        wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
+        wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values["image"].rotation, given))
         return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
 
     @property
@@ -357,14 +356,14 @@ class Adjustment:
         A = np.zeros((len(Q), 6, 6))
         A[:, :3, :3] = np.eye(3)
         A[:, 3:, 3:] = self.angle_jacobian
-        free = self.problem.system.table("image").free
+        free = self.problem.table("image").free
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:
         """X, Y, Z in the object unit; NaN at infinity, and if excluded by data snooping."""
-        return self._where_known(np.asarray(self.values.point) + self.problem.origin)
+        return self._where_known(np.asarray(coordinates(self.values)) + self.problem.origin)
 
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
@@ -372,9 +371,9 @@ class Adjustment:
         return self._where_known(self.sigma0**2 * self.cofactors.point_cofactors)
 
     def _where_known(self, of_points):
-        lengths, unknown = self.problem.layout.lengths, self.problem.excluded
+        lengths, unknown = self.problem.lengths, self.problem.excluded
         if lengths is not None:
-            unknown = unknown | is_at_infinity(np.asarray(self.values.point), lengths)
+            unknown = unknown | is_at_infinity(np.asarray(coordinates(self.values)), lengths)
         return np.where(unknown.reshape(-1, *(1,) * (of_points.ndim - 1)), np.nan, of_points)
 
     @functools.cached_property
@@ -391,8 +390,8 @@ class Adjustment:
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
         c = self._camera(camera)
-        model = get_model(self.problem.network.cameras[c].model)
-        return dict(zip(model.parameters, np.asarray(self.values.camera)[c].tolist()))
+        table, row = self.problem.table_of_camera(c)
+        return dict(zip(table.parameters, np.asarray(self.values[table.name])[row].tolist()))
 
     def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and covariance of the free parameters of a camera."""
@@ -401,7 +400,7 @@ class Adjustment:
 
     def camera_cofactor(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and cofactors of the free parameters of a camera."""
-        names, free = self.problem.interior(self._camera(camera))
+        names, free = self.problem.free_parameters(self._camera(camera))
         Q = self.cofactors.camera_cofactors[self._camera(camera)]
         return [names[i] for i in free], Q[np.ix_(free, free)]
 
@@ -462,8 +461,8 @@ class Adjustment:
     def unknowns(self, table: str) -> TableResult:
         """Values, σ and covariances of a table of unknowns of further kinds of observations (`also`
         of `jaxbundle.adjust`)."""
-        if table not in self.values.other:
-            known = ", ".join(self.values.other) or "none"
+        if table not in self.problem.further_tables:
+            known = ", ".join(self.problem.further_tables) or "none"
             raise KeyError(f"there is no further table {table!r}; known: {known}")
         return table_result(self.cofactors.solution, table, self.sigma0)
 
@@ -587,10 +586,9 @@ def _all_angles(rotation, given):
     return jax.jacfwd(angles, has_aux=True)(jnp.zeros(3))[::-1]
 
 
-def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:
+def _of_image_points(problem: NetworkProblem, weights) -> Float[np.ndarray, " rays"]:
     """The weight factors of image points, from those of the observation sets."""
     found = np.ones(len(problem.network.observations))
-    for s in problem.layout.sets:
-        if s.field == "image":
-            found[slice(None) if s.rows is None else s.rows] = weights[s.name]
+    for name, rows in problem.image_rows.items():
+        found[rows] = weights[name]
     return found

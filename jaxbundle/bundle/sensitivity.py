@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.arguments import show
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.problem import with_data, with_factor
 from jaxbundle.leastsquares.quality.response import follow
 from jaxbundle.network.columns import data_frame
 from jaxbundle.network.units import ANGLE_UNITS
@@ -104,13 +105,15 @@ class Budget:
         return data_frame(self.table())
 
 
-def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = WORDS) -> Budget:
+def sensitivity(
+    given: Adjustment | NetworkProblem, held: Mapping[Any, Any], of: Any = WORDS
+) -> Budget:
     """The effect of an error of given σ in each held quantity on each result.
 
     **Arguments:**
 
-    - `given`: an `Adjustment`; or a `Problem`, a design: its start values are taken as adjusted, σ
-      are a priori, and its image coordinates are not used.
+    - `given`: an `Adjustment`; or a `NetworkProblem`, a design: its start values are taken as
+      adjusted, σ are a priori, and its image coordinates are not used.
     - `held`: σ of the error by name. A name is KIND:ID:NAME, such as `"camera:cam:K3"`,
       `"image:12:X0"`, `"point:7:Z"`, `"lever arm:cam:az"`, or a tuple of the three; `*` as id or
       name stands for all held ones, with independent errors. Or, under any name, the names and
@@ -125,14 +128,11 @@ def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = 
     not positive; `NotSolvedError` without a solution.
     """
     inspection, sigma0, unit = inspection_of(given)
-    problem = inspection.problem
     found = inspection.solution
-    causes = find_causes(problem, found.values, held)
+    causes = find_causes(inspection.problem, found.values, held)
     results = ask(inspection, of)
     errors = [change for cause in causes for change in cause.errors]
-    parts = [
-        effects_on(problem, results, found.values, tangents) for tangents in follow(found, errors)
-    ]
+    parts = [effects_on(results, found.values, tangents) for tangents in follow(found, errors)]
     effects = np.concatenate(parts)
     ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])
     by_cause = np.array(
@@ -154,11 +154,11 @@ def inspection_of(given: Any) -> tuple[Inspection, float, float]:
     of angles.
 
     **Raises:** `InputError` for other arguments, or if no factor fits into memory."""
-    if isinstance(given, Problem):
-        given = given.with_factor()
+    if isinstance(given, NetworkProblem):
+        given = with_factor(given)
         if given.reduction not in FACTORS:
             raise InputError("the network is too large for its covariance; use a part of it")
-        given = given.with_data(predict(given, given.data))
+        given = with_data(given, predict(given, given.data))
         return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
     if not isinstance(given, Adjustment):
         raise InputError(

@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.cameras import CameraModel, get_model, is_own
 from jaxbundle.io.results.stored_tree import fingerprint, write_tree
 from jaxbundle.leastsquares.quality.names import Name
-from jaxbundle.network.further import KINDS
+from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import (
     Camera,
     Distances,
@@ -143,17 +143,17 @@ def store(adjustment: Any, path: str | Path) -> None:
     write_tree(path, found, CLASSES)
 
 
-def _state(problem: Problem, minimum: Any) -> State:
-    system, steps = problem.system, int(minimum.iterations)
+def _state(problem: NetworkProblem, minimum: Any) -> State:
+    steps = int(minimum.iterations)
     leaves = lambda tree: tuple(np.asarray(x) for x in jax.tree.leaves(tree))
     history = minimum.history
     return State(
-        tables=tuple(t.name for t in system.tables),
-        kinds=tuple(o.kind.name for o in system.observations),
+        tables=tuple(t.name for t in problem.tables),
+        kinds=tuple(o.kind.name for o in problem.observations),
         reduction=problem.reduction,
-        lengths=problem.layout.lengths,
-        free=tuple(np.asarray(t.free) for t in system.tables),
-        weights=leaves([system.data.weight[o.name] for o in system.observations]),
+        lengths=problem.lengths,
+        free=tuple(np.asarray(t.free) for t in problem.tables),
+        weights=leaves([problem.data.weight[o.name] for o in problem.observations]),
         start=leaves(problem.data.start),
         values=leaves(minimum.values),
         termination=int(minimum.termination),

@@ -3,20 +3,20 @@
 σ are a posteriori, angles in the network's unit; there is one function per kind of table.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.leastsquares.declarations import Observations
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
-from jaxbundle.network.declare import Rows
-from jaxbundle.network.further import OF_ANGLES
+from jaxbundle.network.kinds import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
 from jaxbundle.statistics.further import estimates
-from jaxbundle.statistics.inspection import Tested
 
 
 def cameras(adjustment) -> dict[str, dict]:
@@ -119,9 +119,9 @@ def units(adjustment, columns: Sequence[str], name: str) -> dict[str, str]:
 
 def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
     """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
-    weight = np.asarray(adjustment.problem.data.image_weight)
+    weight = adjustment.problem.image_weights
     used = weight > 0
-    v = np.asarray(adjustment.inspection.residuals.image) / np.where(used, weight, 1.0)
+    v = adjustment.inspection.image_residuals / np.where(used, weight, 1.0)
     squares = np.bincount(of_ray, (v**2 * used).sum(1), minlength=n)
     number = np.bincount(of_ray, used.sum(1), minlength=n)
     return {
@@ -135,62 +135,66 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the given order."""
     found = adjustment.reliability
-    parts = observations(adjustment.problem, *found)
+    parts = observations(adjustment.problem, *(getattr(found, name) for name in TESTED))
     return concatenate(
         [
-            residual_rows(adjustment, kind, image, point, axes, weight, Tested(*tested))
+            residual_rows(adjustment, kind, image, point, axes, weight, *tested)
             for kind, image, point, axes, weight, *tested in parts
         ]
     )
 
 
-def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
+BySet = Mapping[str, Float[np.ndarray, "n r"]]
+
+
+def observations(problem: NetworkProblem, *found: BySet) -> Iterator[tuple[Any, ...]]:
     """For every kind of observation: kind, ids of images and points, axes, the weights
     [observations, axes], and the part of each of `found` in that shape."""
-    data, network, given = problem.data, problem.network, problem.layout.given
+    network = problem.network
     images = np.array(network.images.id, dtype=object)
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
+    known = {o.name: o for o in problem.observations}
 
-    def of(field: str, at: Any = np.s_[:]):
-        return data.weight(field)[at], *(getattr(rows, field)[at] for rows in found)
+    def of(name: str):
+        return problem.weights(name), *(np.asarray(rows[name]) for rows in found)
 
-    yield "image", images[problem.image], points[problem.point], ("x", "y"), *of("image")
-    control, exterior = points[given["control"]], images[given["exterior"]]
-    yield "control", blank(len(control)), control, tuple("XYZ"), *of("control")
-    yield "prior", exterior, blank(len(exterior)), EXTERIOR, *of("exterior")
-    for row, c in enumerate(given["interior"]):
-        axes = get_model(network.cameras[c].model).parameters
-        one = np.s_[row : row + 1, : len(axes)]
-        yield "prior", cameras[[c]], blank(1), axes, *of("interior", one)
-    yield from _further(problem, found)
-    a, b = (points[network.distances.points[:, i]] for i in range(2))
-    yield "distance", a, b, ("d",), *of("distance", np.s_[:, None])
+    weights, *rows = (np.asarray(problem.image_points(x)) for x in (problem.data.weight, *found))
+    yield "image", images[problem.image], points[problem.point], ("x", "y"), weights, *rows
+    if "control" in known:
+        control = points[known["control"].rows[0]]
+        yield "control", blank(len(control)), control, tuple("XYZ"), *of("control")
+    if "exterior" in known:
+        exterior = images[known["exterior"].rows[0]]
+        yield "prior", exterior, blank(len(exterior)), EXTERIOR, *of("exterior")
+    for table in problem.cameras:
+        if table.interior_set in known:
+            own = cameras[table.cameras[known[table.interior_set].rows[0]]]
+            yield "prior", own, blank(len(own)), table.parameters, *of(table.interior_set)
+    for name in problem.further_sets:
+        yield *_of_further_kind(problem, known[name]), *of(name)
+    if "distance" in known:
+        a, b = (points[network.distances.points[:, i]] for i in range(2))
+        yield "distance", a, b, ("d",), *of("distance")
 
 
-def _further(problem: Problem, found: Sequence[Rows]):
-    """Observations of further kinds: the rows they touch are in the column of the point."""
-    for k, name in enumerate(problem.layout.others):
-        given, weight = problem.system.observations_of(name), problem.system.weights(name)
-        touched = [given.label(problem.system.tables, row) for row in range(given.number)]
-        touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
-        axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))
-        blank = np.full(given.number, "", dtype=object)
-        yield (
-            given.kind.name,
-            blank,
-            np.array(touched, dtype=object),
-            axes,
-            weight,
-            *(one.other[k] for one in found),
-        )
+def _of_further_kind(
+    problem: NetworkProblem, given: Observations
+) -> tuple[str, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """The rows that observations of a further kind touch are in the column of the point."""
+    touched = [given.label(problem.tables, row) for row in range(given.number)]
+    touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
+    width = problem.weights(given.name).shape[1]
+    axes = given.kind.axes or tuple(str(i + 1) for i in range(width))
+    blank = np.full(given.number, "", dtype=object)
+    return given.kind.name, blank, np.array(touched, dtype=object), axes
 
 
 def further_unknowns(adjustment) -> dict[str, dict]:
     """By table, row and name: value and sigma, like `Adjustment.further_unknowns`."""
     found: dict[str, dict] = {}
-    names, origin = set(adjustment.values.other), adjustment.problem.origin
+    names, origin = set(adjustment.problem.further_tables), adjustment.problem.origin
     if not names:
         return found
     for one in estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin):
@@ -214,11 +218,13 @@ def checks(adjustment) -> dict[str, np.ndarray]:
     return table | {"rays": found.rays}
 
 
-def residual_rows(adjustment, kind, image, point, axes, weight, tested: Tested):
+TESTED = ("residual", "gain", "redundancy", "w", "hat")
+"""Of `Reliability`, what a row of residuals is made of."""
+
+
+def residual_rows(adjustment, kind, image, point, axes, weight, v, gain, r, w, hat):
     """The rows of one kind of observation [observations × axes] as columns, without weightless
-    rows. `weight`: 1/σ."""
-    v, gain, r, w, hat = map(np.asarray, tested)
-    weight = np.asarray(weight)
+    rows. `weight`: 1/σ; the others: `TESTED`."""
     free = np.clip(1 - hat, 0, 1)
     unit = np.ones(weight.shape[1])
     if kind in OF_ANGLES or tuple(axes) == EXTERIOR:

@@ -43,7 +43,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.observation_equations import (
     LinearisedImagePoints,
@@ -178,7 +178,7 @@ def find_bias(
             tests[name] = _f_test(gain, q, adjustment.vtpv - gain, r)
     camera = problem.network.cameras[0]
     pixel = np.array(unit_size(get_model(camera.model), camera.pixel_size))
-    weight = np.asarray(problem.data.image_weight)[np.ravel(cells)]
+    weight = problem.image_weights[np.ravel(cells)]
     sigma = float(np.sqrt(np.mean(1 / (weight * pixel) ** 2)))
     return CalibrationBias(len(cells), sigma * noise, sigma * adjustment.sigma0, tests)
 
@@ -212,16 +212,16 @@ def _powers(xy: Float[np.ndarray, "n 2"], least: int, most: int) -> Float[np.nda
     return np.stack([P[:, i] * R[:, j] for i, j in pairs], 1)
 
 
-def _image_fields(problem: Problem, degree: int) -> Float[np.ndarray, "n 2 k"]:
+def _image_fields(problem: NetworkProblem, degree: int) -> Float[np.ndarray, "n 2 k"]:
     """Smooth displacements in x and y over the image, divided by σ."""
-    field = _powers(np.asarray(problem.data.image_xy), 0, degree)
-    each = np.asarray(problem.data.image_weight)[:, :, None] * field[:, None]
+    field = _powers(problem.image_coordinates(), 0, degree)
+    each = problem.image_weights[:, :, None] * field[:, None]
     none = np.zeros_like(each[:, 0])
     return np.stack([np.hstack([each[:, 0], none]), np.hstack([none, each[:, 1]])], 1)
 
 
 def _board_fields(
-    problem: Problem, found: LinearisedImagePoints, settings: BiasSettings
+    problem: NetworkProblem, found: LinearisedImagePoints, settings: BiasSettings
 ) -> Float[np.ndarray, "n 2 k"]:
     """Image effects of smooth displacements of the board points, divided by σ."""
     XY = problem.network.points.position[problem.point, :2]
@@ -238,7 +238,7 @@ def _board_fields(
     )
 
 
-def cells_of_four(problem: Problem, grid: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
+def cells_of_four(problem: NetworkProblem, grid: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
     """The image points of every complete cell of 2 × 2 points, in all photographs."""
     rows, columns = grid
     used = np.flatnonzero(used_rays(problem))
@@ -257,14 +257,14 @@ def _equations(
     """t of all cells, followed by the pseudo-observations, and their derivatives by the free
     parameters of camera and board."""
     problem = adjustment.problem
-    (name,) = (table.name for table in problem.layout.cameras)
+    (name,) = (table.name for table in problem.cameras)
     cut = lambda x: x[cells].reshape(len(cells), 8, -1)
     # the last left singular vectors of J [8, 6] span what no pose of the cell can move
     N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
     t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
     of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
     # a free or weighted board: its coordinates are columns of A, too
-    free = problem.system.table("point").free.astype(bool)
+    free = problem.table("point").free.astype(bool)
     of_points = np.zeros((len(cells), 2, *free.shape))
     if free.any():
         slope = found.slopes["point"][cells]
@@ -274,17 +274,17 @@ def _equations(
     flat = lambda x: x.reshape(len(t), -1)
     A = np.concatenate([flat(of_camera), flat(of_points)[:, free.ravel()]], 1)
     # Pseudo-observations of a weighted board, and of the camera.
-    v, data, width = adjustment.inspection.residuals, problem.data, of_camera.shape[2]
+    v, width = adjustment.inspection.residuals, of_camera.shape[2]
     place = np.full(free.shape, -1)
     place[free] = width + np.arange(free.sum())
-    of_table = np.full(v.interior.shape, -1)
-    moving = list(problem.system.table(name).vector.moving)
+    table, moving = problem.table(name), list(problem.table(name).vector.moving)
+    of_table = np.full((table.rows, table.vector.size), -1)
     of_table[:, moving] = np.arange(width)
-    for x, weight, column in (
-        (v.control, data.control_weight, place[problem.layout.given["control"]]),
-        (v.interior, data.interior_weight, of_table),
-    ):
-        weight = np.asarray(weight)
+    for kind, columns in (("control", place), ("interior", of_table)):
+        if kind not in v:
+            continue
+        x, weight = v[kind], problem.weights(kind)
+        column = columns[problem.observations_of(kind).rows[0]]
         used = weight > 0
         rows = np.zeros((int(used.sum()), A.shape[1]))
         rows[np.arange(len(rows)), column[used]] = weight[used]

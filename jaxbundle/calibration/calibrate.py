@@ -229,8 +229,8 @@ def _without_eccentricity(
     """The measured views with points moved from the ellipse centres to the images of the circle
     centres."""
     views, model = start.views, get_model(camera.model)
-    p = np.asarray(result.values.camera)[0][: len(model.parameters)]
-    M = jax.vmap(matrix_from_quaternion)(result.values.rotation)
+    p = np.asarray(result.values["camera"])[0]
+    M = jax.vmap(matrix_from_quaternion)(result.values["image"].rotation)
     poses = Pose(jnp.asarray(result.image_values[:, :3]), M)
     radius = present(views.board.diameter) / 2
     shift = _shifts(model, p, poses, views.board.points, radius)

@@ -293,8 +293,8 @@ def _candidate(
         squares[left] = _squares(one, camera)[left]
     # v is over σ, and the redundancy that of the image coordinates alone: k counts an unknown with
     # a prior by the part that the image determines
-    v = again.inspection.residuals.image
-    redundancy = float(again.reliability.redundancy.image.sum())
+    v = again.inspection.image_residuals
+    redundancy = float(again.problem.image_points(again.reliability.redundancy).sum())
     n, S = v.size, float(np.square(v).sum())
     k = n - redundancy
     sums, counts = (np.bincount(network.observations.image, w) for w in (squares, None))

@@ -41,7 +41,7 @@ from jaxbundle.io.results.result_json import verdict_dict
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
-from jaxbundle.network.further import Rigs
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures

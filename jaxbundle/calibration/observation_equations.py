@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import Space
-from jaxbundle.network.arrays import Values
-from jaxbundle.network.kinds import ImagePoint
+from jaxbundle.network.kinds.image_points import ImagePoint
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -34,21 +34,20 @@ class LinearisedImagePoints(NamedTuple):
 
 
 def linearise_image_points(
-    problem: Problem, values: Values, columns: tuple[int, ...] = ()
+    problem: NetworkProblem, values: Values, columns: tuple[int, ...] = ()
 ) -> LinearisedImagePoints:
     """All image points of a network of one camera; 0 without weight.
 
     **Arguments:** `columns`: parameters of the camera, held or not, for derivatives.
     """
     camera = problem.network.cameras[0].model
-    of, declared = ImagePoint(camera, problem.network.residuals), problem.system.declared
-    (name,) = (table.name for table in problem.layout.cameras)
-    tables = problem.layout.tables(values)
+    of, declared = ImagePoint(camera, problem.network.residuals), problem.declared
+    (name,) = (table.name for table in problem.cameras)
     at = {"image": problem.image, name: problem.camera, "point": problem.point}
-    touched = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i], tables[t]) for t, i in at.items())
+    touched = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i], values[t]) for t, i in at.items())
     spaces = tuple(declared.spaces[t] for t in at)
-    data = problem.data
-    v, J = _linearise(of, spaces, columns, touched, data.image_xy, data.image_weight)
+    xy, weight = problem.image_coordinates(), problem.image_weights
+    v, J = _linearise(of, spaces, columns, touched, xy, weight)
     *parts, B = np.split(np.asarray(J), np.cumsum([s.width for s in spaces]), 2)
     return LinearisedImagePoints(np.asarray(v), dict(zip(at, parts)), at, B)
 
@@ -65,7 +64,7 @@ def lagrange_multipliers(
 
     Source: Rao (1948), Proceedings of the Cambridge Philosophical Society 44, 50-57.
     """
-    tables, k = adjustment.problem.system.tables, B.shape[2]
+    tables, k = adjustment.problem.tables, B.shape[2]
     rows = {t.name: np.zeros((k, t.rows, t.space.width)) for t in tables}
     for t, i in found.touched.items():
         part = np.einsum("nrw,nrk->nkw", found.slopes[t], B)

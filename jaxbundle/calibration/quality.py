@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
@@ -124,7 +124,10 @@ def uncertainty_map(
         there = np.flatnonzero(have_rays(model, p, xy))
         # fixed in the scene, a point moves with the pose of each view as well, and poses are
         # correlated with the camera: the whole covariance, by propagation through a function
-        function = images_through_scene(model, c, views, adjustment.values, xy[there], distance)
+        table, row = adjustment.problem.table_of_camera(c)
+        function = images_through_scene(
+            model, (table.name, row), views, adjustment.values, xy[there], distance
+        )
         Q = adjustment.covariance_of(function).reshape(len(there), 2, len(there), 2)
         n = np.arange(len(there))
         C = np.full((len(xy), 2, 2), np.nan)
@@ -238,9 +241,9 @@ class CrossValidation:
     comparison: Comparison | None
 
 
-def used_rays(problem: Problem) -> Bool[np.ndarray, " rays"]:
+def used_rays(problem: NetworkProblem) -> Bool[np.ndarray, " rays"]:
     """Which image points have weight: those that were not removed as gross errors."""
-    return np.all(np.asarray(problem.data.image_weight) > 0, axis=1)
+    return np.all(problem.image_weights > 0, axis=1)
 
 
 def cross_validation(result: Adjustment) -> CrossValidation | None:
@@ -356,15 +359,15 @@ def residuals_in_pixels(
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Residuals v [n, 2] of the image points of a camera, and the points [n, 2], in pixels; v is
     NaN where a point was removed."""
-    problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)
-    weight = np.asarray(data.image_weight)
-    v = adjustment.inspection.residuals.image
+    problem, model = adjustment.problem, get_model(camera.model)
+    weight = problem.image_weights
+    v = adjustment.inspection.image_residuals
     used = used_rays(problem)
     # v is over σ in the adjustment
     v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
     own = problem.camera == c
-    xy = np.asarray(data.image_xy)[own]
+    xy = problem.image_coordinates()[own]
     size = np.array(unit_size(model, camera.pixel_size))
     uv = in_pixels(xy, model, camera.image_size, camera.pixel_size)
     return v[own] / size, uv

@@ -94,7 +94,7 @@ class Calibration:
     @property
     def rotation(self) -> Float[np.ndarray, "views 3 3"]:
         """M of every view, board to camera."""
-        return np.asarray(_matrices(self.adjustment.values.rotation))
+        return np.asarray(_matrices(self.adjustment.values["image"].rotation))
 
     @property
     def position(self) -> Float[np.ndarray, "views 3"]:

@@ -2,7 +2,7 @@
 
 from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
-from jaxbundle.network.further.base import ANGLES
+from jaxbundle.network.kinds.base import ANGLES
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics.held import split_name

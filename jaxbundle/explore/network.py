@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
@@ -31,7 +31,8 @@ from jaxbundle.geometry import (
     omega_phi_kappa_near,
     quaternion_from_matrix,
 )
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.leastsquares.indexing.rows import Data, Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import count, did_you_mean, show
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.plotting.frame import image_frame
@@ -145,7 +146,7 @@ class NetworkView:
         problem = self.problem
         seen = problem.point[(problem.image == row) & self.adjustment.located[problem.point]]
         given = self.adjustment.image_values[row]
-        M = np.asarray(matrix_from_quaternion(self.adjustment.values.rotation[row]))
+        M = np.asarray(matrix_from_quaternion(self.adjustment.values["image"].rotation[row]))
         if not len(seen):
             return M
         middle = self.adjustment.point_values[seen].mean(0)
@@ -161,13 +162,12 @@ class NetworkView:
     def start(self, moves: list[Moved]) -> Values:
         """The adjusted values with the stations at their new places."""
         values = self.adjustment.values
-        position, rotation = (np.array(x) for x in (values.position, values.rotation))
+        position, rotation = map(np.array, values["image"])
         # positions of the engine are relative to the origin of the network
         for row, centre, M in moves:
             position[row] = centre - self.problem.origin
             rotation[row] = np.asarray(quaternion_from_matrix(jnp.asarray(M)))
-        where = lambda v: (v.position, v.rotation)
-        return eqx.tree_at(where, values, (jnp.asarray(position), jnp.asarray(rotation)))
+        return values | {"image": PoseValue(jnp.asarray(position), jnp.asarray(rotation))}
 
     # --- what the server asks ---------------------------------------------------------------
 
@@ -228,7 +228,7 @@ class NetworkView:
         near = self.adjustment.point_values[self.adjustment.located]
         _, size = extent(np.concatenate([near, centres]))
         pyramids = camera_pyramids(self.adjustment, pyramid_size(centres, size))
-        M = np.asarray(jax.vmap(matrix_from_quaternion)(self.adjustment.values.rotation))
+        M = np.asarray(jax.vmap(matrix_from_quaternion)(self.adjustment.values["image"].rotation))
         return (pyramids - centres[:, None]) @ M.transpose(0, 2, 1)
 
     def _pyramid(self, moved: Moved) -> Float[np.ndarray, "5 3"]:
@@ -239,13 +239,13 @@ class NetworkView:
         """Messages about image points of moved stations outside the image or behind the camera."""
         problem, lines = self.problem, []
         for moved in moves:
-            used = (np.asarray(problem.data.image_weight) > 0).any(1)
+            used = problem.used
             rays = np.flatnonzero(used & (problem.image == moved.row))
             camera = problem.network.cameras[problem.network.images.camera[moved.row]]
             model = get_model(camera.model)
             low, high, known = image_frame(self.adjustment, camera.id)
             p = self.adjustment.camera_parameters(camera.id)
-            X = np.asarray(self.adjustment.values.point)[problem.point[rays]]
+            X = np.asarray(coordinates(self.adjustment.values))[problem.point[rays]]
             ray = (X - (moved.centre - problem.origin)) @ moved.M.T
             xy = images_of(model, p, ray)
             behind = np.zeros(len(rays), bool) if model.wide else ray[:, 2] >= 0

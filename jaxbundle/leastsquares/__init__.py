@@ -13,6 +13,8 @@ from jaxbundle.leastsquares.declarations import Kind as Kind
 from jaxbundle.leastsquares.declarations import Motions as Motions
 from jaxbundle.leastsquares.declarations import Observations as Observations
 from jaxbundle.leastsquares.declarations import Table as Table
+from jaxbundle.leastsquares.indexing.rows import Data as Data
+from jaxbundle.leastsquares.indexing.rows import Values as Values
 from jaxbundle.leastsquares.indexing.settings import PlanningSettings as PlanningSettings
 from jaxbundle.leastsquares.iterations.search import MarquardtDescent as MarquardtDescent
 from jaxbundle.leastsquares.iterations.search import NielsenTrustRegion as NielsenTrustRegion

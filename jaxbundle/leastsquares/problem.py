@@ -5,7 +5,7 @@ import itertools
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -100,6 +100,10 @@ class Problem:
         return kept
 
 
+AnyProblem = TypeVar("AnyProblem", bound=Problem)
+"""A problem, or one that knows more, such as the network it is of."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Counts:
     """Rows with weight, and free unknowns."""
@@ -187,7 +191,7 @@ def is_large(observations: Sequence[Observations], settings: PlanningSettings) -
     return sum(o.number for o in observations) > settings.exact_sizes_from
 
 
-def with_factor(problem: Problem) -> Problem:
+def with_factor(problem: AnyProblem) -> AnyProblem:
     """The problem with a reduced system that can be factorised for statistics; unchanged if no
     factor fits into memory."""
     if problem.plan.reduction in FACTORS:
@@ -220,7 +224,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     return dataclasses.replace(problem, plan=plan, counts=counts)
 
 
-def with_motions_at(problem: Problem, values: Values) -> Problem:
+def with_motions_at(problem: AnyProblem, values: Values) -> AnyProblem:
     """The problem with its open motions at these values: those about a weighted point follow the
     point."""
     datum, kinds = problem.plan.datum, problem.declared.kinds.values()
@@ -238,11 +242,11 @@ def with_motions_at(problem: Problem, values: Values) -> Problem:
 
 
 def hold(
-    problem: Problem,
+    problem: AnyProblem,
     table: str,
     rows: int | Sequence[int],
     columns: slice | Sequence[int] = slice(None),
-) -> Problem:
+) -> AnyProblem:
     """The problem with some unknowns held at their start values, removed from the datum
     unknowns."""
     given = problem.table(table)
@@ -251,7 +255,7 @@ def hold(
     return with_free(problem, table, free)
 
 
-def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"]) -> Problem:
+def with_free(problem: AnyProblem, table: str, free: Float[np.ndarray, "rows width"]) -> AnyProblem:
     """The problem with these unknowns of a table free (if free when planned) and the others held at
     their start values and removed from the datum unknowns."""
     tables = tuple(
@@ -276,7 +280,7 @@ def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"
     return dataclasses.replace(problem, tables=tables, plan=plan, counts=counts)
 
 
-def with_data(problem: Problem, data: Data) -> Problem:
+def with_data(problem: AnyProblem, data: Data) -> AnyProblem:
     """The problem with other data of the same shapes."""
     counts = dataclasses.replace(count(problem.tables, data), datum=problem.counts.datum)
     return dataclasses.replace(problem, data=data, counts=counts)

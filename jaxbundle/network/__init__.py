@@ -1,7 +1,5 @@
 """Networks: tables, checks, and their declaration to the engine."""
 
-from jaxbundle.network.arrays import Data as Data
-from jaxbundle.network.arrays import Values as Values
 from jaxbundle.network.tables import Camera as Camera
 from jaxbundle.network.tables import Distances as Distances
 from jaxbundle.network.tables import Images as Images

@@ -9,7 +9,7 @@ The columns are those of the project format:
 | points | id, role (tie, control, fixed, check), X, Y, Z, and σ: sX, sY, sZ |
 | observations | image, point, x, y, and σ: sx, sy |
 | distances | from, to, value, sigma |
-| antennas, attitudes, camera_parameters, … | `jaxbundle.network.further` |
+| antennas, attitudes, camera_parameters, … | `jaxbundle.network.kinds` |
 
 The columns X0, Y0, Z0 of images, and omega, phi, kappa, are optional, all three together.
 Missing values (None, NaN, empty text) mean no start value or no σ. A σ of an image may be "fixed"
@@ -35,7 +35,7 @@ from jaxbundle.network.columns import (
     is_missing,
     show,
 )
-from jaxbundle.network.further import KINDS, SECTIONS, Further
+from jaxbundle.network.kinds import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (
     AXES,
     CHOICES,

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
 from jaxbundle.leastsquares import declarations as ls
@@ -33,13 +33,16 @@ class CameraTable:
         """The name of the set of priors of these cameras."""
         return self.name.replace("camera", "interior", 1)
 
+    def start(self, cameras: Sequence[Camera]) -> Float[np.ndarray, "rows parameters"]:
+        """The start values of their parameters."""
+        return np.array([start_of(cameras[c]) for c in self.cameras])
+
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
         """The table; only parameters that are free in some camera are unknowns."""
         own = [cameras[c] for c in self.cameras]
         unknowns = [camera.unknowns for camera in own]
         free = np.array([[name in names for name in self.parameters] for names in unknowns])
         moving = tuple(np.flatnonzero(free.any(0)).tolist())
-        value = np.array([start_of(camera) for camera in own])
         at = self.parameters.index
         tied = tuple(
             (at(name), moving.index(at(group[0])))
@@ -49,7 +52,7 @@ class CameraTable:
         )
         return ls.Table(
             self.name,
-            value,
+            self.start(cameras),
             Vector(len(self.parameters), moving, tied),
             free[:, moving],
             [camera.id for camera in own],

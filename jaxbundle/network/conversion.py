@@ -15,7 +15,7 @@ import numpy as np
 from jaxbundle.cameras import CameraModel, Conversion, convert_camera, get_model, is_own, key_of
 from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.errors import InputError
-from jaxbundle.network.further import Edges
+from jaxbundle.network.kinds import Edges
 from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network
 

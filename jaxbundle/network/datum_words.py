@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.network.kinds import SIMILARITY
+from jaxbundle.network.motions import SIMILARITY
 
 
 def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"], about=(0.0, 0.0, 0.0)) -> str:

@@ -11,7 +11,7 @@ from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.network.kinds import ImagePoint
+from jaxbundle.network.kinds.image_points import ImagePoint
 
 
 @dataclasses.dataclass(frozen=True)

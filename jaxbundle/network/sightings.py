@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.further.base import among, rows_of
+from jaxbundle.network.kinds.base import among, rows_of
 from jaxbundle.network.tables import (
     EXTERIOR,
     Distances,

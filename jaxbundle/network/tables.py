@@ -232,7 +232,7 @@ class Network:
     `datum` is "control" (given by control points, priors), "inner" (inner constraints on
     `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
     has datum defects). `residuals` names the domain in which v = computed − observed is formed.
-    `further`: observations of further kinds (`network/further`), which name images and points by
+    `further`: observations of further kinds (`network/kinds`), which name images and points by
     id. `warnings` and `notes` for the report: what may spoil a result, and what is only good to
     know, such as what was left out; `left_out`: the latter with all names.
     """

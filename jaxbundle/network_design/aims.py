@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.unknowns import find_unknowns, value_of
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import AIMS
@@ -33,12 +33,11 @@ from jaxbundle.geometry.quaternions import quaternion_from_rotation_vector
 from jaxbundle.leastsquares.equations.normal import zero_tangent
 from jaxbundle.leastsquares.indexing.plan import Plan
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
-from jaxbundle.leastsquares.indexing.rows import Data as EngineData
-from jaxbundle.leastsquares.indexing.rows import Declared, diagonal_of
+from jaxbundle.leastsquares.indexing.rows import Data, Declared, Values, diagonal_of
 from jaxbundle.leastsquares.iterations.retraction import retract
-from jaxbundle.leastsquares.problem import pad_data, without_filling
+from jaxbundle.leastsquares.problem import pad_data, with_factor, without_filling
 from jaxbundle.leastsquares.quality.precision import covariances, redundancy
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.types import AnyArray
 
 Name = tuple[str, str, str]
@@ -88,7 +87,7 @@ class Aim:
         return f"{self.measure} σ of {what}"
 
 
-def functions_of(problem: Problem, aim: Aim) -> Functions | None:
+def functions_of(problem: NetworkProblem, aim: Aim) -> Functions | None:
     """The quantities of the aim as a function of the unknowns; None for points and reliability.
 
     **Raises:** `InputError` if no camera has a free parameter, `KeyError` for unknown names."""
@@ -114,7 +113,7 @@ def functions_of(problem: Problem, aim: Aim) -> Functions | None:
     return lambda values: jnp.stack([value_of(problem, name, values) for name in wanted])
 
 
-def points_of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
+def points_of_interest(problem: NetworkProblem) -> Bool[np.ndarray, " points"]:
     """The points of the aim: tie points, or if there are none all that are not held."""
     points = problem.network.points
     tie = points.has_role("tie")
@@ -135,33 +134,35 @@ class Task(NamedTuple):
     image_sets: tuple[str, ...]
 
 
-def task_of(problem: Problem, aim: Aim) -> Task:
+def task_of(problem: NetworkProblem, aim: Aim) -> Task:
     """The aim for the engine.
 
     **Raises:** `InputError` if no factor of the network fits into memory."""
-    problem = problem.with_factor()
-    system, functions = problem.system, functions_of(problem, aim)
+    problem = with_factor(problem)
+    functions = functions_of(problem, aim)
     if problem.reduction not in FACTORS:
         raise InputError("design: the network is too large for its covariance; use a part of it")
     of = None
     if functions is not None:
-        of = lambda tables: functions(problem.layout.values(without_filling(system, tables)))
+        of = lambda tables: functions(without_filling(problem, tables))
     rows = points_of_interest(problem)
-    mask = np.zeros(system.sizes["table", "point"])
+    mask = np.zeros(problem.sizes["table", "point"])
     mask[: len(rows)] = rows
     index = np.asarray(AIMS.index(aim.measure))
     reliable = aim.measure == "reliability"
-    return Task(system.declared, system.plan, of, reliable, index, mask, _image_sets(problem))
+    return Task(
+        problem.declared, problem.plan, of, reliable, index, mask, tuple(problem.image_rows)
+    )
 
 
 @eqx.filter_jit
-def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]:
+def log_aim(task: Task, data: Data) -> tuple[Float[Array, ""], Data]:
     """The logarithm of the aim and its gradient by all numbers of a design, which are padded to the
     sizes of the plan; NaN if the design leaves unknowns undetermined. Designs of one shape share
     the program."""
     declared, plan = task.declared, task.plan
 
-    def value(data: EngineData) -> Float[Array, ""]:
+    def value(data: Data) -> Float[Array, ""]:
         if task.reliability:
             # Observations with less than a thousandth of the largest 1/σ, a millionth of the
             # weight, are not visible in effect: they do not count, as they would not be measured.
@@ -186,24 +187,19 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
     return jax.value_and_grad(value)(data)
 
 
-def aim_of(problem: Problem, aim: Aim) -> float:
+def aim_of(problem: NetworkProblem, aim: Aim) -> float:
     """The aim of a network at its start values with its weights; NaN if it is not determined."""
-    data = pad_data(problem.system, problem.layout.data(problem.data))
+    data = pad_data(problem, problem.data)
     return float(jnp.exp(log_aim(task_of(problem, aim), data)[0]))
 
 
-def smallest_redundancy(problem: Problem) -> float:
+def smallest_redundancy(problem: NetworkProblem) -> float:
     """The smallest redundancy number of an image coordinate."""
-    system = problem.with_factor().system
-    data = pad_data(system, problem.layout.data(problem.data))
-    found = redundancy(system.declared, system.plan, data)
-    there = {o: diagonal_of(data.weight[o]) > 0 for o in _image_sets(problem)}
+    problem = with_factor(problem)
+    data = pad_data(problem, problem.data)
+    found = redundancy(problem.declared, problem.plan, data)
+    there = {o: diagonal_of(data.weight[o]) > 0 for o in problem.image_rows}
     return min(float(found[o][used].min()) for o, used in there.items())
-
-
-def _image_sets(problem: Problem) -> tuple[str, ...]:
-    """The names of the sets of image points."""
-    return tuple(s.name for s in problem.layout.sets if s.field == "image")
 
 
 def measure(aim: Aim, blocks: Float[AnyArray, "blocks k k"]) -> float:
@@ -251,11 +247,11 @@ def _norm(x: Float[Array, "..."]) -> Float[Array, ""]:
     return largest * jnp.sum((x / largest) ** q) ** (1 / q)
 
 
-def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
+def refuse_arbitrary(aim: Aim, problem: NetworkProblem) -> None:
     """Refuse an aim that depends on the datum.
 
     **Raises:** `InputError`."""
-    datum = problem.system.plan.datum
+    datum = problem.plan.datum
     if datum is None or aim.measure == "reliability":
         return
     functions, defect = functions_of(problem, aim), int(np.asarray(datum.gauge).shape[1])
@@ -292,10 +288,6 @@ def _move(values: Values, t: Float[AnyArray, "7"]) -> Values:
     turn = matrix_from_quaternion(quaternion_from_rotation_vector(t[3:6]))
     moved = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]
     in_camera = jax.vmap(lambda q: retract_quaternion(q, -matrix_from_quaternion(q) @ t[3:6]))
-    return Values(
-        values.camera,
-        moved(values.position),
-        in_camera(jnp.asarray(values.rotation)),
-        moved(values.point),
-        values.other,
-    )
+    position, rotation = values["image"]
+    image = PoseValue(moved(position), in_camera(jnp.asarray(rotation)))
+    return values | {"image": image, "point": moved(values["point"])}

@@ -19,7 +19,8 @@ from jaxbundle.arguments import integer, one_of, positive, show
 from jaxbundle.choices import DESIGNED, ORDERS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.sightings import keep_images, split_check_points
 from jaxbundle.network.tables import Images, Network, require_network
@@ -152,7 +153,8 @@ def _design_configuration(
         )
     # The result is never worse than the start, if that satisfies the conditions of stations.
     low, high = boxes[0]
-    inside = bool(((start.values.position >= low) & (start.values.position <= high)).all())
+    position = start.values["image"].position
+    inside = bool(((position >= low) & (position <= high)).all())
     if _better(before, best) and inside:
         allowed = satisfies(conditions, variables, origin, start, settings.edge_sharpness)
         best = before if allowed else best
@@ -385,14 +387,10 @@ def _place(
 ) -> Configuration:
     """Some stations at other positions."""
     values = start.values
-    positions, rotations, look = (
-        np.array(x) for x in (values.position, values.rotation, start.look)
-    )
+    positions, rotations, look = (np.array(x) for x in (*values["image"], start.look))
     positions[rows], rotations[rows] = position, rotation
-    look[rows] = np.asarray(values.point)[target]
-    return Configuration(
-        Values(values.camera, positions, rotations, values.point, values.other), look
-    )
+    look[rows] = np.asarray(values["point"])[target]
+    return Configuration(values | {"image": PoseValue(positions, rotations)}, look)
 
 
 def _with_another(network: Network) -> tuple[Network, str]:

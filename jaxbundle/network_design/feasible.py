@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network.columns import list_some
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.pairs import MIN_RAYS, StationTargetPairs
@@ -23,8 +23,8 @@ def room_of(conditions: Conditions, pairs: StationTargetPairs) -> Float[np.ndarr
     if conditions.room is not None:
         return np.array(conditions.room) - pairs.problem.origin
     start = pairs.problem.data.start
-    middle = np.asarray(start.point).mean(0)
-    reach = np.linalg.norm(np.asarray(start.position) - middle, axis=1).max()
+    middle = np.asarray(start["point"]).mean(0)
+    reach = np.linalg.norm(np.asarray(start["image"].position) - middle, axis=1).max()
     # Three times the largest distance at the start, as `Conditions` says: a bound for aims that
     # fall with the distance for ever, such as the σ of a distortion.
     return middle + 3.0 * reach * np.array([[-1.0] * 3, [1.0] * 3])
@@ -34,7 +34,7 @@ def targets_of(conditions: Conditions, pairs: StationTargetPairs) -> Float[np.nd
     """The box of movable targets: that of the conditions, or of all points."""
     if conditions.targets is not None:
         return np.array(conditions.targets) - pairs.problem.origin
-    points = np.asarray(pairs.problem.data.start.point)
+    points = np.asarray(pairs.problem.data.start["point"])
     return np.stack([points.min(0), points.max(0)])
 
 
@@ -56,8 +56,8 @@ def try_stations(
     if not len(position):
         raise InputError("conditions: no station is possible: the obstacles fill the whole room")
     # Every target is looked at in turn: with a narrow camera a station sees only what it looks at.
-    targets = np.resize(np.arange(len(values.point)), len(position))
-    away = np.asarray(values.point)[targets] - position
+    targets = np.resize(np.arange(len(values["point"])), len(position))
+    away = np.asarray(values["point"])[targets] - position
     upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(position), 1))
     return position, np.asarray(_turned(upright, away)), targets
 
@@ -71,8 +71,8 @@ def check_feasible(pairs: StationTargetPairs, tried: int = 1024) -> None:
     **Raises:** `InputError` naming the condition, or the targets."""
     start = pairs.problem.data.start
     position, rotation, _ = try_stations(pairs, tried)
-    position = np.concatenate([position, start.position])
-    rotation = np.concatenate([rotation, start.rotation])
+    position = np.concatenate([position, start["image"].position])
+    rotation = np.concatenate([rotation, start["image"].rotation])
     found = {}
     for c in range(len(pairs.views)):
         seen = _test_conditions(pairs, c, start, position, rotation)
@@ -131,7 +131,8 @@ def _test_conditions(
 ) -> dict[str, Bool[np.ndarray, "stations points"]]:
     """Which conditions the stations of a camera satisfy, [stations, points] each."""
     view = pairs.views[c]
-    interior = jnp.asarray(start.camera)[c, : len(view.model.parameters)]
+    table, row = pairs.problem.table_of_camera(c)
+    interior = jnp.asarray(start[table.name])[row]
 
     def test_ray(
         p: Float[Array, "3"],
@@ -146,7 +147,7 @@ def _test_conditions(
     found = of_all(
         jnp.asarray(position),
         jnp.asarray(rotation),
-        jnp.asarray(start.point),
+        jnp.asarray(start["point"]),
         None if pairs.normals is None else jnp.asarray(pairs.normals),
     )
     return {name: np.asarray(rows) for name, rows in found.items()}

@@ -9,19 +9,17 @@ from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.indexing.rows import Data as EngineData
+from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.leastsquares.problem import fill_data
-from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_tables
-from jaxbundle.network.further import CameraParameters
+from jaxbundle.network.kinds import CameraParameters
 from jaxbundle.network.tables import Network, Observations, Source, require_network
 from jaxbundle.network_design.aims import (
     Aim,
@@ -62,7 +60,7 @@ class StationTargetPairs:
     `normals`: of all points; `interest`: the points of the aim.
     """
 
-    problem: Problem
+    problem: NetworkProblem
     aim: Aim
     task: Task
     conditions: Conditions
@@ -87,17 +85,18 @@ class StationTargetPairs:
         image, point, found, order = self.problem.image, self.problem.point, [], []
         for c, view in enumerate(self.views):
             rows = self.of_camera(c)
-            interior = jnp.asarray(values.camera)[c, : len(view.model.parameters)]
+            table, row = self.problem.table_of_camera(c)
+            interior = jnp.asarray(values[table.name])[row]
             normal = None if self.normals is None else jnp.asarray(self.normals)[point[rows]]
             axes = 0, 0, None, 0, None if normal is None else 0
             mapped = jax.vmap(partial(function, view), axes)
             take = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
             found.append(
                 mapped(
-                    take(values.position, image),
-                    take(values.rotation, image),
+                    take(values["image"].position, image),
+                    take(values["image"].rotation, image),
                     interior,
-                    take(values.point, point),
+                    take(values["point"], point),
                     normal,
                 )
             )
@@ -115,15 +114,15 @@ class StationTargetPairs:
         of_others = np.nan_to_num(self.given_visibility)
         return jnp.where(self.soft, self.each_ray(of_ray, values), of_others)
 
-    def data(self, values: Values, visibilities: Float[AnyArray, " rays"]) -> EngineData:
+    def data(self, values: Values, visibilities: Float[AnyArray, " rays"]) -> Data:
         """The numbers of the design, padded to the sizes of the plan: 1/σ times the visibilities,
         image coordinates those of the values."""
-        xy, data = self.predict(values), self.problem.data
-        # The network's `image_weight` is 1/σ, the root of the weight.
-        sqrt_p = jnp.asarray(data.image_weight) * jnp.asarray(visibilities)[:, None]
-        fields = lambda d: (d.start, d.image_xy, d.image_weight)
-        data = eqx.tree_at(fields, data, (values, xy, sqrt_p))
-        return fill_data(self.problem.system, self.problem.layout.data(data))
+        problem = self.problem
+        data = dataclasses.replace(problem.data, start=values)
+        data = problem.with_image_coordinates(data, self.predict(values))
+        # The engine's `weight` is 1/σ, the root of the weight.
+        sqrt_p = jnp.asarray(problem.image_weights) * jnp.asarray(visibilities)[:, None]
+        return fill_data(problem, problem.with_image_weights(data, sqrt_p))
 
     def aim_at(self, measured: Bool[np.ndarray, " rays"], values: Values) -> float:
         """The aim with these rays; NaN if they do not determine it. Photographs with too few
@@ -136,7 +135,7 @@ class StationTargetPairs:
         return float(jnp.exp(log_aim(self.task, data)[0]))
 
     @cached_property
-    def _compiled_data(self) -> Callable[..., EngineData]:
+    def _compiled_data(self) -> Callable[..., Data]:
         return jax.jit(self.data)
 
     @cached_property

@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.network.further import CameraParameters, ExteriorPriors
-from jaxbundle.network.further.base import rows_of
-from jaxbundle.network.further.camera_parameters import RATIO
+from jaxbundle.network.kinds import CameraParameters, ExteriorPriors
+from jaxbundle.network.kinds.base import rows_of
+from jaxbundle.network.kinds.camera_parameters import RATIO
 from jaxbundle.network.tables import Network
 
 

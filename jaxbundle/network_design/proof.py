@@ -10,17 +10,18 @@ import dataclasses
 
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import PSEUDO_OBSERVATIONS, NetworkProblem, coordinates
 from jaxbundle.arguments import integer
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.indexing.rows import Data
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
-from jaxbundle.network.arrays import Data
 from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, points_of_interest
 
-FIELDS = ("image", "control", "exterior", "interior", "distance")
+STANDARD = (*PSEUDO_OBSERVATIONS, "image")
+"""Sets whose measurements are simulated."""
 
 
 @print_in_one_screen
@@ -57,7 +58,7 @@ class Proof:
         )
 
 
-def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
+def prove(problem: NetworkProblem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     """Simulate and adjust a network with exact image coordinates.
 
     **Arguments:** `problem`: its start values are the truth.
@@ -67,17 +68,15 @@ def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
     truth, exact = problem.data.start, problem.data
     functions = functions_of(problem, aim)
     interest = np.flatnonzero(points_of_interest(problem))
-    points = lambda values: np.asarray(values.point)[interest]
+    points = lambda values: np.asarray(coordinates(values))[interest]
     of = points if functions is None else lambda values: functions(values)[None]
     random = np.random.default_rng(seed)
     # Adjusted, not propagated: the linear propagation is what is to be proved.
     found = []
     for _ in range(draws):
-        data = problem.layout.data(_measure(exact, random))
-        minimum = find_minimum(with_data(problem.system, data))
+        minimum = find_minimum(with_data(problem, _measure(exact, random)))
         if bool(converged(minimum.termination)):
-            values = problem.layout.values(minimum.values)
-            found.append(np.asarray(of(values)) - np.asarray(of(truth)))
+            found.append(np.asarray(of(minimum.values)) - np.asarray(of(truth)))
     if not found:
         raise NotSolvedError("design: none of the simulated networks could be adjusted")
     d = np.array(found)
@@ -93,14 +92,13 @@ def _measure(exact: Data, random: np.random.Generator) -> Data:
     """Simulated data."""
 
     def sigma_of(name: str) -> np.ndarray:
-        """0 of what is not measured. The network's `weight` is 1/σ, the root of the weight."""
-        sqrt_p = np.asarray(exact.weight(name))
+        """0 of what is not measured. The engine's `weight` is 1/σ, the root of the weight."""
+        sqrt_p = np.asarray(exact.weight[name])
         return np.where(sqrt_p > 0, 1 / np.where(sqrt_p > 0, sqrt_p, 1.0), 0.0)
 
-    noisy = {
-        name: np.asarray(exact.measured(name))
-        + random.standard_normal(exact.measured(name).shape) * sigma_of(name)
-        for name in FIELDS
-    }
-    xy = noisy.pop("image")
-    return dataclasses.replace(exact, image_xy=xy, **noisy)
+    noisy = dict(exact.measured)
+    for name, measured in exact.measured.items():
+        if name.partition(",")[0] in STANDARD:
+            sigma = sigma_of(name).reshape(np.shape(measured))
+            noisy[name] = np.asarray(measured) + random.standard_normal(sigma.shape) * sigma
+    return dataclasses.replace(exact, measured=noisy)

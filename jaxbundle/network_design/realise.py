@@ -6,10 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, make_problem
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
 from jaxbundle.network.tables import Distances, Network, Source
@@ -33,10 +33,10 @@ def realise(
     network, origin = pairs.problem.network, pairs.problem.origin
     images = dataclasses.replace(
         network.images,
-        position=np.asarray(values.position) + origin,
-        angles=np.asarray(_angles(np.asarray(values.rotation))),
+        position=np.asarray(values["image"].position) + origin,
+        angles=np.asarray(_angles(np.asarray(values["image"].rotation))),
     )
-    points = dataclasses.replace(network.points, position=np.asarray(values.point) + origin)
+    points = dataclasses.replace(network.points, position=np.asarray(coordinates(values)) + origin)
     rays = network.observations
     xy = np.asarray(pairs.predict(values))
     if seed is not None:
@@ -74,7 +74,7 @@ def _distances(
     return dataclasses.replace(given, value=np.where(moved, length + noise, given.value))
 
 
-def problem_of(network: Network) -> Problem | None:
+def problem_of(network: Network) -> NetworkProblem | None:
     """The problem of a designed network; None if it cannot be adjusted."""
     try:
         checked = check_network(network)

@@ -17,7 +17,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.leastsquares.indexing.rows import Data as EngineData
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.network_design.aims import log_aim
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.pairs import StationTargetPairs
@@ -98,7 +98,7 @@ def station_margins(
     sharp = edge_sharpness / half.mean(1)
 
     def margins(x: Float[AnyArray, " variables"], start: Configuration) -> Float[Array, " margins"]:
-        position = variables.place(start, x).values.position
+        position = variables.place(start, x).values["image"].position
         images = len(position)
         i, j = np.triu_indices(images, 1)
         moves = np.isin(i, variables.images) | np.isin(j, variables.images)

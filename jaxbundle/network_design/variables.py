@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int, Shaped
 from jaxbundle.choices import DESIGNED
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.types import AnyArray
 
 AXIS = np.array([0.0, 0.0, -1.0])
@@ -62,10 +63,10 @@ class Variables:
     def vector(self, start: Configuration) -> Float[np.ndarray, " variables"]:
         """The variables of the start: roll 0."""
         rows = {
-            "position": np.asarray(start.values.position)[self.images] / self.unit,
+            "position": np.asarray(start.values["image"].position)[self.images] / self.unit,
             "direction": np.asarray(start.look)[self.images] / self.unit,
             "roll": np.zeros((len(self.images), 1)),
-            "targets": np.asarray(start.values.point)[self.points] / self.unit,
+            "targets": np.asarray(start.values["point"])[self.points] / self.unit,
         }
         return np.concatenate([np.zeros(0), *(rows[name].ravel() for name in self.sizes)])
 
@@ -73,7 +74,7 @@ class Variables:
         self, start: Configuration, x: Float[np.ndarray, " variables"]
     ) -> Float[np.ndarray, "images 3"]:
         """Projection centres at these variables."""
-        found = np.array(start.values.position)
+        found = np.array(start.values["image"].position)
         if "position" in self.sizes:
             found[self.images] = self.parts(x)["position"] * self.unit
         return found
@@ -88,8 +89,8 @@ class Variables:
     def place(self, start: Configuration, x: Float[AnyArray, " variables"]) -> Configuration:
         """The network at these variables."""
         parts, values = self.parts(x), start.values
-        position, look = (jnp.asarray(rows) for rows in (values.position, start.look))
-        rotation, point = jnp.asarray(values.rotation), jnp.asarray(values.point)
+        position, rotation = map(jnp.asarray, values["image"])
+        look, point = jnp.asarray(start.look), jnp.asarray(values["point"])
         # The position first: the direction is that from the new position to the viewed point.
         if "position" in parts:
             position = position.at[self.images].set(parts["position"] * self.unit)
@@ -104,7 +105,8 @@ class Variables:
             rotation = rotation.at[self.images].set(rolled)
         if "targets" in parts:
             point = point.at[self.points].set(parts["targets"] * self.unit)
-        return Configuration(Values(values.camera, position, rotation, point, values.other), look)
+        image = PoseValue(position, rotation)
+        return Configuration(values | {"image": image, "point": point}, look)
 
 
 def turn_axis(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
@@ -135,7 +137,7 @@ def choose_variables(
             raise InputError(f"free: {name!r} is not one of {', '.join(DESIGNED)}")
     if not free:
         raise InputError(f"free: nothing to design; give some of {', '.join(DESIGNED)}")
-    reach = np.asarray(values.position) - np.asarray(values.point).mean(0)
+    reach = np.asarray(values["image"].position) - np.asarray(values["point"]).mean(0)
     return Variables(images, points, tuple(free), float(np.linalg.norm(reach, axis=1).mean()))
 
 
@@ -144,8 +146,8 @@ _axes = jax.jit(jax.vmap(lambda q: matrix_from_quaternion(q).T @ AXIS))
 
 def points_on_axes(values: Values) -> Float[np.ndarray, "images 3"]:
     """The points on the axes of all images at the depth of the centre of the targets."""
-    position, middle = np.asarray(values.position), np.asarray(values.point).mean(0)
-    axis = np.asarray(_axes(np.asarray(values.rotation)))
+    position, middle = np.asarray(values["image"].position), np.asarray(values["point"]).mean(0)
+    axis = np.asarray(_axes(np.asarray(values["image"].rotation)))
     depth = ((middle - position) * axis).sum(1)
     size = np.linalg.norm(middle - position, axis=1)
     # At least a tenth of the distance in front of a camera that looks away from the targets.
@@ -159,7 +161,7 @@ def bounds(
     targets: Float[np.ndarray, "2 3"],
 ) -> tuple[Float[np.ndarray, " variables"], Float[np.ndarray, " variables"]]:
     """The smallest and largest values of the variables; boxes relative to the origin."""
-    points = np.concatenate([np.asarray(start.values.point), start.look])
+    points = np.concatenate([np.asarray(start.values["point"]), start.look])
     low, high = points.min(0), points.max(0)
     # Cameras may look past the targets by a quarter of their extent. Farther, a viewed point says
     # less about the direction and the search has nothing to gain.

@@ -17,7 +17,7 @@ from jaxbundle.leastsquares.declarations import Kind, Observations, Table
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.declare import declare
-from jaxbundle.network.further import RollingShutter
+from jaxbundle.network.kinds import RollingShutter
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
 from jaxbundle.system.programs import compile_once
@@ -57,7 +57,7 @@ def simulate_further(
             network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
-            seen = declared.observations[len(declared.layout.sets)]
+            seen = next(o for o in declared.observations if o.name in declared.further_sets)
             measured = jax.tree.leaves(seen.measured)[0] + _residuals(declared.tables, seen, values)
             whitening = seen.weight(np.shape(measured)[-1] if np.ndim(measured) > 1 else 1)
             noise = _noise(random, whitening).reshape(np.shape(measured))
@@ -82,10 +82,9 @@ def _expose_moving(
         declared, rays = declare(truth, np.zeros(3)), truth.observations
         values = {t.name: t.value for t in declared.tables} | values
         xy = rays.xy.copy()
-        for part, seen in zip(declared.layout.sets, declared.observations):
-            if part.field == "image":
-                chosen = slice(None) if part.rows is None else part.rows
-                xy[chosen] += _residuals(declared.tables, seen, values)
+        for seen in declared.observations:
+            if seen.name in declared.image_rows:
+                xy[declared.image_rows[seen.name]] += _residuals(declared.tables, seen, values)
         change = np.abs(xy - rays.xy).max(initial=0.0)
         truth = truth.replace(observations=dataclasses.replace(rays, xy=xy))
         if change <= 1e-13 * np.abs(xy).max(initial=0.0):

@@ -33,7 +33,7 @@ def image_frame(
         half = np.array(size) * np.abs(pitch) / 2
         return -half, half, True
     used = adjustment.problem.camera == c
-    xy = np.asarray(adjustment.problem.data.image_xy)[used]
+    xy = adjustment.problem.image_coordinates()[used]
     if not len(xy):
         return -np.ones(2), np.ones(2), False
     return xy.min(0), xy.max(0), False
@@ -45,18 +45,18 @@ def measured(adjustment: "Adjustment", image: str) -> tuple[np.ndarray, ...]:
     Coordinates and v = computed − observed in the unit of the camera's model; τ and v of a
     removed coordinate are NaN.
     """
-    problem, data = adjustment.problem, adjustment.problem.data
+    problem = adjustment.problem
     i = image_index(adjustment, image)
-    weight = np.asarray(data.image_weight)
+    weight = problem.image_weights
     rows = np.flatnonzero((problem.image == i) & (weight > 0).any(1))
     weight = np.where(weight[rows] > 0, weight[rows], np.nan)
     found = adjustment.reliability
     ids = np.array(adjustment.problem.network.points.id, dtype=object)
     return (
         ids[problem.point[rows]],
-        np.asarray(data.image_xy)[rows],
-        np.asarray(found.residual.image)[rows] / weight,
-        adjustment.pope(np.asarray(found.w.image)[rows]),
+        problem.image_coordinates()[rows],
+        problem.image_points(found.residual)[rows] / weight,
+        adjustment.pope(problem.image_points(found.w)[rows]),
     )
 
 

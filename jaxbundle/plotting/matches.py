@@ -137,10 +137,10 @@ def tracks_in_photograph(
     """
     ax = axes(ax, (8, 6))
     problem, i = adjustment.problem, image_index(adjustment, image)
-    used = (np.asarray(problem.data.image_weight) > 0).any(1)
+    used = problem.used
     rays = np.bincount(problem.point[used], minlength=len(problem.network.points))
     rows = problem.image == i
-    xy = np.asarray(problem.data.image_xy)
+    xy = problem.image_coordinates()
     columns, height = problem.network.cameras[problem.network.images.camera[i]].image_size
     ax.imshow(
         picture,

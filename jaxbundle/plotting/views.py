@@ -176,14 +176,16 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
     that the principal point and the distortion are visible.
     """
     network, values = adjustment.problem.network, adjustment.values
-    M = np.asarray(jax.vmap(matrix_from_quaternion)(values.rotation))
+    M = np.asarray(jax.vmap(matrix_from_quaternion)(values["image"].rotation))
     centres = adjustment.image_values[:, :3]
     models = [get_model(given.model) for given in network.cameras]
     frames = np.array([np.stack(image_frame(adjustment, c.id)[:2]) for c in network.cameras])
     corners = np.zeros((len(models), 4, 3))
+    interior = np.asarray(adjustment.problem.interior_orientation(values))
+    interior = np.asarray(adjustment.problem.interior_orientation(values))
     for model in dict.fromkeys(models):
         chosen = [c for c, other in enumerate(models) if other == model]
-        p = adjustment.values.camera[np.array(chosen), : len(model.parameters)]
+        p = interior[np.array(chosen), : len(model.parameters)]
         corners[chosen] = _corner_rays(model, p, frames[chosen])
     # if the distortion turns back inside the frame there is no ray: an approximate corner instead
     missing = ~np.all(np.isfinite(corners), axis=2)

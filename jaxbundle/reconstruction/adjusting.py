@@ -268,13 +268,11 @@ def _weight(
         if np.all(np.abs(factor - 1) < settings.last_change):
             break
         total[rows] *= factor
-        used = np.asarray(result.problem.data.image_weight) > 0
-        suspects = _name(result, ~np.any(used, axis=1))
+        suspects = _name(result, ~result.problem.used)
     factors = {
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }
-    used = np.asarray(result.problem.data.image_weight) > 0
-    return WeightedAdjustment(result, factors, int(used.any(1).sum()))
+    return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
@@ -303,7 +301,7 @@ def _approximate_redundancy(
 ) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
     """v/σ of the rays, and redundancy numbers from the number of rays of their points: exact ones
     need the cofactors of the whole network, which gross errors would spoil."""
-    w = np.asarray(result.inspection.residuals.image)
+    w = result.inspection.image_residuals
     rays = np.bincount(result.problem.point)[result.problem.point]
     return w, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
 
@@ -312,10 +310,9 @@ def _redundancy(
     result: Adjustment,
 ) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
     """v/σ of the rays, NaN of excluded ones, and their redundancy numbers."""
-    reliability = result.reliability
-    used = np.asarray(result.problem.data.image_weight) > 0
-    w = np.where(used, reliability.residual.image, np.nan)
-    return w, np.asarray(reliability.redundancy.image)
+    reliability, problem = result.reliability, result.problem
+    w, r = (problem.image_points(x) for x in (reliability.residual, reliability.redundancy))
+    return np.where(problem.image_weights > 0, w, np.nan), r
 
 
 def _factors(

@@ -18,7 +18,7 @@ import numpy as np
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.further import Ties
+from jaxbundle.network.kinds import Ties
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network, Points
 from jaxbundle.reconstruction.network import ASPECT, observed_parameters, with_observed
@@ -125,7 +125,7 @@ def _adjusted_network(result: Adjustment) -> Network:
     """The network with adjusted values as start values, without removed observations."""
     network, values = result.problem.network, result.image_values
     images, points, rays = network.images, network.points, network.observations
-    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    used = result.problem.used
     tie = points.has_role("tie")[:, None]
     position = np.where(tie, result.point_values, points.position)
     cameras = tuple(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.network.further import Antennas
+from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation import many
@@ -166,7 +166,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
     network, values = result.problem.network, result.image_values
     X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
-    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    used = result.problem.used
     image, point = result.problem.image[used], result.problem.point[used]
     X = result.point_values
     known = np.isfinite(X[point]).all(1)

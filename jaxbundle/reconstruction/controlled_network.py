@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.io.results.result_project import readjustable_network
-from jaxbundle.network.further import Antennas, ExteriorPriors
+from jaxbundle.network.kinds import Antennas, ExteriorPriors
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Distances, LeftOut, Network, Points, Source
 from jaxbundle.network.units import from_image_unit

@@ -46,7 +46,7 @@ def choose_datum_points(
         return ()
     if network.points.has_role("control", "fixed").any():
         return ()
-    used = (np.asarray(problem.data.image_weight) > 0).any(1)
+    used = problem.used
     image, point = problem.image[used], problem.point[used]
     rays = np.bincount(point, minlength=len(network.points))
     angle = angle_of_rays(problem, result.values)
@@ -57,7 +57,7 @@ def choose_datum_points(
     good &= angle >= min(settings.wide_angle, float(np.median(angle[good])))
     rows = np.flatnonzero(good[point])
     image, point = image[rows], point[rows]
-    cell = _cells(np.asarray(problem.data.image_xy)[used][rows], image, settings.cells)
+    cell = _cells(problem.image_coordinates()[used][rows], image, settings.cells)
     # the first of each cell: with the most rays, and the widest angle
     order = np.lexsort((-angle[point], -rays[point], cell, image))
     first = np.unique(np.stack([image[order], cell[order]]), axis=1, return_index=True)[1]

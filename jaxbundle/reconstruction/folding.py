@@ -127,7 +127,7 @@ def count_shared_points(
     network, values = result.network, result.image_values
     X0, M = values[:, :3], np.asarray(many.matrices(values[:, 3:]))
     X = np.asarray(result.point_values)
-    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    used = result.problem.used
     known = np.all(np.isfinite(X), axis=1)
     used &= known[result.problem.point]
     n = len(X0)

@@ -83,7 +83,7 @@ def georeference(
     )
     if not result.converged:
         raise NotSolvedError(f"with control: {result.termination}", list(result.undetermined))
-    used = (np.asarray(result.problem.data.image_weight) > 0).any(1)
+    used = result.problem.used
     fixed = [id for id, role in zip(control.id, control.role) if role == "fixed"]
     free = np.array([role == "control" for role in control.role])
     words = describe_sigma(control.sigma[free], choice.assessed(free), fixed, "m")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbundle.network.build import make_further, make_network
-from jaxbundle.network.further import CameraParameters
+from jaxbundle.network.kinds import CameraParameters
 from jaxbundle.network.tables import ESTIMATED, Network
 from jaxbundle.photographs.exif import StatedDistance
 from jaxbundle.reconstruction.attitudes import MapAttitudes

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import derivative
@@ -264,13 +265,13 @@ class OrientedBlock:
     def _joint_cofactors(self, rows: Sequence[int]) -> Float[np.ndarray, "n 3 n 3"]:
         """The covariance of the coordinates of some points among each other."""
         problem, n = self.result.problem, len(rows)
-        tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.system.tables}
-        lengths = problem.layout.lengths
+        tables = {t.name: np.zeros((3 * n, t.rows, t.space.width)) for t in problem.tables}
+        lengths = problem.lengths
         for k, row in enumerate(rows):
             D = np.eye(3)
             # far points are unknowns by direction and inverse distance: D of X by them
             if lengths is not None:
-                unknowns = np.append(np.asarray(self.result.values.point)[row], lengths[row])
+                unknowns = np.append(np.asarray(coordinates(self.result.values))[row], lengths[row])
                 D = np.asarray(derivative(jnp.asarray(unknowns)))
             tables["point"][3 * k : 3 * k + 3, row] = self.A @ D
         # A·D·Q·Dᵀ·Aᵀ of these points, row by row, without the covariance matrix of the network
@@ -280,7 +281,7 @@ class OrientedBlock:
     def removed(self) -> list[tuple[str, str]]:
         """Image and point, by id, of the image points without weight."""
         problem = self.result.problem
-        gone = ~(np.asarray(problem.data.image_weight) > 0).any(1)
+        gone = ~problem.used
         images, points = self.network.images.id, self.network.points.id
         return [
             (images[i], points[p])

@@ -219,17 +219,15 @@ def declare(
         network = _network_of(inputs, rays, index, X + inputs.origin, checking)
         photographs = declare_network(network, inputs.origin)
         # the network has a set of image points for every camera model
-        for s in photographs.layout.sets:
-            if s.field == "image":
-                rows = np.arange(len(rays.frame)) if s.rows is None else s.rows
-                image, point = network.observations.image[rows], network.observations.point[rows]
-                image = image + len(inputs.images)
-                parts.append(ImagePointSet(s.name, False, rays.frame[rows], image, point))
+        for set_name, rows in photographs.image_rows.items():
+            image, point = network.observations.image[rows], network.observations.point[rows]
+            image = image + len(inputs.images)
+            parts.append(ImagePointSet(set_name, False, rays.frame[rows], image, point))
         observed += photographs.observations
         tables += [t for t in photographs.tables if t.name != "point"]
         of_cameras = {
             network.cameras[c].id: (t.name, row)
-            for t in photographs.layout.cameras
+            for t in photographs.cameras
             for row, c in enumerate(t.cameras)
         }
         columns += _columns_of_photographs(network, tables, of_cameras)

@@ -116,30 +116,33 @@ def setting_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
 
 def reduced_system(adjustment: "Adjustment") -> str:
     """The size of the reduced system of images and cameras, and its solver."""
-    plan = adjustment.problem.system.plan
+    plan = adjustment.problem.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
         how += f" of {present(plan.band).width} unknowns"
-    return f"{adjustment.problem.system.reduced_size} unknowns, {how}"
+    return f"{adjustment.problem.reduced_size} unknowns, {how}"
 
 
 def datum(adjustment: "Adjustment") -> str:
     """The datum of the coordinates, and the freedoms left open by the observations."""
-    network, data = adjustment.problem.network, adjustment.problem.data
-    system = adjustment.problem.system
+    problem, network = adjustment.problem, adjustment.problem.network
     defect = adjustment.counts.datum
     if not defect:
         known = [
             (int(network.points.has_role("control").sum()), "control point", ""),
             (int(network.points.has_role("fixed").sum()), "fixed point", ""),
-            (len(data.exterior), "image", " with a prior exterior orientation"),
-            (int((system.table("image").free == 0).any(1).sum()), "image", " held"),
+            (
+                len(problem.data.measured.get("exterior", ())),
+                "image",
+                " with a prior exterior orientation",
+            ),
+            (int((problem.table("image").free == 0).any(1).sum()), "image", " held"),
             (len(network.distances), "distance", ""),
         ]
         parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
-    weight = np.asarray(present(system.plan.datum).weight["point"])[: len(network.points)] > 0
+    weight = np.asarray(present(problem.plan.datum).weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
         held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
@@ -163,7 +166,7 @@ def open_datum(adjustment: "Adjustment") -> str:
     # the directions are told about these points, which a rotation about them leaves
     known = network.points.has_role("control", "fixed")
     about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-    gauge = np.asarray(present(adjustment.problem.system.plan.datum).gauge)
+    gauge = np.asarray(present(adjustment.problem.plan.datum).gauge)
     words = open_directions_in_words(gauge, about / max(known.sum(), 1))
     return "position and orientation" if defect == 6 and "scale" not in words else words
 
@@ -184,13 +187,13 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
         ("interior orientation", n.interior),
         ("distances", n.distances),
     ]
-    free = lambda table: int(adjustment.problem.system.table(table).free.sum())
+    free = lambda table: int(adjustment.problem.table(table).free.sum())
     groups = [
         ("exterior orientation", free("image")),
-        ("interior orientation", sum(free(t.name) for t in adjustment.problem.layout.cameras)),
+        ("interior orientation", sum(free(t.name) for t in adjustment.problem.cameras)),
         ("object coordinates", free("point")),
     ]
-    used = int((np.asarray(adjustment.problem.data.image_weight) > 0).any(1).sum())
+    used = int(adjustment.problem.used.sum())
     points = count_points(adjustment)
     excluded = len(network.points) - points
     rows = [
@@ -259,7 +262,7 @@ def evaluations(adjustment: "Adjustment") -> tuple[np.ndarray, np.ndarray, np.nd
 
 def image_sigmas(adjustment: "Adjustment") -> np.ndarray:
     """The distinct a priori σ of the image coordinates, ascending."""
-    weight = np.asarray(adjustment.problem.data.image_weight)
+    weight = adjustment.problem.image_weights
     return np.unique(np.round(1 / weight[weight > 0], 12))
 
 

@@ -210,7 +210,7 @@ SUMMARY = (
 def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[str]:
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
-    free = adjustment.problem.system.table("point").free > 0
+    free = adjustment.problem.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
     # points at infinity have no coordinates whose σ could be counted
     free &= adjustment.located[:, None]

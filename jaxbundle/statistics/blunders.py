@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.types import present
 
@@ -38,7 +38,7 @@ class Suspect:
     weight: float
 
 
-def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
+def name_removed(problem: NetworkProblem, found: snooping.Removed) -> Removed:
     """Observations removed by data snooping, with names."""
     kind, rows = _place(problem, found.set, found.rows)
     names = [_name(problem, found.set, row, found.residual) for row in found.rows]
@@ -48,7 +48,7 @@ def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
 
 
 def image_points_removed(
-    problem: Problem, named: Iterable[tuple[str, str]]
+    problem: NetworkProblem, named: Iterable[tuple[str, str]]
 ) -> list[snooping.Removed]:
     """Image points, by image and point id, as removals for data snooping."""
     named = set(named)
@@ -58,12 +58,9 @@ def image_points_removed(
     places = zip(problem.image.tolist(), problem.point.tolist())
     rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
     return [
-        snooping.Removed(s.name, row, None, math.inf)
-        for s in problem.layout.sets
-        if s.field == "image"
-        for row, place in enumerate(
-            range(len(problem.image)) if s.rows is None else s.rows.tolist()
-        )
+        snooping.Removed(name, row, None, math.inf)
+        for name, places in problem.image_rows.items()
+        for row, place in enumerate(places.tolist())
         if place in rows
     ]
 
@@ -73,24 +70,25 @@ def either_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"either of {', '.join(names[:-1])} or {names[-1]}"
 
 
-def name_suspect(problem: Problem, found: robust.Suspect) -> Suspect:
+def name_suspect(problem: NetworkProblem, found: robust.Suspect) -> Suspect:
     """Suspects of the robust estimation, with names."""
     kind, rows = _place(problem, found.set, (found.row,))
     name = _name(problem, found.set, found.row, None)
     return Suspect(kind, rows[0], name, found.test, found.weight)
 
 
-def _place(problem: Problem, name: str, rows):
-    """Kind and rows in the arrays of that kind."""
-    s = next((s for s in problem.layout.sets if s.name == name), None)
-    if s is None:
-        return problem.system.observations_of(name).kind.name, tuple(rows)
-    return s.field, tuple(int(row if s.rows is None else s.rows[row]) for row in rows)
+def _place(problem: NetworkProblem, name: str, rows):
+    """Kind and rows: of image points those of the network, of others those of their set."""
+    if name in problem.image_rows:
+        return "image", tuple(int(problem.image_rows[name][row]) for row in rows)
+    if name in problem.further_sets:
+        return problem.observations_of(name).kind.name, tuple(rows)
+    return name.partition(",")[0], tuple(rows)
 
 
-def _name(problem: Problem, name: str, row: int, residual: int | None) -> str:
+def _name(problem: NetworkProblem, name: str, row: int, residual: int | None) -> str:
     kind, (place,) = _place(problem, name, (row,))
-    network, given = problem.network, problem.system.observations_of(name)
+    network, given = problem.network, problem.observations_of(name)
     points = network.points.id
     if kind == "image":
         image = network.images.id[problem.image[place]]
@@ -100,4 +98,4 @@ def _name(problem: Problem, name: str, row: int, residual: int | None) -> str:
     if kind == "distance":
         a, b = (points[int(p)] for p in network.distances.points[place])
         return f"distance {a}–{b}"
-    return given.label(problem.system.tables, row)
+    return given.label(problem.tables, row)

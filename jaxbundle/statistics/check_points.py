@@ -54,7 +54,7 @@ def intersect_check_points(
         distances=Distances.none(),
     )
     checks = shifted_problem(network, problem, inspection.adjusted)
-    system = rescale(checks.system, groups(checks), factors)
+    system = rescale(checks, groups(checks), factors)
     values, cofactor = determine(inspection.solution, system)
     position = np.asarray(values["point"]) + problem.origin
     return CheckPoints(

@@ -13,6 +13,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.problem import with_factor
 from jaxbundle.network.check import check_network
 from jaxbundle.network.tables import Network
 from jaxbundle.statistics.inspection import Inspection
@@ -43,7 +44,7 @@ def expected_precision(network: Network) -> ExpectedPrecision:
 
     **Raises:** `InputError` for a network that cannot be adjusted.
     """
-    problem = make_problem(check_network(network)).with_factor()
+    problem = with_factor(make_problem(check_network(network)))
     if problem.reduction not in FACTORS:
         raise InputError("the planned network is too large for its covariance; plan a part of it")
     found = Inspection(problem, problem.data.start)

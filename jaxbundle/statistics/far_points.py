@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
 from jaxbundle.statistics.inspection import Inspection
@@ -49,7 +50,8 @@ def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
     rows = np.flatnonzero(problem.at_any_distance & ~problem.excluded)
     if not len(rows):
         return None
-    X, s = np.asarray(inspection.adjusted.point)[rows], present(problem.layout.lengths)[rows]
+    X = np.asarray(coordinates(inspection.adjusted))[rows]
+    s = present(problem.lengths)[rows]
     across, along = shares(X, s)
     Q = sigma0**2 * np.asarray(inspection.solution.cofactor("point"))[rows]
     ellipse = np.linalg.eigvalsh(Q[:, :2, :2])[:, ::-1] * across[:, None] ** 2

@@ -10,7 +10,7 @@ import numpy as np
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation
-from jaxbundle.network.further.rigs import MOUNTING
+from jaxbundle.network.kinds.rigs import MOUNTING
 from jaxbundle.system.programs import compile_once
 
 ANGLES = ("omega", "phi", "kappa")

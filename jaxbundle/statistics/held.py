@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.unknowns import require_located
 from jaxbundle.arguments import number, positive, show
 from jaxbundle.errors import InputError
@@ -24,7 +24,7 @@ from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.response import Change
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation, Vector
 from jaxbundle.network.columns import did_you_mean, list_some
-from jaxbundle.network.further.base import ANGLES
+from jaxbundle.network.kinds.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.system.programs import compile_once
 
@@ -45,7 +45,7 @@ class Cause:
     errors: tuple[Change, ...]
 
 
-def find_causes(problem: Problem, values: Values, held: Mapping[Any, Any]) -> list[Cause]:
+def find_causes(problem: NetworkProblem, values: Values, held: Mapping[Any, Any]) -> list[Cause]:
     """Held quantities by names KIND:ID:NAME, texts or tuples; `values`: the engine's tables.
 
     **Raises:** `InputError` for an unknown or estimated quantity, and for a σ that is not
@@ -58,7 +58,7 @@ def find_causes(problem: Problem, values: Values, held: Mapping[Any, Any]) -> li
     return [_cause(problem, values, name, given) for name, given in held.items()]
 
 
-def _cause(problem: Problem, values: Values, name, given) -> Cause:
+def _cause(problem: NetworkProblem, values: Values, name, given) -> Cause:
     if isinstance(given, Mapping):
         return _common(problem, values, str(name), given)
     kind, id, parameter = split_name(name)
@@ -77,7 +77,7 @@ def _cause(problem: Problem, values: Values, name, given) -> Cause:
     return Cause(text, words, sigma, angle, errors)
 
 
-def _common(problem: Problem, values: Values, name: str, given: Mapping) -> Cause:
+def _common(problem: NetworkProblem, values: Values, name: str, given: Mapping) -> Cause:
     """One error common to many held quantities: by name, the change of each."""
     change = []
     for one, amount in given.items():
@@ -109,7 +109,7 @@ def split_name(name: Any) -> tuple[str, str, str]:
     return kind, id, parameter
 
 
-def _held_places(problem: Problem, kind: str, id: str, parameter: str):
+def _held_places(problem: NetworkProblem, kind: str, id: str, parameter: str):
     """Table, row, column and name of every held quantity of this name."""
     text, estimated = ":".join((kind, id, parameter)), []
     if kind == "point" and id in problem.network.points.id:
@@ -143,20 +143,20 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
     return found
 
 
-def _tables_of(problem: Problem, kind: str) -> list[Table]:
-    tables = problem.system.tables
+def _tables_of(problem: NetworkProblem, kind: str) -> list[Table]:
+    tables = problem.tables
     found = [t for t in tables if t.title == kind or t.name == kind]
     if kind == "camera":
-        found = [problem.system.table(t.name) for t in problem.layout.cameras]
+        found = [problem.table(t.name) for t in problem.cameras]
     if not found:
         known = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
         raise InputError(f"held: unknown kind {kind!r}; known: {list_some(known, 12, str)}")
     return found
 
 
-def _names(problem: Problem, table: Table) -> tuple[str, ...]:
+def _names(problem: NetworkProblem, table: Table) -> tuple[str, ...]:
     """The names of the numbers of a row."""
-    for camera in problem.layout.cameras:
+    for camera in problem.cameras:
         if camera.name == table.name:
             return camera.parameters
     if isinstance(table.value, PoseValue):

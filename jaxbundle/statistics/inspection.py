@@ -1,66 +1,39 @@
-"""Inspection of a network solution, in terms and order of the network."""
+"""The solution of a network, with what the network's statistics ask of it."""
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.reliability import Reliability
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.network.arrays import Values
-from jaxbundle.network.declare import Rows, Tables
-
-
-class OfNetwork(NamedTuple):
-    """`Reliability` in the order of the network."""
-
-    residual: Rows
-    gain: Rows
-    redundancy: Rows
-    w: Rows
-    hat: Rows
-
-
-class Tested(NamedTuple):
-    """The same columns for one kind of observation, [observations, axes]."""
-
-    residual: np.ndarray
-    gain: np.ndarray
-    redundancy: np.ndarray
-    w: np.ndarray
-    hat: np.ndarray
-
-
-class _OfTables(eqx.Module):
-    """A function of a network's values as one of the engine's tables."""
-
-    function: Callable[[Values], Array]
-    values: Callable[[Tables], Values]
-
-    def __call__(self, tables: Tables) -> Array:
-        return self.function(self.values(tables))
 
 
 class Inspection:
     """Quantities for the statistics of a problem at its `adjusted` values; `solution`: the
-    engine's."""
+    engine's. What is given by set of observations has the names of `network.declare`."""
 
-    def __init__(self, problem: Problem, values: Values):
+    def __init__(self, problem: NetworkProblem, values: Values):
         self.problem, self.adjusted = problem, values
-        self.solution = Solution(problem.system, problem.layout.tables(values))
+        self.solution = Solution(problem, values)
 
-    @functools.cached_property
-    def residuals(self) -> Rows:
-        """All residuals divided by their σ."""
-        return self._rows(self.solution.residuals)
+    @property
+    def residuals(self) -> dict[str, Float[np.ndarray, "n r"]]:
+        """All residuals divided by their σ, by set."""
+        return self.solution.residuals
+
+    @property
+    def image_residuals(self) -> Float[np.ndarray, "rays 2"]:
+        """Those of the image points, in the order of the network."""
+        return self.problem.image_points(self.residuals)
 
     @property
     def lengths(self) -> Float[np.ndarray, " rays"]:
         """|v/σ| of every image point."""
-        return np.hypot(*self.residuals.image.T)
+        return np.hypot(*self.image_residuals.T)
 
     @property
     def vtpv(self) -> float:
@@ -81,31 +54,23 @@ class Inspection:
     def point_cofactors(self) -> Float[np.ndarray, "points 3 3"]:
         """Cofactors of X, Y, Z of every point; zero if held."""
         Q = self.solution.cofactor("point")
-        return np.asarray(self.problem.layout.coordinate_cofactors(self.adjusted.point, Q))
+        return np.asarray(self.problem.cofactors_of_coordinates(self.adjusted["point"], Q))
 
     @functools.cached_property
     def camera_cofactors(self) -> list[Float[np.ndarray, "k k"]]:
         """Cofactors of the parameters of every camera that are free in any camera of its model."""
         found = [np.zeros((0, 0))] * len(self.problem.network.cameras)
-        for table in self.problem.layout.cameras:
+        for table in self.problem.cameras:
             for c, Q in zip(table.cameras, self.solution.cofactor(table.name)):
                 found[c] = Q
         return found
 
-    @functools.cached_property
-    def reliability(self) -> OfNetwork:
-        """Redundancy numbers and w of all observations."""
-        found = self.solution.reliability
-        return OfNetwork(*(self._rows(getattr(found, name)) for name in OfNetwork._fields))
+    @property
+    def reliability(self) -> Reliability:
+        """Redundancy numbers and w of all observations, by set."""
+        return self.solution.reliability
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
         compiled, once for the same function (an `equinox.Partial`: of whatever arrays)."""
-        return self.solution.propagate(self.of_tables(function))
-
-    def of_tables(self, function: Callable[[Values], Array]) -> Callable[[Tables], Array]:
-        """A function of a network's values as one of the engine's tables."""
-        return _OfTables(function, self.problem.layout.values)
-
-    def _rows(self, by_set) -> Rows:
-        return self.problem.layout.rows(by_set, self.problem.data)
+        return self.solution.propagate(function)

@@ -12,26 +12,26 @@ Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (conf
 second order (weights, P).
 """
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle import cameras
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, find_unknowns, value_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
-from jaxbundle.leastsquares.problem import complete_data
+from jaxbundle.leastsquares.indexing.rows import Data, Values
+from jaxbundle.leastsquares.problem import complete_data, with_factor
 from jaxbundle.leastsquares.quality.precision import precision as engine_precision
 from jaxbundle.leastsquares.quality.precision import redundancy as engine_redundancy
-from jaxbundle.leastsquares.spaces import Pose, PoseValue
-from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.declare import Rows
+from jaxbundle.leastsquares.spaces import Pose
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -56,7 +56,7 @@ class Precision(eqx.Module):
 
 
 def precision(
-    problem: Problem,
+    problem: NetworkProblem,
     data: Data | None = None,
     *,
     names: tuple[tuple[str, str, str], ...] = (),
@@ -83,23 +83,19 @@ def precision(
     name.
     """
     check_given(problem, data)
-    problem, wanted = problem.with_factor(), [] if names == () else find_unknowns(problem, names)
+    problem, wanted = with_factor(problem), [] if names == () else find_unknowns(problem, names)
     if problem.reduction not in FACTORS:
         raise InputError("precision: the network is too large for its covariance; use a part of it")
     data = problem.data if data is None else data
 
-    def of(tables):
-        values = problem.layout.values(tables)
+    def named(values: Values) -> Float[Array, " names"]:
         return jnp.stack([value_of(problem, name, values) for name in wanted])
 
-    found = engine_precision(
-        problem.system, problem.layout.data(predict(problem, data)), of if wanted else None
-    )
-    of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
+    found = engine_precision(problem, predict(problem, data), named if wanted else None)
+    of_points = problem.cofactors_of_coordinates(data.start["point"], found.own["point"])
+    rotation = data.start["image"].rotation
     return Precision(
-        images=_root(
-            image_variances(problem.network.images.angles, data.start.rotation, found.own["image"])
-        )
+        images=_root(image_variances(problem.network.images.angles, rotation, found.own["image"]))
         * sigma0,
         cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
@@ -109,49 +105,57 @@ def precision(
     )
 
 
-def redundancy(problem: Problem, data: Data | None = None) -> Rows:
+def redundancy(problem: NetworkProblem, data: Data | None = None) -> dict[str, Float[Array, "n r"]]:
     """The redundancy numbers of a design, differentiable to every order in all of it.
 
     r = 1 − diag(J·Q·Jᵀ) of every observation: 0 (uncontrolled) to 1. Use it as `precision`;
     nothing is adjusted, and image coordinates are predicted from the given values.
 
-    **Returns:** `Rows`: `image` [rays, 2], `control`, `exterior`, `interior`, `distance` and
-    `other` in the order of `Data`; 0 where the weight is 0.
+    **Returns:** by set of observations, such as `["image"]` [rays, 2]; 0 where the weight is 0.
 
     **Raises:** `InputError` if no factor of the network fits into memory.
     """
     check_given(problem, data)
-    problem = problem.with_factor()
+    problem = with_factor(problem)
     if problem.reduction not in FACTORS:
         raise InputError("redundancy: the network is too large for its cofactors; use a part of it")
-    data, system = problem.data if data is None else data, problem.system
-    given = complete_data(system, problem.layout.data(predict(problem, data)))
-    found = engine_redundancy(system.declared, system.plan, given)
-    found = {o.name: found[o.name][: o.number] for o in system.observations}
-    return problem.layout.rows(found, data)
+    data = problem.data if data is None else data
+    given = complete_data(problem, predict(problem, data))
+    found = engine_redundancy(problem.declared, problem.plan, given)
+    return {o.name: found[o.name][: o.number] for o in problem.observations}
 
 
-def predict(problem: Problem, data: Data) -> Data:
+def predict(problem: NetworkProblem, data: Data) -> Data:
     """The data with image coordinates predicted from the given values."""
-    xy = data.image_xy
-    for table in problem.layout.cameras:
-        rows = np.flatnonzero(np.isin(problem.camera, table.cameras))
-        touched = (index[rows] for index in (problem.image, problem.camera, problem.point))
-        xy = _project(cameras.get_model(table.model), data.start, xy, rows, *touched)
-    return eqx.tree_at(lambda d: d.image_xy, data, xy)
+    measured = dict(data.measured)
+    for table in problem.cameras:
+        if table.image_set not in measured:
+            continue
+        image, *_, camera, point = problem.observations_of(table.image_set).rows
+        interior = data.start[table.name]
+        found = _project(cameras.get_model(table.model), data.start, interior, image, camera, point)
+        given = measured[table.image_set]
+        measured[table.image_set] = (found, given[1]) if isinstance(given, tuple) else found
+    return dataclasses.replace(data, measured=measured)
 
 
 @partial(compile_once, static=0)
-def _project(model, values: Values, xy, rows, image, camera, point):
-    """The image coordinates with those of `rows` computed."""
+def _project(
+    model: cameras.CameraModel,
+    values: Values,
+    interior: Float[Array, "rows parameters"],
+    image: Int[Array, " rays"],
+    camera: Int[Array, " rays"],
+    point: Int[Array, " rays"],
+) -> Float[Array, "rays 2"]:
+    """The image coordinates of a set of image points."""
 
     def one(pose, interior, X):
-        interior = interior[: len(model.parameters)]
         return jnp.stack(cameras.project(model, interior, *Pose().prepare(pose).ray(X)))
 
-    poses = PoseValue(values.position[image], values.rotation[image])
-    found = jax.vmap(one)(poses, values.camera[camera], values.point[point])
-    return jnp.asarray(xy).at[rows].set(found)
+    poses = jax.tree.map(lambda rows: jnp.asarray(rows)[image], values["image"])
+    points = jnp.asarray(values["point"])[point, :3]
+    return jax.vmap(one)(poses, jnp.asarray(interior)[camera], points)
 
 
 @partial(compile_once, static=())
@@ -173,10 +177,10 @@ def image_variances(angles, rotation, Q):
     return jnp.concatenate([of_position, of_angles], 1)
 
 
-def _camera_sigma(problem: Problem, values: Values, own):
-    sigma = jnp.zeros_like(values.camera)
-    for table in problem.layout.cameras:
-        moves = map(np.array, problem.system.table(table.name).vector.moves)
+def _camera_sigma(problem: NetworkProblem, values: Values, own):
+    sigma = jnp.zeros_like(problem.interior_orientation(values))
+    for table in problem.cameras:
+        moves = map(np.array, problem.table(table.name).vector.moves)
         sigma = _with_cameras(sigma, own[table.name], np.asarray(table.cameras), *moves)
     return sigma
 

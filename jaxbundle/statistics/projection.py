@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.cameras import CameraModel, image_ray, project
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.system.programs import compile_once
 
 FRAMES = ("camera", "rotation", "scene")
@@ -102,7 +102,7 @@ def interior_covariance_of_images(
 
 def images_through_scene(
     model: CameraModel,
-    column: int,
+    camera: tuple[str, int],
     views: Float[np.ndarray, " views"],
     estimate: Values,
     xy: Float[np.ndarray, "n 2"],
@@ -113,27 +113,26 @@ def images_through_scene(
     Their covariance is that of the frame "scene". At the estimate itself they are `xy`, which must
     have rays (`have_rays`): one without would make the derivatives of all NaN.
 
-    **Arguments:** `column`: the camera among those of the network; `views`: indices of its images;
-    `distance` from the projection centre in the object unit; infinity as well.
+    **Arguments:** `camera`: its table and its row there; `views`: indices of its images; `distance`
+    from the projection centre in the object unit; infinity as well.
     """
-    camera, X0 = np.asarray(estimate.camera), np.asarray(estimate.position)[views]
+    table, row = camera
+    X0, rotation = (np.asarray(rows)[views] for rows in estimate["image"])
     directions = _directions(
-        model,
-        camera[column, : len(model.parameters)],
-        np.asarray(estimate.rotation)[views],
-        np.asarray(xy, float),
+        model, np.asarray(estimate[table])[row], rotation, np.asarray(xy, float)
     )
     near = np.asarray(1.0 / distance)
-    return eqx.Partial(_images_through_scene, model, column, views, X0, directions, near)
+    return eqx.Partial(_images_through_scene, model, camera, views, X0, directions, near)
 
 
-def _images_through_scene(model, column, views, X0, directions, near, values: Values):
+def _images_through_scene(model, camera, views, X0, directions, near, values: Values):
     """The images [2n] of the directions [views, n, 3] from X0 to points at the distance 1/near."""
-    q = tuple(values.camera[column, : len(model.parameters)])
-    change = near * (X0 - values.position[views])
+    table, row = camera
+    q, (position, rotation) = tuple(values[table][row]), values["image"]
+    change = near * (X0 - position[views])
     turned = jnp.einsum(
         "vij,vnj->vni",
-        jax.vmap(matrix_from_quaternion)(values.rotation[views]),
+        jax.vmap(matrix_from_quaternion)(rotation[views]),
         directions + change[:, None],
     )
     image = jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, q, *ray))))(turned)

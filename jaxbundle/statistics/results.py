@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.unknowns import angles_near, require_located, value_of
 from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.names import Name
-from jaxbundle.network.arrays import Values
-from jaxbundle.network.declare import Tables
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.held import split_name
 from jaxbundle.statistics.inspection import Inspection
@@ -111,7 +110,7 @@ def _part(inspection: Inspection, one):
 def _of_cameras(inspection: Inspection):
     problem, places, names, sigmas = inspection.problem, [], [], []
     for c, camera in enumerate(problem.network.cameras):
-        parameters, free = problem.interior(c)
+        parameters, free = problem.free_parameters(c)
         every = get_model(camera.model).parameters
         Q = inspection.camera_cofactors[c]
         for k in free:
@@ -123,22 +122,24 @@ def _of_cameras(inspection: Inspection):
         return None
     rows, columns = np.array(places).T
     # One number each: slices of one.
-    return lambda values: values.camera[rows, columns], names, len(names), np.array(sigmas)
+    interior = problem.interior_orientation
+    return lambda values: interior(values)[rows, columns], names, len(names), np.array(sigmas)
 
 
 def _of_images(inspection: Inspection):
     problem = inspection.problem
-    rows = np.flatnonzero((problem.system.table("image").free > 0).any(1))
+    rows = np.flatnonzero((problem.table("image").free > 0).any(1))
     if not len(rows):
         return None
     given = jnp.asarray(problem.network.images.angles[rows])
 
     def poses(values: Values):
-        angles = jax.vmap(angles_near, (0, None, 0))(values.rotation[rows], jnp.zeros(3), given)
-        return jnp.concatenate([values.position[rows], angles], 1).ravel()
+        position, rotation = values["image"]
+        angles = jax.vmap(angles_near, (0, None, 0))(rotation[rows], jnp.zeros(3), given)
+        return jnp.concatenate([position[rows], angles], 1).ravel()
 
-    angles, values = problem.network.images.angles, inspection.adjusted
-    variance = _variances(angles, values.rotation, inspection.image_cofactors)
+    angles, rotation = problem.network.images.angles, inspection.adjusted["image"].rotation
+    variance = _variances(angles, rotation, inspection.image_cofactors)
     variance = np.asarray(variance)[rows]
     names = [(f"images:{p}", f"{p} of images, RMS", p in EXTERIOR[3:]) for p in EXTERIOR]
     return poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None))
@@ -149,13 +150,13 @@ _variances = compile_once(image_variances, ())
 
 def _of_points(inspection: Inspection):
     problem = inspection.problem
-    rows = np.flatnonzero((problem.system.table("point").free > 0).any(1))
+    rows = np.flatnonzero((problem.table("point").free > 0).any(1))
     if not len(rows):
         return None
     variance = np.diagonal(inspection.point_cofactors[rows], axis1=1, axis2=2)
     names = [(f"points:{axis}", f"{axis} of points, RMS", False) for axis in "XYZ"]
     sigma = np.sqrt(np.clip(variance.mean(0), 0, None))
-    return lambda values: values.point[rows].ravel(), names, 3 * len(rows), sigma
+    return lambda values: coordinates(values)[rows].ravel(), names, 3 * len(rows), sigma
 
 
 def _of_function(inspection: Inspection, of: Callable[..., Any]) -> Results:
@@ -167,13 +168,12 @@ def _of_function(inspection: Inspection, of: Callable[..., Any]) -> Results:
 
 
 def effects_on(
-    problem: Problem, results: Results, values: Tables, tangents: Tables
+    results: Results, values: Values, tangents: Values
 ) -> Float[np.ndarray, "k numbers"]:
-    """The change of every requested number along tangents of the engine's tables [k, rows, …]."""
-    return np.asarray(_along(results.function, problem.layout.values, values, tangents))
+    """The change of every requested number along tangents of the tables [k, rows, …]."""
+    return np.asarray(_along(results.function, values, tangents))
 
 
 @compile_once
-def _along(function, as_values, tables, tangents):
-    of_tables = lambda tables: function(as_values(tables))
-    return jax.vmap(lambda d: jax.jvp(of_tables, (tables,), (d,))[1])(tangents)
+def _along(function, values, tangents):
+    return jax.vmap(lambda d: jax.jvp(function, (values,), (d,))[1])(tangents)

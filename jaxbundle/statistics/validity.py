@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.cameras import CameraModel, get_model, validity_message
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -27,11 +27,12 @@ class Reach:
     message: str | None
 
 
-def distortion_reach(problem: Problem, values: Values) -> dict[str, Reach]:
+def distortion_reach(problem: NetworkProblem, values: Values) -> dict[str, Reach]:
     """The checked radius of every camera, by id."""
     found = {}
     farthest = farthest_measurements(problem, values)
-    for given, p, far in zip(problem.network.cameras, np.asarray(values.camera), farthest):
+    interior = np.asarray(problem.interior_orientation(values))
+    for given, p, far in zip(problem.network.cameras, interior, farthest):
         model = get_model(given.model)
         size, pitch = given.image_size, given.pixel_size
         if size is not None and model.unit == "px":
@@ -46,19 +47,19 @@ def distortion_reach(problem: Problem, values: Values) -> dict[str, Reach]:
     return found
 
 
-def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray, " cameras"]:
+def farthest_measurements(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " cameras"]:
     """The largest distance of a measurement of every camera from its principal point."""
-    data, cameras = problem.data, problem.network.cameras
+    cameras = problem.network.cameras
     models = [get_model(given.model) for given in cameras]
     centre = np.array(
         [
             measured_centre(model, p[: len(model.parameters)])
-            for model, p in zip(models, np.asarray(values.camera))
+            for model, p in zip(models, np.asarray(problem.interior_orientation(values)))
         ]
     )
     camera = problem.camera
-    used = (np.asarray(data.image_weight) > 0).any(1)
-    away = np.linalg.norm(np.asarray(data.image_xy) - centre[camera], axis=1)
+    used, xy = problem.used, problem.image_coordinates()
+    away = np.linalg.norm(xy - centre[camera], axis=1)
     farthest = np.zeros(len(cameras))
     np.fmax.at(farthest, camera[used], away[used])  # NaN: a camera without a solution
     return farthest

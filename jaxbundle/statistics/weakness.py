@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.datum.by_table import directions_of_motions
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.weakness import (
     NONLINEAR_RATIO,
     VAGUE_RATIO,
@@ -23,10 +24,9 @@ from jaxbundle.leastsquares.quality.weakness import (
     find_weak,
     find_weak_unsolved,
 )
-from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.further.base import ANGLES, LENGTHS
-from jaxbundle.network.further.rolling_shutter import READ_OUT
+from jaxbundle.network.kinds.base import ANGLES, LENGTHS
+from jaxbundle.network.kinds.rolling_shutter import READ_OUT
 from jaxbundle.statistics.inspection import Inspection
 
 ADVICE_FOR = {
@@ -150,9 +150,9 @@ def find_georeference(inspection: Inspection) -> Georeference | None:
     problem, values = inspection.problem, inspection.adjusted
     tables = inspection.solution.values
     moves = directions_of_motions(
-        problem.system.declared, {name: tables[name] for name in ("image", "point")}
+        problem.declared, {name: tables[name] for name in ("image", "point")}
     )
-    X, n = np.asarray(values.point), len(problem.network.points)
+    X, n = np.asarray(coordinates(values)), len(problem.network.points)
     rows = np.flatnonzero(np.isfinite(X[:n]).all(1) & ~problem.at_any_distance)
     of_points = np.asarray(moves["point"])[rows]
     if of_points.shape[1:2] != (3,) or len(rows) < 3:
@@ -173,16 +173,16 @@ def find_georeference(inspection: Inspection) -> Georeference | None:
 
 def _similarity_of(inverse, rows, values):
     """τ of the coordinates of points, to first order."""
-    return inverse @ values.point[rows].ravel()
+    return inverse @ coordinates(values)[rows].ravel()
 
 
-def weakness_of_unsolved(problem: Problem, values: Values) -> Weakness:
+def weakness_of_unsolved(problem: NetworkProblem, values: Values) -> Weakness:
     """The weak directions where an adjustment ended without a solution, by a priori σ."""
     there = Inspection(problem, values)
     return _in_words(problem, find_weak_unsolved(there.solution, _extents(there)))
 
 
-def _in_words(problem: Problem, found) -> Weakness:
+def _in_words(problem: NetworkProblem, found) -> Weakness:
     ids = problem.network.points.id
     return Weakness(found.names, found.worst, tuple(ids[p] for p in found.rows), found.judged)
 
@@ -192,17 +192,17 @@ def _extents(inspection: Inspection) -> Extents:
     of_image, of_point = _ray_lengths(inspection)
     pose = np.where(of_image > 0, of_image, 1.0)[:, None]
     found = {"image": np.concatenate([np.repeat(1 / pose, 3, 1), np.ones((len(pose), 3))], 1)}
-    for table in problem.layout.cameras:
+    for table in problem.cameras:
         model = get_model(table.model)
-        moving = problem.system.table(table.name).vector.moving
+        moving = problem.table(table.name).vector.moving
         at = [model.parameters.index(name) for name in model.principal_distance]
         judged = np.array([model.parameters[j] in model.core for j in moving], bool)
-        shortest = np.abs(np.asarray(values.camera)[table.cameras][:, at]).min(1)
+        shortest = np.abs(np.asarray(values[table.name])[:, at]).min(1)
         shortest = np.maximum(shortest, np.finfo(float).tiny)
         found[table.name] = judged / shortest[:, None]
     mean = float(of_image[of_image > 0].mean()) if (of_image > 0).any() else 1.0
-    for name in values.other:
-        given = problem.system.table(name)
+    for name in problem.further_tables:
+        given = problem.table(name)
         judged = [(p in LENGTHS) / mean + (p in ANGLES) for p in given.parameters]
         if any(judged):
             found[name] = np.tile(judged, (given.rows, 1))
@@ -214,13 +214,14 @@ def _extents(inspection: Inspection) -> Extents:
 def _ray_lengths(inspection: Inspection):
     """Mean length of the rays of every image and of every point; 0 without rays."""
     problem, values = inspection.problem, inspection.adjusted
-    rays = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).any(1))
+    rays = np.flatnonzero(problem.used)
     image, point = problem.image[rays], problem.point[rays]
-    ray = np.asarray(values.point)[point] - np.asarray(values.position)[image]
+    X0, X = np.asarray(values["image"].position), np.asarray(coordinates(values))
+    ray = X[point] - X0[image]
     length = np.linalg.norm(ray, axis=1)
 
     def mean(of, number):
         total, rays = np.bincount(of, length, number), np.bincount(of, minlength=number)
         return total / np.maximum(rays, 1)
 
-    return mean(image, len(values.position)), mean(point, len(values.point))
+    return mean(image, len(X0)), mean(point, len(X))

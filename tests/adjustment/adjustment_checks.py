@@ -14,8 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxbundle import cameras
-from jaxbundle.adjustment.problem import Problem, make_problem
-from jaxbundle.bundle.minimum import minimise
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares.datum.conditions import datum_directions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
@@ -26,7 +25,8 @@ from jaxbundle.leastsquares.indexing.rows import (
     restore_order,
 )
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
-from jaxbundle.leastsquares.problem import pad_data, pad_values
+from jaxbundle.leastsquares.problem import pad_data, pad_values, with_data
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network import Camera, Distances, Images, Network, Observations, Points
 from jaxbundle.statistics.inspection import Inspection
 
@@ -272,8 +272,8 @@ def adjusted(name):
 
 def solved(problem, data=None, **options):
     """Iterated to the last digits: one compilation for each kind of network."""
-    problem = problem if data is None else problem.with_data(data)
-    return minimise(problem, problem.data.start, **{"atol": 1e-9, **options})
+    problem = problem if data is None else with_data(problem, data)
+    return find_minimum(problem, problem.data.start, **{"atol": 1e-9, **options})
 
 
 def vtpv(problem, values):
@@ -328,13 +328,13 @@ class Dense:
         return bordered_inverse(self.N, self.B, self.free)
 
 
-def linearise(problem: Problem, values=None, data=None) -> Dense:
+def linearise(problem: NetworkProblem, values=None, data=None) -> Dense:
     """The dense matrices of a problem at its start values, or at others."""
-    system = problem.system
+    system = problem
     data = problem.data if data is None else data
     values = data.start if values is None else values
-    given = pad_data(system, problem.layout.data(data))
-    tables = pad_values(system, problem.layout.tables(values))
+    given = pad_data(system, data)
+    tables = pad_values(system, values)
     plan, sets = system.plan, system.observations
     v, J, G, B, index = _linearise(system.declared, plan, tables, given)
     tall = lambda rows: np.concatenate([

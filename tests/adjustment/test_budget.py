@@ -14,6 +14,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.network.tables import EXTERIOR
 
 HELD = dict(images=5, points=10, fixed=4, held=((0, (3, 4, 5)), (1, (0,))), noise=3.0)
@@ -29,13 +30,12 @@ def held_network():
 def results_of(values):
     """c, x0, y0, K1, and all points and centres."""
     names = list(jaxbundle.cameras.get_model("brown").parameters)
-    camera = np.asarray(values.camera)[0, [names.index(name) for name in FREE]]
-    return camera, np.asarray(values.point), np.asarray(values.position)
+    camera = np.asarray(values["camera"])[0, [names.index(name) for name in FREE]]
+    return camera, np.asarray(values["point"]), np.asarray(values["image"].position)
 
 
-def with_start(problem, **fields):
-    start = dataclasses.replace(problem.data.start, **fields)
-    return dataclasses.replace(problem.data, start=start)
+def with_start(problem, **tables):
+    return dataclasses.replace(problem.data, start=problem.data.start | tables)
 
 
 def shifted(problem, name, h):
@@ -44,23 +44,23 @@ def shifted(problem, name, h):
     start = problem.data.start
     if kind == "camera":
         names = list(jaxbundle.cameras.get_model("brown").parameters)
-        camera = np.array(start.camera)
+        camera = np.array(start["camera"])
         camera[0, names.index(parameter)] += h
         return with_start(problem, camera=camera)
     if kind == "point":
-        point = np.array(start.point)
+        point = np.array(start["point"])
         point[problem.network.points.id.index(id), "XYZ".index(parameter)] += h
         return with_start(problem, point=point)
     i, k = problem.network.images.id.index(id), EXTERIOR.index(parameter)
     if k < 3:
-        position = np.array(start.position)
+        position = np.array(start["image"].position)
         position[i, k] += h
-        return with_start(problem, position=position)
+        return with_start(problem, image=start["image"]._replace(position=position))
     angles = np.array(problem.network.images.angles[i])
     angles[k - 3] += h
-    rotation = np.array(start.rotation)
+    rotation = np.array(start["image"].rotation)
     rotation[i] = quaternion_from_matrix(matrix_from_omega_phi_kappa(angles))
-    return with_start(problem, rotation=rotation)
+    return with_start(problem, image=start["image"]._replace(rotation=rotation))
 
 
 def differences(problem, name, h):
@@ -138,8 +138,8 @@ def test_a_design_has_a_budget_before_anything_is_measured():
     network, _ = synthetic(**HELD | dict(noise=0.0, disturbance=0.0))
     problem = make_problem(network)
     planned = jaxbundle.sensitivity(problem, {"camera:cam:K3": 1e-9}, of="camera:cam:c")
-    blank = problem.with_data(dataclasses.replace(
-        problem.data, image_xy=np.zeros_like(problem.data.image_xy)
+    blank = with_data(problem, problem.with_image_coordinates(
+        problem.data, np.zeros_like(problem.data.measured["image"])
     ))  # fmt: skip
     again = jaxbundle.sensitivity(blank, {"camera:cam:K3": 1e-9}, of="camera:cam:c")
     np.testing.assert_allclose(again.effects, planned.effects, rtol=1e-9)
@@ -158,14 +158,14 @@ def test_the_influence_of_a_measurement_is_what_shifting_it_does():
     order = np.argsort(-np.abs(influence.effects[:, 0]))
     for row in order[[0, 5]]:
         ray, axis = divmod(int(row), 2)
-        sigma = 1 / np.asarray(problem.data.image_weight)[ray, axis]
+        sigma = 1 / problem.image_weights[ray, axis]
         ends = []
         for sign in (1, -1):
-            xy = np.array(problem.data.image_xy)
+            xy = np.array(problem.data.measured["image"])
             xy[ray, axis] += 0.3 * sign * sigma
-            data = dataclasses.replace(problem.data, image_xy=xy)
+            data = problem.with_image_coordinates(problem.data, xy)
             values = solved(problem, data).values
-            ends.append([results_of(values)[0][0], np.asarray(values.point)[7, 2]])
+            ends.append([results_of(values)[0][0], np.asarray(values["point"])[7, 2]])
         slope = (np.array(ends[0]) - ends[1]) / (0.6 * sigma)
         np.testing.assert_allclose(influence.derivatives[row], slope, rtol=1e-3, atol=1e-4)
     assert "Influence on c of camera cam" in str(influence)

@@ -100,7 +100,7 @@ PLACES = ((1, 0), (1000, 0), (1, [5e6, 4e5, 1e3]), (1000, [2e7, -5e6, 0]), (1e-3
 def test_defect(name):
     network, defect = CASES[name]
     for scale, shift in PLACES:
-        system = make_problem(moved(network, scale, shift)).system
+        system = make_problem(moved(network, scale, shift))
         assert system.counts.datum == defect
         if not defect:
             continue
@@ -117,7 +117,7 @@ program = eqx.filter_jit(generators)
 
 
 def test_words():
-    gauge = lambda name: make_problem(CASES[name][0]).system.plan.datum.gauge
+    gauge = lambda name: make_problem(CASES[name][0]).plan.datum.gauge
     assert open_directions_in_words(gauge("nothing")).endswith("rotation Z, scale")
     assert open_directions_in_words(gauge("a distance")).endswith("rotation Z")
     assert open_directions_in_words(np.zeros((7, 0))) == "none"
@@ -148,7 +148,7 @@ def test_datum_points_that_cannot_hold_the_datum_are_refused(datum, chosen):
 
 
 def test_start_values_that_cannot_be_computed_are_left_to_the_solver():
-    system = make_problem(FREE).system
+    system = make_problem(FREE)
     point = system.data.start["point"].at[0].set(jnp.nan)
     data = dataclasses.replace(system.data, start=system.data.start | {"point": point})
     real = {t.name: np.arange(system.sizes["table", t.name]) < t.rows for t in system.tables}
@@ -160,7 +160,7 @@ def test_start_values_that_cannot_be_computed_are_left_to_the_solver():
 
 @pytest.mark.parametrize("name", ["free", "free with distances"])
 def test_s_transformation(name):
-    system, dense = make(name).system, linearised(name)
+    system, dense = make(name), linearised(name)
     G, B, random = dense.G, dense.B, np.random.default_rng(0)
     values = pad_values(system, system.data.start)
     change = jax.tree.map(
@@ -181,12 +181,12 @@ def chosen_points():
 @pytest.mark.parametrize("name", ["free", "minimal", "some points"])
 def test_the_datum_holds_exactly_after_convergence(name):
     problem, minimum = chosen_points() if name == "some points" else adjusted(name)
-    difference = np.asarray(minimum.values.point - problem.data.start.point).ravel()
+    difference = np.asarray(minimum.values["point"] - problem.data.start["point"]).ravel()
     dense = linearise(problem, minimum.values)
     B = dense.B[dense.columns["point"].ravel()]
     assert (dense.B != 0).sum() == (B != 0).sum() > 0
     assert (np.abs(B.T @ difference) < 1e-13 * np.abs(B).sum(0)).all()
-    weight = np.asarray(problem.system.plan.datum.weight["point"])[: len(problem.network.points)]
+    weight = np.asarray(problem.plan.datum.weight["point"])[: len(problem.network.points)]
     if name == "minimal":
         assert weight.sum() == problem.counts.datum == 7
         # Not one rounding: the coordinates are solved for, not copied.
@@ -200,25 +200,25 @@ def test_the_datum_holds_exactly_after_convergence(name):
 
 def test_moving_to_the_datum_changes_no_residual():
     problem = make("one fixed point")
-    system, start = problem.system, problem.data.start
+    system, start = problem, problem.data.start
     # Any values will do: here the start values moved by a similarity of the group, not small.
     random = np.random.default_rng(3)
-    shape = start.point.shape
-    elsewhere = start.point + 0.3 * random.normal(size=(1, 3)) + 0.05 * random.normal(size=shape)
-    target = dataclasses.replace(start, point=jnp.asarray(elsewhere))
-    tables = [pad_values(system, problem.layout.tables(v)) for v in (start, target)]
+    shape = start["point"].shape
+    elsewhere = start["point"] + 0.3 * random.normal(size=(1, 3)) + 0.05 * random.normal(size=shape)
+    target = start | {"point": jnp.asarray(elsewhere)}
+    tables = [pad_values(system, v) for v in (start, target)]
     found, there = eqx.filter_jit(move_to_datum)(system.declared, system.plan, *tables)
     assert there
-    values = problem.layout.values(without_filling(system, found))
+    values = without_filling(system, found)
     # Residuals are up to 100 σ, image coordinates 1000 σ: rounding of the coordinates.
     np.testing.assert_allclose(
         residuals_of(problem, values), residuals_of(problem, start), atol=1e-9
     )
-    change = np.asarray(values.point - start.point)
+    change = np.asarray(values["point"] - start["point"])
     assert np.abs(change).max() > 0.02 and (change[0] == 0).all()
     dense = linearise(problem, values)
     B = dense.B[dense.columns["point"].ravel()]
-    np.testing.assert_allclose(B.T @ np.ravel(values.point - target.point), 0, atol=1e-12)
+    np.testing.assert_allclose(B.T @ np.ravel(values["point"] - target["point"]), 0, atol=1e-12)
 
 
 def test_inner_constraints_have_the_smallest_trace():

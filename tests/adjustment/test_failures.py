@@ -18,6 +18,7 @@ from jaxbundle.leastsquares.iterations.stopping import (
     TERMINATIONS,
     converged,
 )
+from jaxbundle.leastsquares.problem import hold
 from jaxbundle.network import Camera
 
 
@@ -30,8 +31,8 @@ def problem_of(scene, *, hold_scale=True, hold_images=False, noise=1.0):
     )
     problem = make_problem(network)
     columns = [0, 1] if hold_images else [1] if hold_scale else []
-    problem = problem.hold("camera", [0], np.array(columns, int))
-    return problem.hold("image", np.arange(6 if hold_images else 0))
+    problem = hold(problem, "camera", [0], np.array(columns, int))
+    return hold(problem, "image", np.arange(6 if hold_images else 0))
 
 
 def test_the_same_network_is_solved_where_it_is_determined():
@@ -53,10 +54,11 @@ def test_principal_distance_from_vertical_images_of_flat_ground():
 def test_points_seen_from_one_place():
     # Every point may lie anywhere on its ray.
     problem = problem_of("one centre", hold_images=True)
-    centre = problem.data.start.position
-    start = dataclasses.replace(
-        problem.data.start, position=jnp.broadcast_to(centre[0], centre.shape)
+    centre = problem.data.start["image"].position
+    image = problem.data.start["image"]._replace(
+        position=jnp.broadcast_to(centre[0], centre.shape)
     )
+    start = problem.data.start | {"image": image}
     data = dataclasses.replace(problem.data, start=start)
     assert int(solved(problem, data).termination) == SINGULAR
 
@@ -65,17 +67,15 @@ def test_points_seen_from_one_place():
 def test_an_unknown_that_nothing_observes(of):
     problem = problem_of("ring")
     rays = getattr(problem, of) == {"image": 2, "point": 8}[of]
-    weight = jnp.where(rays[:, None], 0.0, problem.data.image_weight)
-    data = dataclasses.replace(problem.data, image_weight=weight)
+    weight = jnp.where(rays[:, None], 0.0, problem.data.weight["image"])
+    data = problem.with_image_weights(problem.data, weight)
     assert int(solved(problem, data).termination) == SINGULAR
 
 
 def test_start_values_that_are_not_finite():
     problem = problem_of("ring")
-    point = problem.data.start.point.at[7, 1].set(jnp.nan)
-    data = dataclasses.replace(
-        problem.data, start=dataclasses.replace(problem.data.start, point=point)
-    )
+    point = problem.data.start["point"].at[7, 1].set(jnp.nan)
+    data = dataclasses.replace(problem.data, start=problem.data.start | {"point": point})
     assert int(solved(problem, data).termination) == NOT_FINITE
 
 

@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.equations.normal import Normal, normal_equations
 from jaxbundle.leastsquares.indexing.rows import lay_out_data
 from jaxbundle.leastsquares.problem import pad_data
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
-from jaxbundle.network.kinds import EXTERIOR
+from jaxbundle.network.kinds.exterior_orientation import EXTERIOR_ORIENTATION as EXTERIOR
 
 DAMPING = 1e-2
 
@@ -31,7 +31,7 @@ DAMPING = 1e-2
 def blocks_of(name):
     """Of the engine, at the start values: gradient, N, the damped N, a damped and an undamped
     step."""
-    system = make(name).system
+    system = make(name)
     return _blocks(system.declared, system.plan, pad_data(system, system.data))
 
 
@@ -62,7 +62,7 @@ def test_blocks_are_those_of_the_dense_product(name):
     gradient, N, *_ = blocks_of(name)
     size = np.linalg.norm(dense.J, axis=0)
     assert ((size > 0) == dense.free).all() and dense.free.sum() == counts.unknowns
-    rows = counts.observations + counts.pseudo_observations
+    rows = counts.observations
     assert (np.linalg.norm(dense.J, axis=1) > 0).sum() == rows
     assert_same(np.asarray(N), dense.N, size, 1e-13)
     terms = size * np.linalg.norm(dense.v)

@@ -54,12 +54,12 @@ def test_a_network_solved_by_iteration_is_the_same_network(dense):
 def test_a_network_solved_in_a_band_is_the_same_network(dense):
     """Images with common points stand close in the band."""
     found = jaxbundle.adjust(street(), reduction="banded")
-    band = found.problem.system.plan.band
+    band = found.problem.plan.band
     assert band.group == "image" and band.width <= 2 * REACH < IMAGES - 1
     assert found.vtpv == pytest.approx(dense.vtpv, rel=1e-11)
     assert_same_cofactors(found, dense, rtol=1e-6, atol=1e-8)
-    r = found.inspection.reliability.redundancy.image
-    np.testing.assert_allclose(r, dense.inspection.reliability.redundancy.image, atol=1e-7)
+    r = found.inspection.reliability.redundancy["image"]
+    np.testing.assert_allclose(r, dense.inspection.reliability.redundancy["image"], atol=1e-7)
 
 
 def assert_same_cofactors(found, dense, rtol, atol):

@@ -15,7 +15,7 @@ from adjustment_checks import adjusted, camera, solved, synthetic, vtpv
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.leastsquares.problem import complete_data, pad_values, without_filling
+from jaxbundle.leastsquares.problem import complete_data, pad_values, with_data, without_filling
 from jaxbundle.leastsquares.quality.derivatives import attach_derivatives
 
 pytestmark = pytest.mark.slow
@@ -27,11 +27,11 @@ principal distance) they are exact to 1e-8, and the last digits of the solutions
 
 def attached(problem, values, data, sensitivity="exact"):
     """The solution `values` for `data` as a function of them."""
-    system = problem.system
-    tables = pad_values(system, problem.layout.tables(values))
-    given = complete_data(system, problem.layout.data(data))
+    system = problem
+    tables = pad_values(system, values)
+    given = complete_data(system, data)
     found = attach_derivatives(system.declared, system.plan, tables, given, sensitivity)
-    return problem.layout.values(without_filling(system, found))
+    return without_filling(system, found)
 
 
 @cache
@@ -59,25 +59,23 @@ def program():
     )
 
 
-FIELDS = ("image_xy", "image_weight", "control", "control_weight", "exterior", "exterior_weight",
-          "interior", "interior_weight", "distance", "distance_weight")  # fmt: skip
+SETS = ("image", "control", "exterior", "interior", "distance")
 
 
 def directions(data, random):
-    """Random changes of one field each: 0.05 σ of a value, 0.3 % of a weight; start values."""
+    """Random changes of the values or the weights of one set each: 0.05 σ of a value, 0.3 % of a
+    weight; start values."""
     zero = jax.tree.map(jnp.zeros_like, data)
-    for name in FIELDS:
-        value = getattr(data, name)
-        if name.endswith("_weight"):
-            change = 0.003 * random.normal(size=value.shape) * value
-        else:
-            weight = getattr(data, "image_weight" if name == "image_xy" else f"{name}_weight")
-            inverse = jnp.where(weight > 0, 1 / jnp.where(weight > 0, weight, 1), 0)
-            change = 0.05 * random.normal(size=value.shape) * inverse
-        yield name, eqx.tree_at(lambda d, n=name: getattr(d, n), zero, change)
-    camera = data.start.camera
+    for name in SETS:
+        value, weight = data.measured[name], data.weight[name]
+        change = 0.003 * random.normal(size=weight.shape) * weight
+        yield f"weight of {name}", eqx.tree_at(lambda d, n=name: d.weight[n], zero, change)
+        inverse = jnp.where(weight > 0, 1 / jnp.where(weight > 0, weight, 1), 0)
+        change = 0.05 * random.normal(size=value.shape) * inverse.reshape(value.shape)
+        yield name, eqx.tree_at(lambda d, n=name: d.measured[n], zero, change)
+    camera = data.start["camera"]
     change = 0.001 * random.normal(size=camera.shape) * camera  # fixed parameters, here
-    yield "start camera", eqx.tree_at(lambda d: d.start.camera, zero, change)
+    yield "start camera", eqx.tree_at(lambda d: d.start["camera"], zero, change)
 
 
 @pytest.mark.further
@@ -99,13 +97,15 @@ def test_a_fixed_point_takes_the_datum_with_it():
     (The rotations and the scale that are open are those about the point.)"""
     problem, minimum = adjusted("one fixed point")
     start, shift = problem.data.start, jnp.array([0.3, -0.2, 0.1])
-    moved = dataclasses.replace(start, point=start.point.at[0].add(shift))
+    moved = start | {"point": start["point"].at[0].add(shift)}
     only = dataclasses.replace(problem.data, start=moved)
     found = solved(problem, only)
     expected = vtpv(problem, minimum.values)
-    assert vtpv(problem.with_data(only), found.values) == pytest.approx(expected, rel=1e-9)
+    assert vtpv(with_data(problem, only), found.values) == pytest.approx(expected, rel=1e-9)
     # A shift of everything moves no principal distance.
-    np.testing.assert_allclose(found.values.camera, minimum.values.camera, rtol=1e-8, atol=1e-11)
+    np.testing.assert_allclose(
+        found.values["camera"], minimum.values["camera"], rtol=1e-8, atol=1e-11
+    )
 
 
 @pytest.fixture(scope="module")

@@ -177,7 +177,7 @@ def bumpy_views():
 def of_neighbours(found):
     """The correlation of residuals of neighbours on the board over its σ, 1/√pairs."""
     v = np.full((*found.views.visible.shape, 2), np.nan)
-    v[found.views.visible] = found.adjustment.inspection.residuals.image
+    v[found.views.visible] = found.adjustment.inspection.image_residuals
     v = v.reshape(len(v), 8, 10, 2)
     products = (v[:, :, 1:] * v[:, :, :-1])[..., 0].ravel()
     products = products[np.isfinite(products)] / np.nanmean(v**2)
@@ -208,8 +208,8 @@ def test_the_spline_follows_a_lens_that_no_parametric_model_fits(bumpy_views):
     found = calibrate(bumpy_views, model="spline-9x8-104", **options)
     assert found.converged
     # white: as large as the noise, and as little alike in neighbours as noise is
-    v = found.adjustment.inspection.residuals.image
-    redundancy = found.adjustment.reliability.redundancy.image.sum()
+    v = found.adjustment.inspection.image_residuals
+    redundancy = found.adjustment.reliability.redundancy["image"].sum()
     assert np.square(v).sum() / redundancy == pytest.approx(1, abs=4 * np.sqrt(2 / redundancy))
     assert abs(of_neighbours(found)) < 4
     ratio, largest = over_sigma(found, (BUMPY, LENS))

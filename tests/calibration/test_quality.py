@@ -193,7 +193,7 @@ def test_image_points_without_rays_have_no_uncertainty_and_the_others_have_their
     model = get_model("opencv")
     xy = np.array([[375.5, 239.5]])
     adjustment = found.adjustment
-    function = images_through_scene(model, 0, np.arange(12), adjustment.values, xy, 1.0)
+    function = images_through_scene(model, ("camera", 0), np.arange(12), adjustment.values, xy, 1.0)
     Q = adjustment.covariance_of(function)
     assert found.uncertainty(1.0).middle == pytest.approx(np.sqrt(np.trace(Q) / 2), rel=1e-9)
     middle, corners = found.uncertainty_over_distance(np.array([1.0, 3.0]))

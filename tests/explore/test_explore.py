@@ -258,9 +258,9 @@ def network(convergent4):
 
 def moved_start(adjustment, id, centre):
     row = adjustment.problem.network.images.id.index(id)
-    position = np.array(adjustment.values.position)
+    position = np.array(adjustment.values["image"].position)
     position[row] = centre - adjustment.problem.origin
-    return row, eqx.tree_at(lambda v: v.position, adjustment.values, jnp.asarray(position))
+    return row, eqx.tree_at(lambda v: v["image"].position, adjustment.values, jnp.asarray(position))
 
 
 @pytest.mark.further
@@ -290,11 +290,12 @@ def predicted_network(adjustment, values):
     problem = adjustment.problem
     network = problem.network
     camera = network.cameras[0]
-    model, p = get_model(camera.model), tuple(np.asarray(values.camera)[0])
+    model, p = get_model(camera.model), tuple(np.asarray(values["camera"])[0])
 
     def of_ray(i, j):
-        M = jaxbundle.geometry.matrix_from_quaternion(values.rotation[i])
-        return jnp.stack(project(model, p, *(M @ (values.point[j] - values.position[i]))))
+        position, rotation = values["image"]
+        M = jaxbundle.geometry.matrix_from_quaternion(rotation[i])
+        return jnp.stack(project(model, p, *(M @ (values["point"][j] - position[i]))))
 
     xy = np.asarray(jax.vmap(of_ray)(problem.image, problem.point))
     angles = np.asarray(adjustment.image_values)[:, 3:]
@@ -302,10 +303,11 @@ def predicted_network(adjustment, values):
     return network.replace(
         cameras=(dataclasses.replace(camera, parameters=parameters),),
         images=dataclasses.replace(
-            network.images, position=np.asarray(values.position) + problem.origin, angles=angles
+            network.images, angles=angles,
+            position=np.asarray(values["image"].position) + problem.origin,
         ),
         points=dataclasses.replace(
-            network.points, position=np.asarray(values.point) + problem.origin
+            network.points, position=np.asarray(values["point"]) + problem.origin
         ),
         observations=dataclasses.replace(network.observations, xy=xy),
     )
@@ -333,7 +335,8 @@ def test_a_station_turns_to_its_points(network, convergent4):
     seen = convergent4.problem.point[convergent4.problem.image == 0]
     middle = convergent4.point_values[seen].mean(0)
     unit = lambda v: v / np.linalg.norm(v)
-    M = np.asarray(jaxbundle.geometry.matrix_from_quaternion(convergent4.values.rotation[0]))
+    rotation = convergent4.values["image"].rotation
+    M = np.asarray(jaxbundle.geometry.matrix_from_quaternion(rotation[0]))
     before = unit(M @ (middle - convergent4.image_values[0, :3]))
     assert_allclose(unit(move.M @ (middle - move.centre)), before, atol=1e-12)
 

@@ -57,7 +57,7 @@ def test_network(path):
 
 def test_exact_projections_have_no_residuals(path):
     problem = jaxbundle.make_problem(jaxbundle.read_network(path))
-    rows = Inspection(problem, problem.data.start).residuals.image
+    rows = Inspection(problem, problem.data.start).image_residuals
     np.testing.assert_allclose(rows, 0, atol=1e-10)
 
 

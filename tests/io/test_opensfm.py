@@ -15,7 +15,7 @@ from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.io import convert, read_cameras, read_network
 from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.network.further import Antennas
+from jaxbundle.network.kinds import Antennas
 
 W, H = 1280, 720
 SIZE = {"width": W, "height": H}

@@ -1,6 +1,5 @@
 """The adjusted network: adjusted again it does not change, and other programs can read it."""
 
-import dataclasses
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import jaxbundle
 from jaxbundle.cli.outputs import NETWORK_FILES, check_targets, write_targets
 from jaxbundle.io import adjusted_network, read_network, write_project
 from jaxbundle.io.networks.orientation_covariance import read_orientation_covariance
+from jaxbundle.leastsquares.problem import with_data
 
 
 def test_it_is_a_fixed_point(convergent4, tmp_path):
@@ -29,11 +29,11 @@ def test_it_is_a_fixed_point(convergent4, tmp_path):
 
 
 def test_removed_and_held_things(convergent4):
-    weight = np.array(convergent4.problem.data.image_weight)
+    weight = np.array(convergent4.problem.data.weight["image"])
     gone = 7
     weight[gone] = 0
-    data = dataclasses.replace(convergent4.problem.data, image_weight=weight)
-    problem = convergent4.problem.with_data(data)
+    problem = convergent4.problem
+    problem = with_data(problem, problem.with_image_weights(problem.data, weight))
     result = jaxbundle.Adjustment(convergent4.network, problem, convergent4.minimum)
     rays, kept = convergent4.problem.network.observations, adjusted_network(result).observations
     assert len(kept) == len(rays) - 1

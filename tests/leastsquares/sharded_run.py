@@ -39,7 +39,7 @@ def network():
         disturb=0.005, distances=((1, 5), (5, 7)), distance_sigma=0.001, datum="control",
         control=(0, 8, 20, 26), control_sigma=0.001,
     )  # fmt: skip
-    problem = jaxbundle.make_problem(jaxbundle.check_network(given)).system
+    problem = jaxbundle.make_problem(jaxbundle.check_network(given))
     return hold(hold(problem, "image", 2, [2]), "point", 20)
 
 

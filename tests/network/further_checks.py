@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
+from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.leastsquares.solution import find_minimum
 
 STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 
@@ -16,7 +17,7 @@ STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 def check_jacobians(problem, values, skip=("image coordinates",)):
     """∂v/∂δ of one observation of every kind, as the engine differentiates it and by differences of
     finite changes of what it touches."""
-    system, tables = problem.system, problem.layout.tables(values)
+    system, tables = problem, values
     random = np.random.default_rng(3)
     for given in system.observations:
         kind, row = given.kind, given.number // 2
@@ -53,23 +54,23 @@ def sample(problem, values, tables, draws=24):
     """Values of tables of vectors, and positions of frames, from that many draws of everything that
     was measured, solved from the values; all by the program that is compiled already."""
     random, data = np.random.default_rng(8), problem.data
-    noisy = lambda x, w: np.asarray(x) + random.normal(size=np.shape(w)) * np.where(
-        np.asarray(w) > 0, 1 / np.where(np.asarray(w) > 0, w, 1), 0
-    )  # fmt: skip
+    drawn = ("image", "control", *problem.further_sets)
     found = {name: [] for name in tables}
     for _ in range(draws):
-        change = {"image_xy": noisy(data.image_xy, data.image_weight),
-                  "control": noisy(data.control, data.control_weight)}  # fmt: skip
-        change["other"] = tuple((_noisy_other(random, m, w), w) for m, w in data.other)
-        minimum = minimise(problem.with_data(dataclasses.replace(data, **change)), values)
+        measured = {
+            name: _noisy(random, given, data.weight[name]) if name in drawn else given
+            for name, given in data.measured.items()
+        }
+        changed = dataclasses.replace(data, measured=measured)
+        minimum = find_minimum(with_data(problem, changed), values)
         for name in tables:
-            value = problem.layout.tables(minimum.values)[name]
+            value = minimum.values[name]
             value = value if hasattr(value, "shape") else value[0]
             found[name].append(np.asarray(value))
     return {name: np.array(x) for name, x in found.items()}
 
 
-def _noisy_other(random, measured, weight):
+def _noisy(random, measured, weight):
     """The first of the arrays measured with noise of its weights (1/σ, or L⁻¹)."""
     leaves, tree = jax.tree.flatten(measured)
     weight, first = np.asarray(weight), np.asarray(leaves[0])

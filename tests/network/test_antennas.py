@@ -13,8 +13,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation
 from jaxbundle.network.build import make_further
-from jaxbundle.network.further.antennas import antenna
-from jaxbundle.network.further.attitudes import ATTITUDE
+from jaxbundle.network.kinds.antennas import antenna
+from jaxbundle.network.kinds.attitudes import ATTITUDE
 
 ARM, TURN = np.array([0.3, -0.2, 0.8]), np.radians([0.4, -0.3, 0.6])
 SHIFT = {"north": np.array([0.4, -0.2, 0.3]), "south": np.array([-0.1, 0.5, 0.2])}

@@ -27,7 +27,7 @@ def focal_lengths(result):
 
 
 def cofactors_of_focal_lengths(result, values):
-    return Inspection(result.problem, values).propagate(lambda v: v.camera[0, :2])
+    return Inspection(result.problem, values).propagate(lambda v: v["camera"][0, :2])
 
 
 @pytest.fixture(scope="module")

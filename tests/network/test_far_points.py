@@ -10,6 +10,7 @@ import pytest
 from network.further_checks import sample
 
 import jaxbundle
+from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
 from jaxbundle.bundle.minimum import inspect_solution
 from jaxbundle.io import adjusted_network
@@ -123,15 +124,14 @@ def test_what_is_held_along_its_ray_keeps_its_distance_to_first_order():
 
 def test_coordinates_and_their_covariance_do_not_depend_on_how_points_move(moderate):
     one, other = moderate
-    shift = other.problem.origin - one.problem.origin
-    assert other.problem.layout.lengths is not None
+    assert other.problem.lengths is not None
     np.testing.assert_allclose(other.vtpv, one.vtpv, rtol=1e-10)
     # In both the datum is that of the near points, the distance theirs.
     np.testing.assert_allclose(
         other.solution.propagate(_distances_of(other)),
         one.solution.propagate(_distances_of(one)), rtol=1e-5,
     )  # fmt: skip
-    a, b = np.asarray(one.adjusted.point), np.asarray(other.adjusted.point) + shift
+    a, b = (np.asarray(coordinates(found.adjusted)) for found in moderate)
     lengths = lambda x: np.linalg.norm(x[NEAR:] - x[0], axis=1)
     sigma = np.sqrt(np.diagonal(one.solution.propagate(_distances_of(one))))
     assert np.abs((lengths(a) - lengths(b)) / sigma).max() < 1e-4
@@ -141,7 +141,7 @@ def _distances_of(inspection):
     """The function: distances of all far points from the first point."""
 
     def distances(tables):
-        X = inspection.problem.layout.values(tables).point
+        X = tables["point"][:, :3]
         return jnp.linalg.norm(X[NEAR:] - X[0], axis=1)
 
     return distances
@@ -204,10 +204,10 @@ def test_points_at_infinity_are_named_and_have_no_coordinates(horizon, tmp_path)
 def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
     _, _, result = horizon
     problem, values = result.problem, result.values
-    point = np.array(values.point)
-    u = point[NEAR:] / np.linalg.norm(point[NEAR:], axis=1)[:, None]
-    point[NEAR:] = LARGEST_DISTANCE * LENGTHS[NEAR:, None] * u
-    for start in (problem.data.start, dataclasses.replace(values, point=jnp.asarray(point))):
+    point = np.array(values["point"])
+    u = point[NEAR:, :3] / np.linalg.norm(point[NEAR:, :3], axis=1)[:, None]
+    point[NEAR:, :3] = LARGEST_DISTANCE * LENGTHS[NEAR:, None] * u
+    for start in (problem.data.start, values | {"point": jnp.asarray(point)}):
         again, minimum = minimise_with_infinity(problem, start, max_steps=100)
         np.testing.assert_array_equal(
             at_infinity(again, minimum.values), at_infinity(problem, values)
@@ -222,31 +222,29 @@ def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
     _, _, result = horizon
     problem, values = result.problem, result.values
     there = result.far_points.at_infinity
-    tables = problem.layout.tables(values)
-    space = problem.system.declared.spaces["point"]
-    rows = tables["point"][NEAR:]
+    space = problem.declared.spaces["point"]
+    rows = jnp.asarray(values["point"])[NEAR:]
 
     def vtpv(along):
         X = jnp.stack([jnp.stack(space.move(space.prepare(row), (0.0, 0.0, d)))
                        for row, d in zip(rows, along)])  # fmt: skip
-        point = values.point.at[NEAR:].set(X)
-        return _vtpv_of_images(problem, dataclasses.replace(values, point=point))
+        point = jnp.asarray(values["point"]).at[NEAR:, :3].set(X)
+        return _vtpv_of_images(problem, values | {"point": point})
 
     slope = np.asarray(jax.jit(jax.grad(vtpv))(jnp.zeros(FAR)))
-    sigma = result.far_points.sigma_inverse_distance * problem.layout.lengths[NEAR:]
+    sigma = result.far_points.sigma_inverse_distance * problem.lengths[NEAR:]
     # An inverse distance falls where δ grows.
     assert (slope[there] > 0).all()
     assert np.abs(slope * sigma)[~there].max() < 1e-3
 
 
 def _vtpv_of_images(problem, values):
-    tables = problem.layout.tables(values)
-    laid = lay_out_data(problem.system.plan, pad_data(problem.system, problem.system.data))
+    laid = lay_out_data(problem.plan, pad_data(problem, problem.data))
     rows = residuals(
-        problem.system.declared, problem.system.plan, pad_values(problem.system, tables), laid
+        problem.declared, problem.plan, pad_values(problem, values), laid
     )
-    of_images = [s.name for s in problem.layout.sets if s.field == "image"]
-    return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.system.plan.parts)
+    of_images = [*problem.image_rows]
+    return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.plan.parts)
                if part.set_name in of_images)  # fmt: skip
 
 
@@ -313,8 +311,8 @@ def test_images_from_one_place_are_not_solved_by_points_at_infinity():
     position = np.tile(images.position[:1], (len(images), 1))
     network = network.replace(images=dataclasses.replace(images, position=position))
     problem = prepared(network)
-    v = Inspection(problem, problem.data.start).residuals.image
-    xy = network.observations.xy + v / np.asarray(problem.data.image_weight)
+    v = Inspection(problem, problem.data.start).image_residuals
+    xy = network.observations.xy + v / problem.image_weights
     seen = dataclasses.replace(network.observations, xy=xy)
     result = jaxbundle.adjust(network.replace(observations=seen))
     assert not result.converged

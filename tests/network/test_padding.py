@@ -24,7 +24,7 @@ def test_networks_with_a_few_rays_less_share_their_programs():
     for less in range(12):
         rows = np.arange(len(network.observations) - less)
         fewer = network.replace(observations=network.observations.take(rows))
-        system = make_problem(fewer).system
+        system = make_problem(fewer)
         given = system.plan, pad_data(system, system.data)
         shapes = tuple((x.shape, x.dtype) for x in jax.tree.leaves(given))
         seen.add((shapes, jax.tree.structure(given), system.declared))

@@ -7,7 +7,7 @@ from further_checks import check_jacobians, sample
 import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import make_further
-from jaxbundle.network.further.fit_figures import fit
+from jaxbundle.network.kinds.fit_figures import fit
 
 random = np.random.default_rng(11)
 AXIS = np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93])

@@ -95,7 +95,8 @@ def test_the_adjustment_sees_no_residuals_either():
     )  # fmt: skip
     problem = jaxbundle.make_problem(made.truth)
     r = Inspection(problem, problem.data.start).residuals
-    for rows in (r.image, r.control, r.distance):
+    for name in ("image", "control", "distance"):
+        rows = r[name]
         assert len(rows) and np.abs(rows).max() < 1e-9
 
 

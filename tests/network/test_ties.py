@@ -51,7 +51,7 @@ def test_it_is_the_condition_fx_minus_fy(both):
     """At the same values: cofactors Q − Q·B·(Bᵀ·Q·B)⁻¹·Bᵀ·Q of the network with both free, B of the
     condition fx − fy = 0; and vᵀPv grows by (fx − fy)²/q, to first order."""
     _, tied, apart = both
-    pick = lambda values: values.camera[0, :5]
+    pick = lambda values: values["camera"][0, :5]
     of = lambda result: Inspection(result.problem, tied.values).propagate(pick)
     Q, B = of(apart), np.array([1.0, -1.0, 0, 0, 0])
     expected = Q - np.outer(Q @ B, B @ Q) / (B @ Q @ B)
@@ -145,7 +145,7 @@ def test_it_is_the_condition_left_minus_right(pair):
     """Cofactors Q − Q·B·(Bᵀ·Q·B)⁻¹·Bᵀ·Q, at the same values, but for what an exact σ leaves."""
     tied, apart = pair
     columns = [get_model("brown").parameters.index(name) for name in PAIR]
-    pick = lambda values: values.camera[:, jnp.array(columns)].ravel()
+    pick = lambda values: values["camera"][:, jnp.array(columns)].ravel()
     Q = Inspection(apart.problem, tied.values).propagate(pick)
     B = np.array([[1.0, 0, -1, 0], [0, 1, 0, -1]]).T
     expected = Q - Q @ B @ np.linalg.solve(B.T @ Q @ B, B.T @ Q)
@@ -164,7 +164,7 @@ def test_a_sigma_of_the_difference_lets_it_move():
     of = lambda result: np.diff([result.camera_parameters(i)["K1"] for i in ("left", "right")])[0]
     column = jnp.array([get_model("brown").parameters.index("K1")])
     Q = Inspection(free.problem, found.values).propagate(
-        lambda v: v.camera[1, column] - v.camera[0, column]
+        lambda v: v["camera"][1, column] - v["camera"][0, column]
     )[0, 0]
     assert of(found) == pytest.approx(of(free) * s**2 / (s**2 + Q), rel=0.05)
 

@@ -9,7 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.network.build import make_further
-from jaxbundle.network.further import KINDS
+from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import EXTERIOR
 
 EPOCHS, SIGMA = 4, 0.002
@@ -94,7 +94,7 @@ def problem():
 
 def test_every_kind_is_there(problem):
     assert {type(one).TABLE for one in problem.network.further} == KINDS.keys()
-    assert any(np.ndim(weight) == 3 for _, weight in problem.data.other), "no covariance"
+    assert any(np.ndim(weight) == 3 for weight in problem.data.weight.values()), "no covariance"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -276,10 +276,10 @@ def test_priors_in_tables_are_information_as_in_columns(network):
 def test_an_aim_that_the_datum_decides_is_refused(network, site):
     refused(network, "depends on the datum", Aim("mean", (("point", "3", "Z"),)))
     refused(network.replace(datum="minimal"), "inner constraints")
-    height = lambda values: values.point[0, 2] - values.point[1, 2]
+    height = lambda values: values["point"][0, 2] - values["point"][1, 2]
     refused(network, "depends on the datum", Aim("mean", height))
-    ratio = lambda v: (((v.point[0] - v.point[1]) ** 2).sum()
-                       / ((v.point[2] - v.point[3]) ** 2).sum()).reshape(1)  # fmt: skip
+    ratio = lambda v: (((v["point"][0] - v["point"][1]) ** 2).sum()
+                       / ((v["point"][2] - v["point"][3]) ** 2).sum()).reshape(1)  # fmt: skip
     for aim in (Aim("mean", ratio), Aim("mean", (("camera", "cam", "c"),))):
         make_pairs(network, aim, site, SIGMA)
 

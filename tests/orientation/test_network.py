@@ -11,9 +11,9 @@ import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.minimum import minimise
 from jaxbundle.bundle.orient import orient
 from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
 from jaxbundle.orientation.network import lacks_start_values
@@ -95,10 +95,10 @@ def assert_same_answer(network, without):
 def minimum(network):
     """The parameters of the cameras, and vᵀPv and redundancy, at the minimum."""
     problem = make_problem(check_network(network))
-    found = minimise(problem, problem.data.start, atol=1e-8)
+    found = find_minimum(problem, problem.data.start, atol=1e-8)
     assert converged(int(found.termination))
     vtpv = 2 * np.nanmin(np.asarray(found.history.cost))
-    return np.asarray(found.values.camera), (vtpv, problem.counts.redundancy)
+    return np.asarray(found.values["camera"]), (vtpv, problem.counts.redundancy)
 
 
 # --- start values alone: these tests share their programs

@@ -24,7 +24,7 @@ from jaxbundle.leastsquares.iterations.solver import minimise
 from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.problem import make_solver, pad_data
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
-from jaxbundle.network.arrays import Values
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.projection import images_through_scene
 
@@ -49,7 +49,7 @@ def assert_close(found, dense, sigma_rows, sigma_columns, tolerance=1e-8):
 def test_blocks(name):
     found, dense, Q = both(name)
     sigma = standard_deviations(Q)
-    for table in found.problem.system.tables:
+    for table in found.problem.tables:
         for block, rows in zip(found.solution.cofactor(table.name), dense.columns[table.name]):
             assert_close(block, Q[np.ix_(rows, rows)], sigma[rows], sigma[rows])
 
@@ -81,7 +81,7 @@ def test_redundancy_numbers(name):
 
 
 def weights(problem):
-    return [problem.system.weights(o.name) for o in problem.system.observations]
+    return [problem.weights(o.name) for o in problem.observations]
 
 
 def test_reliability():
@@ -129,16 +129,16 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     """
     part = 1 / 3
     problem = make_problem(synthetic(datum="inner", noise=0.0)[0])
-    system, data = problem.system, problem.data
+    system, data = problem, problem.data
     random = np.random.default_rng(12)
-    noise = random.normal(size=(DRAWS, *data.image_xy.shape)) / np.asarray(data.image_weight)
-    solver = make_solver(problem.system, max_steps=100)
+    noise = random.normal(size=(DRAWS, *data.measured["image"].shape)) / problem.image_weights
+    solver = make_solver(problem, max_steps=100)
 
     @eqx.filter_jit
     def sample(solver, xy):
         def one(xy):
-            drawn = eqx.tree_at(lambda d: d.image_xy, data, xy)
-            given = pad_data(system, problem.layout.data(drawn))
+            drawn = eqx.tree_at(lambda d: d.measured["image"], data, xy)
+            given = pad_data(system, drawn)
             minimum = minimise(solver, given, given.start)
             cost = minimum.history.cost[minimum.iterations - 1]
             tables, _ = move_to_datum(solver.declared, solver.plan, minimum.values, given.start)
@@ -146,16 +146,17 @@ def test_predicted_uncertainty_is_that_of_a_sample():
 
         return jax.vmap(one)(xy)
 
-    termination, found, vtpv = sample(solver, data.image_xy + part * noise)
+    termination, found, vtpv = sample(solver, data.measured["image"] + part * noise)
     assert (np.asarray(termination) == SETTLED).all()
     true = solved(problem).values
     at_all = lambda rows, name: rows[:, : system.table(name).rows]
     position, rotation = (at_all(x, "image") for x in found["image"])
-    turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(rotation, true.rotation)
+    turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(rotation, true["image"].rotation)
+    cameras = at_all(found["camera"], "camera") - true["camera"]
     changes = {
-        "image": jnp.concatenate([position - true.position, turn], 2),
-        "camera": (at_all(found["camera"], "camera") - true.camera)[:, :, problem.interior(0)[1]],
-        "point": at_all(found["point"], "point") - true.point,
+        "image": jnp.concatenate([position - true["image"].position, turn], 2),
+        "camera": cameras[:, :, problem.free_parameters(0)[1]],
+        "point": at_all(found["point"], "point") - true["point"],
     }
     dense = linearise(problem, true)
     Q, x = dense.Q, np.zeros((DRAWS, len(dense.free)))
@@ -180,9 +181,12 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     # object is known.
     drawn = (at_all(found["camera"], "camera"), position, rotation, at_all(found["point"], "point"))
     grid = np.stack(np.meshgrid([-6.0, 0.0, 6.0], [-4.0, 4.0]), -1).reshape(-1, 2)
+    tables = lambda c, X0, q, X: {"camera": c, "image": PoseValue(X0, q), "point": X}
     for distance in (12.0, np.inf):
-        images = images_through_scene(get_model("brown"), 0, np.arange(6), true, grid, distance)
-        of = jax.jit(jax.vmap(lambda c, X0, q, X, f=images: f(Values(c, X0, q, X)) - f(true)))
+        images = images_through_scene(
+            get_model("brown"), ("camera", 0), np.arange(6), true, grid, distance
+        )
+        of = jax.jit(jax.vmap(lambda *drawn, f=images: f(tables(*drawn)) - f(true)))
         stated = np.sqrt(np.diag(Inspection(problem, true).propagate(images)))
         ratio = np.sqrt((np.asarray(of(*drawn)) ** 2).mean(0)) / part / stated
         assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * DRAWS)

@@ -1,7 +1,6 @@
 """`precision` against the dense inverse of networks built anew, and its derivatives against their
 differences."""
 
-import dataclasses
 
 import equinox as eqx
 import jax
@@ -40,22 +39,31 @@ def program(problem):
 def dense_covariance(problem, data):
     """Of the unknowns of `NAMES`, from the whole Jacobian at measurements made anew."""
     values = data.start
-    xyz = np.roll(values.rotation, -1, axis=1)  # of any length, as the package takes them
+    xyz = np.roll(values["image"].rotation, -1, axis=1)  # of any length, as the package takes them
     M = Rotation.from_quat(xyz).as_matrix()
-    away = np.asarray(values.point)[problem.point] - np.asarray(values.position)[problem.image]
+    X0, X = np.asarray(values["image"].position), np.asarray(values["point"])
+    away = X[problem.point] - X0[problem.image]
     x, y, z = np.einsum("nij,nj->in", M[problem.image], away)
-    f, k1, k2 = np.asarray(values.camera[0])
+    f, k1, k2 = np.asarray(values["camera"][0])
     r2 = (x * x + y * y) / (z * z)
     xy = np.stack([x, y], 1) * (-f * (1 + k1 * r2 + k2 * r2**2) / z)[:, None]
-    data = dataclasses.replace(data, image_xy=jnp.asarray(xy))
+    data = problem.with_image_coordinates(data, jnp.asarray(xy))
     dense = linearise(problem, data=data)
     columns = dense.columns
     pick = [columns["camera"][0, 0], columns["point"][1, 2], columns["image"][2, 1]]
     return dense.Q[np.ix_(pick, pick)]
 
 
+PLACES = {
+    "position": lambda d: d.start["image"].position,
+    "rotation": lambda d: d.start["image"].rotation,
+    "point": lambda d: d.start["point"], "camera": lambda d: d.start["camera"],
+    "weight": lambda d: d.weight["image"],
+}  # fmt: skip
+
+
 def moved(data, field, place, h):
-    at = lambda d: getattr(d.start, field) if hasattr(d.start, field) else getattr(d, field)
+    at = PLACES[field]
     return eqx.tree_at(at, data, at(data).at[place].add(h))
 
 
@@ -74,24 +82,23 @@ def test_derivatives_by_stations_targets_cameras_and_weights(problem, program):
     slopes, _ = program(problem.data)
     places = {
         "position": ((1, 2), 1e-3), "rotation": ((3, 1), 1e-4), "point": ((2, 0), 1e-3),
-        "camera": ((0, 0), 0.25), "image_weight": ((5, 1), 0.16),
+        "camera": ((0, 0), 0.25), "weight": ((5, 1), 0.16),
     }  # fmt: skip
     for field, (place, h) in places.items():
-        at = lambda d, f=field: getattr(d.start, f) if hasattr(d.start, f) else getattr(d, f)
-        slope = np.asarray(at(slopes))[(..., *place)]
+        slope = np.asarray(PLACES[field](slopes))[(..., *place)]
         ends = {k: dense_covariance(problem, moved(problem.data, field, place, k * h))
                 for k in (-2, -1, 1, 2)}  # fmt: skip
         difference = (8 * (ends[1] - ends[-1]) - (ends[2] - ends[-2])) / (12 * h)
         assert np.abs(slope).max() > 0
         assert np.abs(slope - difference).max() < 1e-5 * np.abs(difference).max(), field
     # What was measured is not asked for.
-    assert not np.asarray(slopes.image_xy).any()
+    assert not np.asarray(slopes.measured["image"]).any()
 
 
 def test_a_design_that_determines_nothing_is_nan(problem, program):
     """All stations at one place."""
-    same = jnp.tile(problem.data.start.position[:1], (4, 1))
-    data = eqx.tree_at(lambda d: d.start.position, problem.data, same)
+    same = jnp.tile(problem.data.start["image"].position[:1], (4, 1))
+    data = eqx.tree_at(lambda d: d.start["image"].position, problem.data, same)
     _, found = program(data)
     assert np.isnan(found.points).all() and np.isnan(found.images).all()
     assert np.isnan(found.cameras[0, 0])
@@ -100,12 +107,12 @@ def test_a_design_that_determines_nothing_is_nan(problem, program):
 @pytest.mark.further
 def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(problem):
     """∂σ²/∂X0, forward, under vmap and jit."""
-    X0 = problem.data.start.position[1, 0]
+    X0 = problem.data.start["image"].position[1, 0]
 
     def variance(x):
         data = eqx.tree_at(
-            lambda d: d.start.position, problem.data,
-            problem.data.start.position.at[1, 0].set(x),
+            lambda d: d.start["image"].position, problem.data,
+            problem.data.start["image"].position.at[1, 0].set(x),
         )  # fmt: skip
         return jaxbundle.precision(problem, data, names=NAMES[:1], sigma0=2.0).covariance[0, 0]
 
@@ -121,10 +128,10 @@ def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(prob
 
 def test_redundancy_numbers_and_their_derivative_by_a_weight(problem):
     def of(weight):
-        data = dataclasses.replace(problem.data, image_weight=weight)
-        return jaxbundle.redundancy(problem, data).image
+        data = problem.with_image_weights(problem.data, weight)
+        return jaxbundle.redundancy(problem, data)["image"]
 
-    weight, at, h = jnp.asarray(problem.data.image_weight), (5, 1), 1e-3
+    weight, at, h = jnp.asarray(problem.image_weights), (5, 1), 1e-3
     towards = jnp.zeros_like(weight).at[at].set(1.0)
     program = jax.jit(lambda w: jax.jvp(of, (w,), (towards,)))
     r, slope = map(np.asarray, program(weight))

@@ -29,8 +29,9 @@ from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.quality.snooping import Removed, snoop, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.network import kinds
 from jaxbundle.network.declare import CameraTable, camera_tables
+from jaxbundle.network.kinds.control_points import CONTROL_POINTS
+from jaxbundle.network.kinds.image_points import image_points
 from jaxbundle.network.tables import EXTERIOR, Camera
 
 POSES = ("epoch", "mounting")
@@ -111,13 +112,13 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
     for table, rows in rig.sets:
         k = rig.camera[rows]
         touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
-        kind = kinds.image_points(table.model, "measured", table.name, POSES)
+        kind = image_points(table.model, "measured", table.name, POSES)
         observations.append(
             kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
     if rig.point_sigma is not None:
         every = np.arange(len(rig.points))
-        control = kinds.CONTROL((every,), rig.points, sigma=rig.point_sigma, name="control")
+        control = CONTROL_POINTS((every,), rig.points, sigma=rig.point_sigma, name="control")
         observations.append(control)
     return tables, observations
 

@@ -24,10 +24,9 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Pose, PoseValue, Result
-from jaxbundle.network.further.exterior_priors import exterior
+from jaxbundle.network.kinds.exterior_orientation import exterior
 from jaxbundle.network.tables import Camera, Network, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
-from jaxbundle.statistics.inspection import Tested
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -146,7 +145,7 @@ class RigCalibration:
                 ids[rig.point],
                 ("x", "y"),
                 rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
-                Tested(*(rows(getattr(found, name)) for name in Tested._fields)),
+                *(rows(getattr(found, name)) for name in result_tables.TESTED),
             )
         ]
         if rig.point_sigma is not None:
@@ -159,7 +158,7 @@ class RigCalibration:
                     ids,
                     tuple("XYZ"),
                     weight("control"),
-                    Tested(*(getattr(found, name)["control"] for name in Tested._fields)),
+                    *(getattr(found, name)["control"] for name in result_tables.TESTED),
                 )
             )
         return result_tables.concatenate(parts)

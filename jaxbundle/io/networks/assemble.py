@@ -18,7 +18,7 @@ from jaxbundle.io.networks.poses import angles_of
 from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further import Rigs
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import (
     EXTERIOR,

@@ -44,7 +44,7 @@ from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
 from jaxbundle.io.text.rows import join_numbers
 from jaxbundle.io.text.yaml_text import parse_yaml
-from jaxbundle.network.further import Rigs
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 

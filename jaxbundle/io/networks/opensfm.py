@@ -64,7 +64,7 @@ from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
-from jaxbundle.network.further import Antennas
+from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning, parse_json
 from jaxbundle.types import present

@@ -65,8 +65,8 @@ from jaxbundle.network.build import (
     POINT_SIGMAS,
 )
 from jaxbundle.network.columns import Columns, as_columns
-from jaxbundle.network.further import KINDS, SECTIONS
-from jaxbundle.network.further.base import among
+from jaxbundle.network.kinds import KINDS, SECTIONS
+from jaxbundle.network.kinds.base import among
 from jaxbundle.network.rules import AXES
 from jaxbundle.network.tables import STATED, UNIT, Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit

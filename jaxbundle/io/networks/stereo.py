@@ -44,7 +44,7 @@ from jaxbundle.io.networks.kalibr import mountings_of
 from jaxbundle.io.networks.losses import describe_losses, size_of
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.network.further import Rigs
+from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 

@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
-from jaxbundle.network.further import CameraParameters, ExteriorPriors, Further, RollingShutter
-from jaxbundle.network.further.base import among
+from jaxbundle.network.kinds import CameraParameters, ExteriorPriors, Further, RollingShutter
+from jaxbundle.network.kinds.base import among
 from jaxbundle.network.sightings import keep_points, without_distances
 from jaxbundle.network.tables import ESTIMATED, Images, Network, Points
 
 if TYPE_CHECKING:
+    from jaxbundle.adjustment.problem import NetworkProblem
     from jaxbundle.bundle.result import Adjustment
 
 
@@ -41,7 +42,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
         )
         for camera in network.cameras
     )
-    used = (np.asarray(problem.data.image_weight) > 0).any(1)
+    used = problem.used
     roles = tuple("tie" if role == "control" else role for role in points.role)
     adjusted = network.replace(
         cameras=cameras,
@@ -82,7 +83,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     snooping, points without coordinates and check points are left out.
     """
     problem = adjustment.problem
-    network, data = problem.network, problem.data
+    network = problem.network
     images, rays = network.images, network.observations
     values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
     cameras = tuple(
@@ -94,8 +95,8 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
         )
         for camera in network.cameras
     )
-    weight = np.asarray(data.image_weight)
-    used = (weight > 0).any(1)
+    weight, used = problem.image_weights, problem.used
+    distance_weight = _weights(problem, "distance", (len(network.distances), 1)).ravel()
     adjusted = network.replace(
         cameras=cameras,
         images=Images(
@@ -112,15 +113,21 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
             sigma=_sigma(weight, np.nan),
             sigma_origin=ESTIMATED if adjustment.sigma_factors else rays.sigma_origin,
         ).take(used),
-        distances=dataclasses.replace(
-            network.distances, sigma=_sigma(np.asarray(data.distance_weight), np.nan)
-        ),
+        distances=dataclasses.replace(network.distances, sigma=_sigma(distance_weight, np.nan)),
         further=_join_tables(*_further(adjustment), *_priors(adjustment)),
         warnings=(),
         notes=("the adjusted network",),
     )
-    adjusted = without_distances(adjusted, np.asarray(data.distance_weight) <= 0)
+    adjusted = without_distances(adjusted, distance_weight <= 0)
     return keep_points(adjusted, np.asarray(np.isfinite(adjustment.point_values).all(1)))
+
+
+def _weights(
+    problem: "NetworkProblem", name: str, otherwise: tuple[int, int]
+) -> Float[np.ndarray, "rows residuals"]:
+    """1/σ of a set of observations; of one that the network lacks, zeros of the shape given."""
+    known = any(o.name == name for o in problem.observations)
+    return problem.weights(name) if known else np.zeros(otherwise)
 
 
 def _sigma(weight: Float[np.ndarray, "..."], otherwise: float) -> Float[np.ndarray, "..."]:
@@ -132,9 +139,10 @@ def _given_points(adjustment: "Adjustment") -> Points:
     """Points at their adjusted coordinates, controlled axes at the given ones; a control point of
     which no axis is used any more is a tie point."""
     problem = adjustment.problem
-    points, data = problem.network.points, problem.data
-    control = problem.layout.given["control"]
-    weight, given = np.asarray(data.control_weight), np.asarray(data.control) + problem.origin
+    points = problem.network.points
+    control = np.flatnonzero(points.has_role("control"))
+    weight = _weights(problem, "control", (0, 3))
+    given = np.asarray(problem.data.measured.get("control", np.zeros((0, 3)))) + problem.origin
     position, sigma = adjustment.point_values.copy(), np.full_like(points.sigma, np.nan)
     sigma[control] = _sigma(weight, np.inf)
     position[control] = np.where(weight > 0, given, position[control])
@@ -148,21 +156,27 @@ def _given_points(adjustment: "Adjustment") -> Points:
 def _priors(adjustment: "Adjustment") -> list[Further]:
     """What was observed of orientations and cameras."""
     problem = adjustment.problem
-    network, data, given = problem.network, problem.data, problem.layout.given
+    network, measured = problem.network, problem.data.measured
+    known = {o.name: o for o in problem.observations}
     tables: list[Further] = []
-    if len(given["exterior"]):
-        value = np.asarray(data.exterior) + np.concatenate([problem.origin, np.zeros(3)])
-        image = tuple(network.images.id[k] for k in given["exterior"])
-        sigma = _sigma(np.asarray(data.exterior_weight), np.inf)
+    if "exterior" in known:
+        value = np.asarray(measured["exterior"]) + np.concatenate([problem.origin, np.zeros(3)])
+        image = tuple(network.images.id[k] for k in known["exterior"].rows[0])
+        sigma = _sigma(problem.weights("exterior"), np.inf)
         tables.append(ExteriorPriors(image=image, value=value, sigma=sigma))
     gone = {(name.id, name.parameter) for name in adjustment.eliminated}
     rows = []
-    for row, c in enumerate(given["interior"]):
-        camera = network.cameras[c]
-        for j, name in enumerate(get_model(camera.model).parameters):
-            weight = float(data.interior_weight[row, j])
-            if weight > 0 and name in camera.unknowns and (camera.id, name) not in gone:
-                rows.append((camera.id, name, float(data.interior[row, j]), 1 / weight))
+    for table in problem.cameras:
+        if table.interior_set not in known:
+            continue
+        weights = problem.weights(table.interior_set)
+        for row, of_table in enumerate(known[table.interior_set].rows[0]):
+            camera = network.cameras[table.cameras[of_table]]
+            for j, name in enumerate(table.parameters):
+                used = weights[row, j] > 0 and name in camera.unknowns
+                if used and (camera.id, name) not in gone:
+                    value = float(measured[table.interior_set][row, j])
+                    rows.append((camera.id, name, value, float(1 / weights[row, j])))
     if rows:
         camera, parameter, value, sigma = zip(*rows)
         tables.append(
@@ -192,23 +206,24 @@ def _further(adjustment: "Adjustment") -> list[Further]:
     """The observations of further kinds without those removed by data snooping, with their final σ:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
-    network, system = problem.network, problem.system
+    network = problem.network
     # the engine's sets in the order of declaration, the user's own before those of the network
     kinds = sorted(among(network), key=lambda table: not isinstance(table, RollingShutter))
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
-    names, tables = iter(problem.layout.others[len(problem.layout.others) - sum(numbers) :]), []
+    own = len(problem.further_sets) - sum(numbers)
+    names, tables = iter(problem.further_sets[own:]), []
     for table, number in zip(kinds, numbers):
         if not number:
             tables.append(table)
             continue
-        first, *_ = [system.observations_of(next(names)) for _ in range(number)]
+        first, *_ = [problem.observations_of(next(names)) for _ in range(number)]
         factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(table, name):
                 changed: dict = {name: getattr(table, name) * factor**power}
                 table = dataclasses.replace(table, **changed)
         if first.number == len(table):
-            whole = np.abs(np.asarray(system.weights(first.name))).reshape(len(table), -1).max(1)
+            whole = np.abs(np.asarray(problem.weights(first.name))).reshape(len(table), -1).max(1)
             table = table.take(whole > 0)
         tables += [table] if len(table) else []
     return tables

@@ -172,11 +172,11 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
 
 def measured_coordinates(adjustment: "Adjustment") -> np.ndarray:
     """By row of the table of residuals, the measured image coordinate; NaN for other kinds."""
-    data, kind = adjustment.problem.data, adjustment.residuals["kind"]
+    problem, kind = adjustment.problem, adjustment.residuals["kind"]
     # the table has rows of other kinds, too
     measured = np.full(len(kind), np.nan)
-    used = np.asarray(data.image_weight) > 0
-    measured[kind == "image"] = np.asarray(data.image_xy)[used]
+    used = problem.image_weights > 0
+    measured[kind == "image"] = problem.image_coordinates()[used]
     return measured
 
 

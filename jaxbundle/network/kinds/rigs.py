@@ -26,8 +26,8 @@ from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, check_settings
-from jaxbundle.network.further.figures import EXACT_SIGMA, across_rays
+from jaxbundle.network.kinds.base import Declared, Further, check_settings
+from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.units import ANGLE_UNITS
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
 
 AXES = ("dX", "dY", "dZ")
 

@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.camera_tables import camera_tables
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.further.base import Declared, Further, positive_sigma
+from jaxbundle.network.kinds.base import Declared, Further, positive_sigma
 
 RATIO = "/"
 

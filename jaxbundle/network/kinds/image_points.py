@@ -1,32 +1,25 @@
-"""The kinds of observations of a network: one function for one observation each.
-
-| kind | residuals | touches |
-|---|---|---|
-| image coordinates | x, y | image, camera, point (collinearity equations, distortion) |
-| control points | X, Y, Z | point |
-| exterior orientation | X0, Y0, Z0, ω, φ, κ | image |
-| interior orientation | the camera's parameters | camera |
-| distances | d | two points |
+"""Image points: x and y, which touch image, camera and point (collinearity equations, distortion).
 
 Residuals are computed minus observed. Only this module defines how an image coordinate depends on
-the unknowns. A similarity of object space changes no image coordinate: the freedoms left open by
-the other kinds are the datum defect.
+the unknowns. Measurements in rows of lines exposed one after the other have the line beside them
+(`rolling_shutter`).
 """
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle import cameras
-from jaxbundle.leastsquares.any_distance import move_at_any_distance
-from jaxbundle.leastsquares.datum.motions import similarity
-from jaxbundle.leastsquares.declarations import Kind, Local
+from jaxbundle.leastsquares.declarations import Kind, Local, Observations
 from jaxbundle.leastsquares.spaces import Posed, turn_by
-from jaxbundle.network.further.base import less
-from jaxbundle.network.further.exterior_priors import EXTERIOR_PRIOR
-from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
+from jaxbundle.network.kinds.rolling_shutter import READ_OUT, VELOCITIES, RollingShutter
 from jaxbundle.types import present
+
+if TYPE_CHECKING:
+    from jaxbundle.network.camera_tables import CameraTable
+    from jaxbundle.network.tables import Network
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +72,7 @@ def _transform_ray(poses, ray):
 
 @dataclasses.dataclass(frozen=True)
 class MovingImagePoint(ImagePoint):
-    """The same for a moving camera with a rolling shutter (`further.rolling_shutter`)."""
+    """The residuals of an image point of a moving camera with a rolling shutter."""
 
     def __call__(self, pose, velocity, read_out, interior, point, measured):
         xy, line = measured
@@ -113,24 +106,39 @@ def image_points(
     return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True, local=local)
 
 
-def _distance(a, b, given):
-    return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
+def declare_image_points(
+    network: "Network", tables: "tuple[CameraTable, ...]"
+) -> tuple[list[Observations], dict[str, Int[np.ndarray, " rows"]]]:
+    """A set of image points for every table of cameras, and by its name the rows of the network's
+    observations that are in it."""
+    images, rays = network.images, network.observations
+    shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
+    line = None if shutter is None else shutter.lines(network)
+    camera = images.camera[rays.image]
+    row_of_camera = np.zeros(len(network.cameras), np.int64)
+    for table in tables:
+        row_of_camera[table.cameras] = np.arange(len(table.cameras))
+    sets, rows_of_sets = [], {}
+    for table in tables:
+        rows = np.flatnonzero(np.isin(camera, table.cameras))
+        if not len(rows):
+            continue
+        kind = image_points(table.model, network.residuals, table.name, moving=line is not None)
+        moving = () if line is None else (rays.image, camera)
+        touched = (rays.image, *moving, row_of_camera[camera], rays.point)
+        measured = rays.xy[rows] if line is None else (rays.xy[rows], line[rows])
+        sets.append(
+            kind(
+                tuple(index[rows] for index in touched),
+                measured,
+                sigma=rays.sigma[rows],
+                name=table.image_set,
+            )
+        )
+        rows_of_sets[table.image_set] = rows
+    return sets, rows_of_sets
 
 
-CONTROL = Kind("control points", less, ("point",), ("X", "Y", "Z"), snooped="single")
-EXTERIOR = EXTERIOR_PRIOR
-DISTANCES = Kind("distances", _distance, ("point", "point"), ("d",), snooped="single")
-
-
-def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
-    """Priors of the parameters of the cameras of a table."""
-    return Kind("interior orientation", less, (camera,), parameters, snooped="", invariant=True)
-
-
-SIMILARITY = similarity(("point",), ("image",))
-SIMILARITY_AT_ANY_DISTANCE = dataclasses.replace(
-    SIMILARITY,
-    actions=tuple(
-        (name, move_at_any_distance if name == "point" else act) for name, act in SIMILARITY.actions
-    ),
-)
+def image_coordinates(measured: Any) -> Float[np.ndarray, "rows 2"]:
+    """x and y of the measurements of a set, without the line of a rolling shutter."""
+    return measured[0] if isinstance(measured, tuple) else measured

@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Frame, PoseValue, cross
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
 from jaxbundle.network.units import from_image_unit
 
 LINE = "object line"

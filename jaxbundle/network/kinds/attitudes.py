@@ -25,7 +25,7 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Rotation
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import (
+from jaxbundle.network.kinds.base import (
     Declared,
     Further,
     Parameters,

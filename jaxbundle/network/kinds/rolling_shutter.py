@@ -35,7 +35,7 @@ from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.further.base import (
+from jaxbundle.network.kinds.base import (
     Declared,
     Further,
     Parameters,

@@ -1,14 +1,15 @@
-"""Given exterior orientations that differ from the start values: table `exterior_priors`.
+"""Given exterior orientations: X0, Y0, Z0, ω, φ, κ of images, with σ.
 
-A σ in the table of images is that of the start value. Where the observed value is another one, such
-as in the adjusted network of a result, it has a row here (cameras: `camera_parameters`).
+A σ in the table of images is that of the start value, the set "exterior". Where the observed value
+is another one, such as in the adjusted network of a result, it has a row in the table
+`exterior_priors` (cameras: `camera_parameters`).
 
 Columns: `image`, `X0`, `Y0`, `Z0`, `omega`, `phi`, `kappa` and their σ; both empty: not given.
 """
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +17,14 @@ from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_near
-from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.declarations import Kind, Observations
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.control_points import infinite_where_none
 from jaxbundle.network.tables import EXTERIOR
+
+if TYPE_CHECKING:
+    from jaxbundle.network.tables import Network
 
 
 def exterior(pose, given):
@@ -29,7 +34,20 @@ def exterior(pose, given):
     return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
 
 
-EXTERIOR_PRIOR = Kind("exterior orientation", exterior, ("image",), EXTERIOR, snooped="")
+EXTERIOR_ORIENTATION = Kind("exterior orientation", exterior, ("image",), EXTERIOR, snooped="")
+
+
+def declare_exterior_orientation(
+    network: "Network", origin: Float[np.ndarray, "3"]
+) -> list[Observations]:
+    """The set "exterior", one row an image with a σ, if there are any."""
+    images = network.images
+    sigma = infinite_where_none(images.sigma)
+    rows = np.flatnonzero(np.isfinite(sigma).any(1))
+    if not len(rows):
+        return []
+    value = np.concatenate([images.position - origin, images.angles], 1)[rows]
+    return [EXTERIOR_ORIENTATION((rows,), value, sigma=sigma[rows], name="exterior")]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,5 +93,10 @@ class ExteriorPriors(Further):
         shift = np.concatenate([origin, np.zeros(3)])
         value = np.where(np.isfinite(self.sigma), self.value - shift, 0.0)
         return Declared(
-            (), (EXTERIOR_PRIOR((rows_of(self.image, network.images),), value, sigma=self.sigma),)
+            (),
+            (
+                EXTERIOR_ORIENTATION(
+                    (rows_of(self.image, network.images),), value, sigma=self.sigma
+                ),
+            ),
         )

@@ -20,8 +20,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.further.base import Declared, Further
-from jaxbundle.network.further.figures import EXACT_SIGMA, sigma_or_exact
+from jaxbundle.network.kinds.base import Declared, Further
+from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_or_exact
 from jaxbundle.system.programs import compile_once
 
 SAMPLED_RAYS = 256

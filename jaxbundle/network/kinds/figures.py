@@ -35,8 +35,8 @@ from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Frame, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
-from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
+from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
 
 EXACT_SIGMA = 1e-3
 """The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with

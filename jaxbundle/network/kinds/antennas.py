@@ -31,7 +31,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import (
+from jaxbundle.network.kinds.base import (
     Declared,
     Further,
     Parameters,

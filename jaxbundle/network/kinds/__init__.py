@@ -1,0 +1,39 @@
+"""Further kinds of observations of a network: one file per kind, with a common interface
+(`base.Further`)."""
+
+from jaxbundle.network.kinds import attitudes, differences
+from jaxbundle.network.kinds.antennas import Antennas as Antennas
+from jaxbundle.network.kinds.attitudes import Attitudes as Attitudes
+from jaxbundle.network.kinds.base import Further as Further
+from jaxbundle.network.kinds.camera_parameters import CameraParameters as CameraParameters
+from jaxbundle.network.kinds.differences import Angles as Angles
+from jaxbundle.network.kinds.differences import Differences as Differences
+from jaxbundle.network.kinds.exterior_orientation import ExteriorPriors as ExteriorPriors
+from jaxbundle.network.kinds.figures import Figures as Figures
+from jaxbundle.network.kinds.figures import Shapes as Shapes
+from jaxbundle.network.kinds.lines import Edges as Edges
+from jaxbundle.network.kinds.rigs import Rigs as Rigs
+from jaxbundle.network.kinds.rolling_shutter import RollingShutter as RollingShutter
+from jaxbundle.network.kinds.ties import Ties as Ties
+
+KINDS = {
+    kind.TABLE: kind
+    for kind in (
+        Antennas,
+        Attitudes,
+        Rigs,
+        RollingShutter,
+        Differences,
+        Angles,
+        Figures,
+        Shapes,
+        Edges,
+        Ties,
+        CameraParameters,
+        ExteriorPriors,
+    )
+}
+"""By the name of their table."""
+OF_ANGLES = {kind.name for kind in (attitudes.ATTITUDE, attitudes.PRIOR, differences.ANGLE)}
+"""The kinds whose residuals are angles, radians."""
+SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)

@@ -1,0 +1,28 @@
+"""Distances between two points."""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.declarations import Kind, Observations
+from jaxbundle.types import Scalar
+
+if TYPE_CHECKING:
+    from jaxbundle.network.tables import Network
+
+
+def distance(a: Float[Array, "3"], b: Float[Array, "3"], given: Scalar) -> Scalar:
+    """The distance of two points minus the given one."""
+    return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
+
+
+DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), snooped="single")
+
+
+def declare_distances(network: "Network") -> list[Observations]:
+    """The set "distance", one row a distance, if there are any."""
+    given = network.distances
+    if not len(given):
+        return []
+    return [DISTANCES(tuple(given.points.T), given.value, sigma=given.sigma, name="distance")]

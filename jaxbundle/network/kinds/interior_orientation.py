@@ -1,0 +1,41 @@
+"""Priors of interior orientation: start values of camera parameters with σ."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxbundle.leastsquares.declarations import Kind, Observations
+from jaxbundle.network.kinds.base import less
+
+if TYPE_CHECKING:
+    from jaxbundle.network.camera_tables import CameraTable
+    from jaxbundle.network.tables import Network
+
+
+def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
+    """Priors of the parameters of the cameras of a table."""
+    return Kind("interior orientation", less, (camera,), parameters, snooped="", invariant=True)
+
+
+def declare_interior_orientation(
+    network: "Network", tables: "tuple[CameraTable, ...]"
+) -> list[Observations]:
+    """A set for every table of cameras of which one has a σ, one row a camera that has."""
+    found = []
+    for table in tables:
+        own = [network.cameras[c] for c in table.cameras]
+        sigma = np.array(
+            [
+                [
+                    camera.sigma.get(p, np.inf) if p in camera.free else np.inf
+                    for p in table.parameters
+                ]
+                for camera in own
+            ]
+        )
+        rows = np.flatnonzero(np.isfinite(sigma).any(1))
+        if len(rows):
+            kind = interior_orientation(table.name, table.parameters)
+            value = table.start(network.cameras)[rows]
+            found.append(kind((rows,), value, sigma=sigma[rows], name=table.interior_set))
+    return found
