@@ -12,7 +12,8 @@ unknowns,
 B = G on the datum rows for inner constraints (trace of their covariance smallest), B = as many
 single unknowns as the defect for a minimal datum. After convergence the whole problem is moved by
 finite open motions so that Bᵀ(x − x_start) = 0 holds exactly: the result does not depend on the
-path of the iterations.
+path of the iterations. (Conditions imposed on every step instead let far points pull the whole
+problem: ½vᵀPv of BAL 49 was 13345.3 after 100 evaluations, imposed at the end after 22.)
 """
 
 import dataclasses
