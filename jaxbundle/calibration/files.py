@@ -68,7 +68,9 @@ RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "opencv-stereo": ("stereo.yaml", ()),
     "ros-stereo": ("camera_info", ROS_FILES),
 }
-"""Files and folders of a rig for other programs, by their format; the last two of pairs."""
+"""Files and folders of a rig for other programs, by their format; the last two in pairs of
+cameras."""
+STEREO_PAIRS = "stereo_*.yaml"
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -112,6 +114,7 @@ def files_of(names: Sequence[str]) -> list[str]:
             f"{RIG}/{file}"
             for file in (
                 CONVERSIONS,
+                STEREO_PAIRS,
                 *(name for name, _ in RIG_FILES.values()),
                 *(f"{name}/{file}" for name, files in RIG_FILES.values() for file in files),
             )
@@ -220,13 +223,11 @@ def fill_calibrations(
 
 
 def fill_rig(network: Network, folder: Path) -> None:
-    """Write a rig for other programs: Kalibr, mrcal, a pair also for OpenCV and ROS. What a program
-    cannot hold is fitted, or left out; both are said in `conversions.txt`."""
+    """Write a rig for other programs: Kalibr, mrcal, and in pairs of cameras OpenCV and ROS. What a
+    program cannot hold is fitted, or left out; both are said in `conversions.txt`."""
     folder.mkdir(exist_ok=True)
     said = [IN_BOARD_UNITS]
     for kind, (name, _) in RIG_FILES.items():
-        if len(network.cameras) > 2 and kind.endswith("stereo"):
-            continue
         target, refused = TARGETS[kind], ""
         # as it is, else with the models that the format has, its best one first
         for model in (None, *target.models[:2]):
@@ -241,6 +242,13 @@ def fill_rig(network: Network, folder: Path) -> None:
             said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
             # the mounting itself is in every format
             said += [f"{name}: not kept: {what}" for what in lost if what != Rigs.TABLE]
+            if target.parts is not None and len(network.cameras) > 2:
+                parts = (
+                    part.relative_to(folder).as_posix()
+                    for part in target.parts(network, folder / name)
+                    if part.exists()
+                )
+                said.append(f"{name}: one for each pair of cameras: {', '.join(parts)}")
             break
         else:
             said.append(refused)

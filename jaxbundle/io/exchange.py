@@ -39,7 +39,8 @@ from jaxbundle.network.tables import Camera, Network
 @print_anywhere
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """The written output: kind and path, camera differences, what is not kept, warnings, notes."""
+    """The written output: kind and path, camera differences, what is not kept, warnings, notes;
+    `parts`: the files or folders of a rig that is written in pairs of cameras."""
 
     kind: str
     path: Path
@@ -47,9 +48,10 @@ class Converted:
     lost: tuple[str, ...]
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    parts: tuple[Path, ...] = ()
 
     def __str__(self) -> str:
-        lines = [f"{self.path}: {self.kind}"]
+        lines = [f"{', '.join(map(str, self.parts or (self.path,)))}: {self.kind}"]
         costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
         shown = 8  # the worst, on one screen; `conversions` has all
         lines += [f"camera {id!r} → {cost}" for id, cost in costs[:shown]]
@@ -116,7 +118,7 @@ def convert(  # noqa: PLR0913, as the options of the command
     network = network.replace(cameras=_add_sizes(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind, control)
-    _keep_others(output, kind, force)
+    _keep_others(output, kind, force, network)
     if kind in CAMERA_KINDS:
         costs = None
         if model is not None and measured:
@@ -151,7 +153,15 @@ def _convert_network(
     else:
         with replace_folder(folder, "convert", files, force) as new:
             lost = TARGETS[kind].write(network, new)
-    return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes)
+    parts = tuple(path for path in _parts(network, output, kind) if path.exists())
+    parts = () if parts == (output,) else parts
+    return Converted(kind, output, costs, tuple(lost), network.warnings, network.notes, parts)
+
+
+def _parts(network: Network, output: Path, kind: str) -> tuple[Path, ...]:
+    """The files or folders that are written."""
+    target = TARGETS.get(kind)
+    return (output,) if target is None or target.parts is None else target.parts(network, output)
 
 
 def _choose_kind(output: Path, to: str | None) -> str:
@@ -240,7 +250,7 @@ def _folder(output: Path, kind: str) -> Path | None:
     return output.parent if kind == "project" and output.name == FILE_NAME else output
 
 
-def _keep_others(output: Path, kind: str, force: bool) -> None:
+def _keep_others(output: Path, kind: str, force: bool, network: Network | None = None) -> None:
     """Refuse to replace existing files, and folders not written by `convert`."""
     folder = _folder(output, kind)
     if folder is not None:
@@ -252,7 +262,8 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         "bundler": [output.parent / LIST],
         "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES],
     }
-    there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
+    files = (output,) if network is None else _parts(network, output, kind)
+    there = [path for path in (*files, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(
             f"{list_some([str(path) for path in there], 3, str)}: already there and would be "

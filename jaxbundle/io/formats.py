@@ -59,8 +59,10 @@ from jaxbundle.io.networks.stereo import (
     fill_ros_stereo,
     is_opencv_stereo,
     is_ros_stereo,
+    opencv_stereo_files,
     read_opencv_stereo,
     read_ros_stereo,
+    ros_stereo_folders,
     write_opencv_stereo,
 )
 from jaxbundle.io.networks.transforms import is_transforms, read_transforms, write_transforms
@@ -92,7 +94,8 @@ class Target:
 
     `write` returns messages about what is not kept; no `models`: all, a name with * is a family.
     `files`: names of the files in a folder; none: a file is written. `alone`: cameras
-    without images can be written.
+    without images can be written. `parts`: the files or folders that are written of a network, if
+    there may be several.
     """
 
     recognises: Callable[[Path], bool]
@@ -101,6 +104,7 @@ class Target:
     models: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     alone: bool = False
+    parts: Callable[[Network, Path], tuple[Path, ...]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,6 +285,7 @@ TARGETS: dict[str, Target] = {
         write_opencv_stereo,
         "NAME.yaml, .yml, .json with stereo in its name",
         PIXEL_MODELS,
+        parts=opencv_stereo_files,
     ),
     "ros-stereo": Target(
         _folder_of("camera_info"),
@@ -288,6 +293,7 @@ TARGETS: dict[str, Target] = {
         "a folder with camera_info in its name",
         PIXEL_MODELS,
         ROS_FILES,
+        parts=ros_stereo_folders,
     ),
     "project": Target(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import json
 import re
+from fnmatch import fnmatch
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.calibration.files import files_of, fill_rig
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of, rays_of
 from jaxbundle.errors import InputError
@@ -30,7 +32,9 @@ RADTAN = (("k1", -0.28), ("k2", 0.07), ("p1", 3e-4), ("p2", -2e-4))
 EQUI = (("k1", -0.01), ("k2", 0.02), ("k3", -0.01), ("k4", 0.002))
 K = ({"fx": 460.0, "fy": 458.0, "cx": 367.0, "cy": 248.0},
      {"fx": 471.0, "fy": 472.0, "cx": 380.0, "cy": 255.0})  # fmt: skip
-TURNS = Rotation.from_euler("xyz", [[0, 0, 0], [0.02, -0.08, 0.01], [-0.03, 0.1, 0.2]]).as_matrix()
+TURNS = Rotation.from_euler(
+    "xyz", [[0, 0, 0], [0.02, -0.08, 0.01], [-0.03, 0.1, 0.2], [0.05, 0.3, -0.1]]
+).as_matrix()
 BASES = {"right": [0.11, 0.004, -0.01], "left": [-0.11, 0.02, 0.01], "below": [0.01, -0.2, 0.02]}
 POINTS = np.random.default_rng(1).uniform([-0.6, -0.5, -3], [0.6, 0.5, -1.5], (20, 3))
 """In the frame of the reference, which has y up and looks along −z."""
@@ -44,7 +48,8 @@ def camera(k, fisheye=False):
 
 
 def rig(base="right", fisheye=False, number=2):
-    bases = [np.zeros(3), np.array(BASES[base]), np.array([0.0, 0.1, 0.3])][:number]
+    bases = [[0, 0, 0], BASES[base], [0.0, 0.1, 0.03], [0.3, 0.0, 0.1]]
+    bases = [np.array(base, float) for base in bases[:number]]
     cameras = [camera(k, fisheye) for k in range(number)]
     return network_of_rig(Path("rig"), cameras, TURNS[:number], bases), bases
 
@@ -65,18 +70,20 @@ def truth(k, bases, fisheye=False):
     return seen((POINTS - bases[k]) @ TURNS[k].T * FLIP, M, D, fisheye)
 
 
-def check_back(path, net):
-    """The rig as our reader reads it: cameras, and poses relative to the reference."""
+def check_back(path, net, cameras=None):
+    """The rig, or some of its cameras, as our reader reads it: cameras, and poses relative to the
+    reference."""
+    rows = list(range(len(net.cameras)) if cameras is None else cameras)
     back = read_network(path)
-    assert len(back.cameras) == len(net.cameras)
-    for a, b in zip(back.cameras, net.cameras):
+    assert len(back.cameras) == len(rows)
+    for a, b in zip(back.cameras, (net.cameras[k] for k in rows)):
         found, expected = all_parameters(a), all_parameters(b)
         assert a.model == b.model and a.image_size == b.image_size
         assert found == pytest.approx(expected, abs=1e-12)
     order = back.images.camera.argsort()
-    assert_allclose(back.images.position[order], net.images.position, atol=1e-12)
+    assert_allclose(back.images.position[order], net.images.position[rows], atol=1e-12)
     turn = lambda n, at: Rotation.from_euler("xyz", n.images.angles[at])
-    apart = (turn(back, order) * turn(net, slice(None)).inv()).magnitude()
+    apart = (turn(back, order) * turn(net, rows).inv()).magnitude()
     assert apart.max() < 1e-9
 
 
@@ -209,10 +216,10 @@ def test_ros_pair(tmp_path, base):
 
 
 def test_what_a_pair_is_not(tmp_path):
-    net, _ = rig(number=3)
-    with pytest.raises(InputError, match="holds two cameras, got 3"):
+    net, _ = rig(number=1)
+    with pytest.raises(InputError, match="holds two cameras, got 1"):
         write_opencv_stereo(net, tmp_path / "stereo.yaml")
-    with pytest.raises(InputError, match="holds two cameras, got 3"):
+    with pytest.raises(InputError, match="holds two cameras, got 1"):
         fill_ros_stereo(net, tmp_path / "camera_info")
     net, _ = rig()
     path = convert_network(net, tmp_path / "stereo.yaml")
@@ -227,6 +234,60 @@ def test_what_a_pair_is_not(tmp_path):
     with pytest.raises(InputError, match="got none with"):
         read_network(folder)
     assert not list(tmp_path.glob("*.tmp"))
+
+
+@pytest.mark.parametrize("name", ["stereo.yaml", "camera_info"])
+def test_a_rig_of_four_cameras_leaves_as_pairs(tmp_path, command, name):
+    net, _ = rig(number=4)
+    source, out = tmp_path / "camchain.yaml", tmp_path / "out"
+    convert_network(net, source)
+    out.mkdir()
+    told = command("convert", source, out / name)
+    places = [out / (f"stereo_cam0_cam{k}.yaml" if name == "stereo.yaml"
+                     else f"camera_info/cam0_cam{k}") for k in (1, 2, 3)]  # fmt: skip
+    assert told.status == 0 and all(str(place) in told.out for place in places), told
+    named = net.replace(cameras=tuple(dataclasses.replace(c, id=f"cam{k}")
+                                      for k, c in enumerate(net.cameras)))  # fmt: skip
+    for k, place in enumerate(places, 1):
+        check_back(place, named, (0, k))
+        assert {c.id for c in read_network(place).cameras} == {"cam0", f"cam{k}"}
+    # written again: nothing is replaced unasked
+    places[1].touch()
+    told = command("convert", source, out / name)
+    assert (told.status, name == "stereo.yaml") in ((2, True), (0, False)), told
+    assert command("convert", source, out / name, "--force").status == 0
+
+
+def test_cameras_that_face_each_other_have_no_rectification(tmp_path):
+    """R and T are written for OpenCV; ROS has the mounting in the rectification only."""
+    net, _ = rig(number=3)
+    angles = net.images.angles.copy()
+    angles[2] = angles[0] + (0, np.pi, 0)
+    net = net.replace(images=dataclasses.replace(net.images, angles=angles))
+    lost = write_opencv_stereo(net, tmp_path / "stereo.yaml")
+    assert [line for line in lost if "rectification of 'c0' and 'c2'" in line]
+    assert not [line for line in lost if "'c1'" in line]
+    for k in (1, 2):
+        file = tmp_path / f"stereo_c0_c{k}.yaml"
+        assert "nan" not in file.read_text().lower()
+        check_back(file, net, (0, k))
+    lost = fill_ros_stereo(net, tmp_path / "camera_info")
+    assert [line for line in lost if "pair of 'c0' and 'c2'" in line]
+    assert [p.name for p in (tmp_path / "camera_info").iterdir()] == ["c0_c1"]
+
+
+def test_the_folder_of_a_calibrated_rig_has_its_pairs(tmp_path):
+    net, _ = rig(number=4)
+    fill_rig(net, tmp_path / "rig")
+    for k in (1, 2, 3):
+        check_back(tmp_path / "rig" / f"stereo_c0_c{k}.yaml", net, (0, k))
+        check_back(tmp_path / "rig" / "camera_info" / f"c0_c{k}", net, (0, k))
+    said = (tmp_path / "rig" / "conversions.txt").read_text()
+    assert "stereo_c0_c3.yaml" in said and "camera_info/c0_c3" in said
+    # an output folder may be written again: its files are all known
+    files = [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()]
+    known = files_of([f"c{k}" for k in range(4)])
+    assert not [file for file in files if not any(fnmatch(file, name) for name in known)]
 
 
 RIG = {"reference": "c0", "mountings": {}, "cameras": {}}

@@ -1,12 +1,14 @@
-"""Two cameras on one mounting, in the forms of OpenCV and of ROS.
+"""Two cameras on one mounting, in the forms of OpenCV and of ROS. A rig of more cameras is written
+as pairs, each camera with the first.
 
     X₂ = R·X₁ + T        frames with x right, y down, z forward; a first pixel with its centre at 0
 
 **OpenCV** (`stereoCalibrate`, and its sample `stereo_calib`): one YAML or JSON file with M1, D1,
-M2, D2, R, T, and of the rectification R1, R2, P1, P2, Q.
+M2, D2, R, T, and of the rectification R1, R2, P1, P2, Q; of more cameras NAME_FIRST_CAMERA.yaml.
 
-**ROS**: one `camera_info` file a camera. Its rectification_matrix Rₖ turns the camera into a frame
-common to both, and projection_matrix Pₖ projects from the frame of the first,
+**ROS**: one `camera_info` file a camera, in a folder FIRST_CAMERA a pair if there are more cameras.
+Its rectification_matrix Rₖ turns the camera into a frame common to both, and projection_matrix Pₖ
+projects from the frame of the first,
 
     Xₖ' = Rₖ·Xₖ,    X₂' = X₁' + [P₁₄/P₁₁, P₂₄/P₂₂, 0]ᵀ of P₂,
 
@@ -43,12 +45,12 @@ from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.kalibr import mountings_of
 from jaxbundle.io.networks.losses import describe_losses, size_of
 from jaxbundle.io.networks.poses import check_rotations
-from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.csv_tables import write_texts
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.system.file_content import beginning
 
-ROS_FILES = ("*.yaml",)
+ROS_FILES = ("*.yaml", "*/*.yaml")
 FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
 NAMES = (
     ("M1", "D1", "M2", "D2"),
@@ -82,24 +84,44 @@ class Rectification(NamedTuple):
         )
 
 
+class Pair(NamedTuple):
+    """Two cameras with X₂ = R·X₁ + T; `name` of its file, empty if there is no other pair."""
+
+    cameras: tuple[Camera, Camera]
+    R: Float[np.ndarray, "3 3"]
+    T: Float[np.ndarray, "3"]
+    name: str
+
+    def __str__(self) -> str:
+        return " and ".join(repr(camera.id) for camera in self.cameras)
+
+
 def rectify(
     cameras: Sequence[Camera], R: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "3"]
 ) -> Rectification:
     """The rectification of two cameras.
 
-    **Raises:** `InputError` for cameras at one position."""
+    **Raises:** `InputError` for cameras at one position, or without a common image plane."""
     length = float(np.linalg.norm(T))
     if length == 0:
         raise InputError("both cameras are at one position; expected a base between them")
     base = -R.T @ T / length  # from the first to the second, in the first's frame
     k = int(np.abs(base[:2]).argmax())  # the axis along the base, pointing as the camera's own
     first = base * np.sign(base[k])
-    z = np.array([0, 0, 1.0]) + R[2]  # both optical axes, in the first's frame
+    axes = np.array([[0, 0, 1.0], R[2]])  # both optical axes, in the first's frame
+    z = axes.sum(0)
     z = z - (z @ first) * first
+    # Each optical axis needs an image in the common plane, so that it is less than 90° from z.
+    # 1e-6, of unit vectors: rounding of a base along an axis, and of opposite axes.
+    if not first.any() or (axes @ z <= 1e-6).any():
+        raise InputError(
+            "one camera looks along the base or away from the other; they have no common "
+            "rectified image"
+        )
     z = z / np.linalg.norm(z)
     # right-handed: x × y = z, whichever of both lies along the base
-    axes = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
-    R1 = np.stack([*axes, z])
+    rows = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
+    R1 = np.stack([*rows, z])
     R2 = R1 @ R.T
     p = [all_parameters(camera) for camera in cameras]
     f = np.mean([values[name] for values in p for name in ("fx", "fy")])
@@ -111,12 +133,27 @@ def rectify(
     return Rectification(R1, R2, P1, P2)
 
 
-def _pair(
-    network: Network, what: str
-) -> tuple[Sequence[Camera], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], list[str]]:
-    """Both cameras, R, T, and what is lost."""
-    if len(network.cameras) != 2:
-        raise InputError(f"{what} holds two cameras, got {len(network.cameras)}")
+def _file_names(cameras: Sequence[Camera]) -> list[str]:
+    """A name of each camera for a file.
+
+    **Raises:** `InputError` if two are equal."""
+    names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
+    # some systems do not distinguish capital letters
+    folded = [name.casefold() for name in names]
+    for k, name in enumerate(folded):
+        if name in folded[:k]:
+            both = f"{cameras[folded.index(name)].id!r} and {cameras[k].id!r}"
+            raise InputError(f"the names of the cameras {both} give the same file {names[k]}.yaml")
+    return names
+
+
+def _pairs(network: Network, what: str) -> tuple[list[Pair], list[str]]:
+    """Every camera with the first, and what is lost.
+
+    **Raises:** `InputError` for a single camera, and for cameras without mountings."""
+    cameras = network.cameras
+    if len(cameras) < 2:
+        raise InputError(f"{what} holds two cameras, got {len(cameras)}")
     mountings, lost = mountings_of(network)
     if mountings is None:
         raise InputError(
@@ -124,35 +161,62 @@ def _pair(
         )
     lost += [what for what in describe_losses(network, rays=True) if what != Rigs.TABLE]
     lost += ["points"] if len(network.points) else []
-    return network.cameras, mountings[0, :3, :3], mountings[0, :3, 3], lost
+    names, T, pairs = _file_names(cameras), np.eye(4), []
+    for camera, name, step in zip(cameras[1:], names[1:], mountings):
+        T = step @ T  # from the first camera to this one
+        own = f"{names[0]}_{name}" if len(cameras) > 2 else ""
+        pairs.append(Pair((cameras[0], camera), T[:3, :3], T[:3, 3], own))
+    return pairs, lost
+
+
+def opencv_stereo_files(network: Network, path: Path) -> tuple[Path, ...]:
+    """The file of each pair of a rig; of two cameras the path itself."""
+    pairs, _ = _pairs(network, "a stereo file of OpenCV")
+    return tuple(_file_of(pair, path) for pair in pairs)
+
+
+def _file_of(pair: Pair, path: Path) -> Path:
+    return path.with_name(f"{path.stem}_{pair.name}{path.suffix}") if pair.name else path
 
 
 def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
-    """Write two cameras and their mounting as OpenCV's stereo calibration.
+    """Write two cameras and their mounting as OpenCV's stereo calibration; of a rig of more cameras
+    one file a pair, NAME_FIRST_CAMERA.
 
     **Returns:** messages about what the format cannot hold.
 
-    **Raises:** `InputError` for a network of other than two cameras, or without a mounting.
+    **Raises:** `InputError` for a network of one camera, or without a mounting.
     """
     path = Path(path)
-    cameras, R, T, lost = _pair(network, "a stereo file of OpenCV")
-    kinds = {str(camera.model) for camera in cameras}
+    pairs, lost = _pairs(network, "a stereo file of OpenCV")
+    texts = []
+    for pair in pairs:
+        entries = _stereo_entries(pair)
+        try:
+            rectified = rectify(*pair[:3])
+        except InputError as error:
+            lost.append(f"rectification of {pair}: {error}")
+        else:
+            entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
+            entries |= {"Q": (4, 4, rectified.Q.ravel())}
+        texts.append(file_text(entries, path.suffix.lower() == ".json"))
+    write_texts([_file_of(pair, path) for pair in pairs], texts)
+    return tuple(lost)
+
+
+def _stereo_entries(pair: Pair) -> dict[str, Any]:
+    kinds = {str(camera.model) for camera in pair.cameras}
     if len(kinds) > 1:
         raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")
     entries: dict[str, Any] = {}
-    for k, camera in enumerate(cameras, 1):
+    for k, camera in enumerate(pair.cameras, 1):
         own = opencv_entries(camera)
         names = NAMES[0][2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
         entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
-    rectified = rectify(cameras, R, T)
-    entries |= {"R": (3, 3, R.ravel()), "T": (3, 1, T)}
-    entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
-    entries |= {"Q": (4, 4, rectified.Q.ravel())}
-    write_text(path, file_text(entries, path.suffix.lower() == ".json"))
-    return tuple(lost)
+    return entries | {"R": (3, 3, pair.R.ravel()), "T": (3, 1, pair.T)}
 
 
 def is_opencv_stereo(path: Path) -> bool:
@@ -188,23 +252,35 @@ def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Netwo
     return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), T], overrides)
 
 
-def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
-    """Write two cameras as ROS's camera_info, NAME.yaml each, rectified with each other.
+def ros_stereo_folders(network: Network, folder: Path) -> tuple[Path, ...]:
+    """The folder of each pair of a rig; of two cameras the folder itself."""
+    pairs, _ = _pairs(network, "a pair of ROS")
+    return tuple(folder / pair.name for pair in pairs)
 
-    **Returns, raises:** as `write_opencv_stereo`.
+
+def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
+    """Write two cameras as ROS's camera_info, NAME.yaml each, rectified with each other; of a rig
+    of more cameras a folder FIRST_CAMERA a pair.
+
+    **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
-    cameras, R, T, lost = _pair(network, "a pair of ROS")
-    rectified = rectify(cameras, R, T)
-    parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
-    texts = [ros_text(camera, *part) for camera, part in zip(cameras, parts)]
-    names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
-    # some systems do not tell the letters of a name from capitals
-    if len({name.casefold() for name in names}) < 2:
-        raise InputError(f"{folder}: the names of the cameras give the same file {names[0]}.yaml")
-    folder.mkdir(exist_ok=True)
-    for name, text in zip(names, texts):
-        write_text(folder / f"{name}.yaml", text)
-    return tuple(lost)
+    pairs, lost = _pairs(network, "a pair of ROS")
+    texts, refused = {}, []
+    for pair in pairs:
+        try:
+            rectified = rectify(*pair[:3])
+        except InputError as error:
+            refused.append(f"pair of {pair}: {error}")
+            continue
+        parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
+        for camera, name, part in zip(pair.cameras, _file_names(pair.cameras), parts):
+            texts[folder / pair.name / f"{name}.yaml"] = ros_text(camera, *part)
+    if not texts:
+        raise InputError("; ".join(refused))
+    for file in texts:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_texts([*texts], [*texts.values()])
+    return (*lost, *refused)
 
 
 def is_ros_stereo(path: Path) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.writing.replacing import replace_file, unwritable
+from jaxbundle.io.writing.replacing import replace_file, replace_files, unwritable
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import DESCRIPTORS, parse_toml, read_content
@@ -114,6 +114,15 @@ def write_text(path: Path, text: str | Iterable[str]) -> None:
     """Write a text, or its pieces, in UTF-8, whole or not at all (`write_bytes`)."""
     pieces = (text,) if isinstance(text, str) else text
     write_bytes(path, (in_utf8(piece).encode() for piece in pieces))
+
+
+def write_texts(paths: Sequence[Path], texts: Sequence[str]) -> None:
+    """Write some texts as `write_text`; none of the files is replaced before all are complete."""
+    if len(paths) == 1:
+        return write_text(paths[0], texts[0])  # may be a device
+    with replace_files(*paths) as temporaries:
+        for temporary, text in zip(temporaries, texts):
+            temporary.write_bytes(in_utf8(text).encode())
 
 
 def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
