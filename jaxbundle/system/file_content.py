@@ -86,6 +86,8 @@ def read_content(path: str | Path, text: bool = True) -> bytes:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
+        if os.path.isdir(path):  # Windows calls it a denied permission
+            raise InputError(f"{path}: is a folder; expected a file") from None
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValueError as error:
         if isinstance(error, InputError):

@@ -120,7 +120,7 @@ def test_a_pipe_given_open_is_read():
 @pytest.mark.parametrize("name, said", [
     ("none", "no such file"), ("file/below", "no such file"), ("a\0b", "no such file"),
     ("x" * 300, "cannot be read: File name too long"), ("loop", "cannot be read: Too many levels"),
-    (".", "cannot be read: Is a directory"),
+    (".", "is a folder; expected a file"),
 ])  # fmt: skip
 def test_errors_of_the_system_are_a_line(name, said, tmp_path):
     (tmp_path / "file").write_text("")

@@ -93,6 +93,33 @@ def test_what_is_wrong_in_a_file(tmp_path, case):
         assert word in str(refused.value), refused.value
 
 
+KINDS = "Community Sensor Model (.json)", "DIMAP", "DigitalGlobe (.xml, .imd)"
+
+
+@pytest.mark.parametrize("source", ["", "none.xml", "image.tif", "other.toml", "folder.xml", None])
+def test_a_wrong_source_is_said_with_the_kinds_there_are(tmp_path, command, source):
+    """By file and key: which kinds of product a scanner file may refer to."""
+    (tmp_path / "folder.xml").mkdir()
+    for name in ("image.tif", "other.toml"):
+        (tmp_path / name).touch()
+    path, key = tmp_path / "scanner.toml", f'source = "{source}"' if source is not None else ""
+    path.write_text(f"[scanner]\n{key}\n")
+    told = command("pushbroom", "locate", path)
+    where = f"{path}, [scanner]: source = " if key else f"{path}: the section [times] is missing"
+    assert told.status == 2 and told.err.startswith(f"jaxbundle: {where}"), told
+    assert all(kind in told.err for kind in (*KINDS, "source")), told
+
+
+@pytest.mark.parametrize("name", ["image.tif", "folder.json", "object.json"])
+def test_what_is_no_scanner_image(tmp_path, command, name):
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "image.tif").touch()
+    (tmp_path / "object.json").write_text('{"a": 1}')
+    told = command("pushbroom", "locate", tmp_path / name)
+    assert told.status == 2 and told.err.startswith(f"jaxbundle: {tmp_path / name}"), told
+    assert "expected" in told.err, told
+
+
 @pytest.mark.parametrize("column, value, words", [
     (0, "-0.9", ["attitude.csv, line 4", "twice"]), (0, "-5", ["line 4", "sort"]),
     (1, "0.5", ["line 4", "length"]), (1, "x", ["line 4", "q0"]),

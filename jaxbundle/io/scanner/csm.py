@@ -86,6 +86,11 @@ def _read_support_data(path: Path) -> tuple[JsonFields, int]:
     if name or is_state(isd.document):
         document, order = support_data_of(isd)
         return JsonFields(path, document), order
+    if not {"image_lines", "line_scan_rate"} & isd.document.keys():
+        raise InputError(
+            f"{path}: JSON of another kind, without image_lines and line_scan_rate; expected an "
+            "ISD or a model state of a line scanner"
+        )
     model = isd.get("name_model", MODEL)
     if model != MODEL:
         raise InputError(f"{path}: name_model is {show(model)}; {MODEL} is expected")

@@ -14,9 +14,14 @@ from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner
 from jaxbundle.io.scanner.worldview import read_worldview
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
+from jaxbundle.network.columns import show
 
 PRODUCTS = (".json", ".dim", ".xml", ".imd")
 """Suffixes of products."""
+EXPECTED_PRODUCTS = (
+    "a file of the Community Sensor Model (.json), DIMAP of SPOT 5, Pléiades, SPOT 6 or 7 "
+    "(.xml, .dim), or support data of DigitalGlobe (.xml, .imd)"
+)
 WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 
 
@@ -30,10 +35,15 @@ def read_scanner(path: str | Path) -> ScannerInput:
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
         return check_against_rpc(_read_product(path), path)
+    if path.suffix.lower() != ".toml" and path.exists():
+        raise InputError(f"{path}: expected a scanner file (.toml), {EXPECTED_PRODUCTS}")
     # a file with a source needs no other section
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
-    return _read_source(file, scanner) if "source" in scanner else scanner_of(file)
+    if "source" in scanner:
+        return _read_source(file, scanner)
+    file.require(REQUIRED_FIELDS, f", or source in [scanner], the name of {EXPECTED_PRODUCTS}")
+    return scanner_of(file)
 
 
 def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
@@ -46,7 +56,12 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
                 "[corrections] can stand beside it"
             )
     choice = scanner.text("interpolation") if "interpolation" in scanner else None
-    source = file.path.parent / scanner.text("source")
+    source = scanner.path("source", EXPECTED_PRODUCTS)
+    if source.suffix.lower() not in PRODUCTS:
+        raise InputError(
+            f"{scanner.where}source = {show(str(scanner.values['source']))}: expected "
+            f"{EXPECTED_PRODUCTS}"
+        )
     product = _read_product(source, choice)
     switches = file.section("corrections")
     switched = {name: switches.switch(name) for name in switches.values}
@@ -60,8 +75,6 @@ def _read_source(file: TomlFile, scanner: TomlSection) -> ScannerInput:
 def _read_product(path: Path, interpolation: str | None = None) -> ScannerInput:
     """The image of a product; `interpolation` applies to CSM files only."""
     suffix = path.suffix.lower()
-    if suffix not in PRODUCTS:
-        raise InputError(f"{path}: the suffix of a scanner file is .toml or {', '.join(PRODUCTS)}")
     if suffix == ".json":
         return read_csm(path) if interpolation is None else read_csm(path, interpolation)
     if interpolation is not None:

@@ -48,7 +48,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, show
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations
@@ -104,8 +103,8 @@ def read_refinement(path: str | Path) -> RefineFile:
     images, warnings = _read_images(file, radians)
     frames = None
     if "frames" in section:
-        frames = read_network(path.parent / section.text("frames"))
-    points = _points(read_csv(path.parent / section.text("points")), images[0].earth, radians)
+        frames = read_network(section.path("frames", "a project of photographs", folder=True))
+    points = _points(section.table("points"), images[0].earth, radians)
     # checked first: the ids of observations are looked up in it
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
@@ -114,7 +113,7 @@ def read_refinement(path: str | Path) -> RefineFile:
         more = (id for id in frames.points.id if id not in ids)
         ids |= {id: k for k, id in enumerate(more, len(ids))}
     observations = _observations(
-        read_csv(path.parent / section.text("observations")),
+        section.table("observations"),
         ids,
         [image.id for image in images],
         section,
@@ -147,7 +146,7 @@ def _read_images(file: TomlFile, radians: float) -> tuple[list[ScannerImage], li
             )
     images, warnings = [], []
     for id in scanners.values:
-        scanner = read_scanner(path.parent / scanners.text(id))
+        scanner = read_scanner(scanners.path(id, "a scanner file, or the file of a product"))
         warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
         freedom = _read_freedom(TomlSection(file, where, common | own.get(id, {})), radians)

@@ -111,7 +111,6 @@ def scanner_of(file: TomlFile) -> ScannerInput:
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
-    file.require(REQUIRED_FIELDS)
     scanner = file.section("scanner")
     lines, pixels = (scanner.integer(key) for key in ("lines", "pixels"))
     check_size(lines, pixels, scanner.where.removesuffix(": "))

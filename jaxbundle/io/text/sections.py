@@ -38,11 +38,12 @@ class TomlFile:
         """A section, empty if it is missing."""
         return TomlSection(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
 
-    def require(self, names: Sequence[str]) -> None:
-        """Refuse a file that lacks one of these sections."""
+    def require(self, names: Sequence[str], otherwise: str = "") -> None:
+        """Refuse a file that lacks one of these sections; `otherwise`: what may be there instead,
+        for the message."""
         for name in names:
             if name not in self.document:
-                raise InputError(f"{self.path}: the section [{name}] is missing")
+                raise InputError(f"{self.path}: the section [{name}] is missing{otherwise}")
 
     @property
     def radians(self) -> float:
@@ -128,15 +129,24 @@ class TomlSection:
             raise InputError(f"{self.where}{key} is {show(values)}; {expected} is expected")
         return np.array(values, float)
 
-    def table(self) -> Columns:
-        """The CSV table of a name, beside the file."""
-        name = self.text("table")
+    def path(self, key: str, expected: str, folder: bool = False) -> Path:
+        """The file that a key names, beside the file of the section; also a folder, if it may be
+        one."""
+        name = self.text(key)
         if self.file is None:
-            raise InputError(f"{self.where}table = {name!r}: not in a file")
+            raise InputError(f"{self.where}{key} = {show(name)}: not in a file")
         path = self.file.path.parent / name
-        if not os.path.isfile(path):
-            raise InputError(f"{self.where}table = {name!r}: no such file {path}")
-        return read_csv(path)
+        if not name or not os.path.exists(path):
+            got = f"no such file {path}" if name else "the name of a file is missing"
+        elif not folder and os.path.isdir(path):
+            got = f"{path} is a folder"
+        else:
+            return path
+        raise InputError(f"{self.where}{key} = {show(name)}: {got}; expected {expected}")
+
+    def table(self, key: str = "table") -> Columns:
+        """The CSV table of a name, beside the file."""
+        return read_csv(self.path(key, "a CSV table"))
 
 
 def toml_text(document: Mapping[str, Mapping[str, Any]]) -> str:
