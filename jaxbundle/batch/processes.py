@@ -28,6 +28,7 @@ from jaxbundle.batch.run import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.writing.locks import hold_lock
+from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.leastsquares.sharding import use_own_devices
 
 
@@ -88,7 +89,7 @@ def _clear(file: str | Path, waiting: str) -> None:
     try:
         os.mkdir(waiting)
     except OSError as error:
-        raise InputError(f"{waiting}: cannot be made: {error.strerror}") from None
+        raise unwritable(waiting, error) from None
 
 
 def _tell(waiting: str, name: str, words: str = "") -> None:

@@ -1,10 +1,12 @@
 """The typer application, its options, and exit statuses."""
 
+import errno
 import os
 import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -212,7 +214,9 @@ def run(prepare: Callable[[], object] | None = None) -> None:
         leave(NO_READER)
     except typer.Abort as error:  # typer's word for EOFError
         _end(f"unexpected end of file: {error.__cause__}", BAD_INPUT)
-    except (OSError, OverflowError, RecursionError) as error:
+    except OSError as error:
+        _end(_describe_system_error(error), BAD_INPUT)
+    except (OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except UnicodeEncodeError as error:
         # a name of a file, in a locale without its letters
@@ -236,6 +240,20 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     sys.exit(status)
 
 
+def _describe_system_error(error: OSError) -> str:
+    """What the system refused, with the file."""
+    why = error.strerror or " ".join(str(error).split())
+    if error.filename is not None:
+        return f"{error.filename}: {why}"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        # Files are named where they are written, streams are not: does this one take a byte?
+        try:
+            os.write(sys.stdout.fileno(), b"\n")
+        except OSError:
+            return f"standard output: cannot be written: {why}"
+    return why
+
+
 def _describe_shortage(error: BaseException) -> str:
     said = " ".join(str(error).split()).partition(" in function")[0]
     if "not enough memory" in said:
@@ -251,5 +269,6 @@ def _describe_shortage(error: BaseException) -> str:
 
 
 def _end(message: object, status: int) -> NoReturn:
-    print(f"jaxbundle: {message}", file=sys.stderr, flush=True)
+    with suppress(OSError):  # of a full disk, or a closed terminal: the status still says it
+        print(f"jaxbundle: {message}", file=sys.stderr, flush=True)
     leave(status)

@@ -18,7 +18,6 @@ from jaxtyping import Float, Int, UInt8
 from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes, write_text
-from jaxbundle.io.writing.replacing import replace_file
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.files import read_cloud_csv, write_cloud_csv
 
@@ -211,8 +210,10 @@ def _write_las(cloud: Cloud, path: Path) -> None:
     for k, name in enumerate(SIGMAS):
         las[name] = cloud.sigma[:, k].astype(np.float32)
     las["rays"] = np.minimum(cloud.rays, 255).astype(np.uint8)
-    with replace_file(path) as temporary, open(temporary, "wb") as file:
-        las.write(file, do_compress=path.suffix.lower() == ".laz")
+    # in memory, a fraction of the cloud: lazrs hides why the system refuses to write
+    file = io.BytesIO()
+    las.write(file, do_compress=path.suffix.lower() == ".laz")
+    write_bytes(path, file.getvalue())
 
 
 def _read_las(path: Path) -> Cloud:

@@ -5,6 +5,7 @@ Their files are those of `examples/` in the repository: the wheel has copies of 
 """
 
 import os
+import re
 import shutil
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
@@ -57,7 +58,14 @@ def write_example(name: str, folder: str | Path) -> None:
             shutil.copytree(source, new)
             os.replace(new, target)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+        raise InputError(f"{folder}: cannot be written: {_why(error)}") from None
+
+
+def _why(error: OSError) -> str:
+    """The reason of the system; `copytree` lists one for each file: source, copy, reason."""
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
+        return re.sub(r"^\[Errno \d+\] |: '.*", "", str(error.args[0][0][-1]))
+    return error.strerror or str(error)
 
 
 def _source(name: str) -> Traversable:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
+from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.matching import MatchingSettings
@@ -31,7 +32,10 @@ class Store:
         self.folder, self.settings = folder, "\n".join(map(repr, settings))
         self.used: set[str] = set()
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable(folder, error) from None
 
     def name(self, *fingerprints: str) -> str:
         """The name of a file about these photographs."""
@@ -106,7 +110,11 @@ class Store:
         if self.folder is None:
             return
         # renamed when it is complete, which is atomic; by process, as two may run in one folder
+        path = self.folder / f"{name}.npz"
         with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
-            with part.open("wb") as file:
-                np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-            part.replace(self.folder / f"{name}.npz")
+            try:
+                with part.open("wb") as file:
+                    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+                part.replace(path)
+            except OSError as error:
+                raise unwritable(path, error) from None

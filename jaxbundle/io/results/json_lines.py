@@ -7,13 +7,14 @@ resumes: it knows the existing keys, and the inputs of their lines.
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import defer_interrupts
 
 HEAD = ("status", "settings", "data")
@@ -97,16 +98,20 @@ class JsonLines:
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
 
     def _write(self, write: Callable[[BinaryIO], object]) -> None:
+        # A pipe may be slow: nothing waits for it.
+        whole = defer_interrupts() if self._regular else nullcontext()
+        before = self._file.stat().st_size if self._regular and self._file.exists() else 0
         try:
-            # A pipe may be slow: nothing waits for it.
-            whole = defer_interrupts() if self._regular else nullcontext()
             with whole, self._file.open("ab") as file:
                 write(file)
                 file.flush()
                 if self._regular:
                     os.fsync(file.fileno())
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
+            if self._regular:
+                with suppress(OSError):  # of a full disk: no part of a line stays
+                    os.truncate(self._file, before)
+            raise unwritable(self.path, error) from None
 
     def _head(self, row: dict[str, Any]) -> dict[str, Any]:
         """The fields kept in memory; equal settings share one object, since all lines have some."""
