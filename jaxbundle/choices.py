@@ -56,6 +56,12 @@ DESIGNED = ("position", "direction", "roll", "targets")
 
 BOARDS = ("chessboard", "circles", "asymmetric-circles", "charuco", "aprilgrid")
 CODED_TARGETS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
+DICTIONARIES = (
+    *(f"DICT_{n}X{n}_{words}" for n in (4, 5, 6, 7) for words in (50, 100, 250, 1000)),
+    "DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12",
+    *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
+)  # fmt: skip
+"""OpenCV's dictionaries of square markers."""
 FEATURES = ("sift", "akaze", "orb")
 MATCHED_PAIRS = ("auto", "all", "sequence", "place", "alike")
 """Selections of photograph pairs for matching."""

@@ -164,8 +164,9 @@ def choice(
         matching = value and any(re.fullmatch(form, value) for form in forms.values())
         if value is None or matching or (value in words and value not in forms):
             return value
-        close = get_close_matches(value.casefold(), words, 1)
-        mean = f"; did you mean {close[0]!r}?" if close else ""
+        folded = {word.casefold(): word for word in words}
+        close = get_close_matches(value.casefold(), folded, 1)
+        mean = f"; did you mean {folded[close[0]]!r}?" if close else ""
         raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
 
     told = (f"{about}: {listed}" if about else listed) if listing else about

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle.choices import BOARDS
+from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.interrupts import advise
@@ -39,7 +39,7 @@ def batch(  # noqa: PLR0913 - the options of the command
     ] = None,
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
     marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
-    dictionary: Annotated[str, typer.Option(help="of markers or tags")] = "DICT_4X4_50",
+    dictionary: Annotated[str, choice(DICTIONARIES, "of markers or tags")] = "DICT_4X4_50",
     rig: Annotated[
         bool,
         typer.Option("--rig", help="folders of rigs: in each a folder of photographs a camera"),

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
+from jaxbundle.choices import BOARDS, DICTIONARIES, ESTIMATORS, TESTS
 from jaxbundle.cli.app import Force, Html, Quiet, app, choice, model_choice
 from jaxbundle.cli.habits import is_in_file
 from jaxbundle.errors import InputError, NotSolvedError
@@ -47,7 +47,7 @@ def calibrate(  # noqa: PLR0913 - the options of the command
         float | None, typer.Option(help="of the circles, to correct their eccentricity")
     ] = None,
     marker: Annotated[float | None, typer.Option(help="side of a marker or tag")] = None,
-    dictionary: Annotated[str, typer.Option(help="of markers or tags")] = "DICT_4X4_50",
+    dictionary: Annotated[str, choice(DICTIONARIES, "of markers or tags")] = "DICT_4X4_50",
     board_sigma: Annotated[
         float | None, typer.Option(help="σ of a board coordinate, for an inexact board")
     ] = None,

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.arguments import integer, number, show
-from jaxbundle.choices import BOARDS
+from jaxbundle.choices import BOARDS, DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
@@ -88,6 +88,7 @@ class Board:
             object.__setattr__(self, "marker", self.marker_side)
             if self.dictionary == ARUCO:
                 object.__setattr__(self, "dictionary", APRILTAGS)
+        object.__setattr__(self, "dictionary", find_dictionary(self.dictionary))
         if self.marker is not None and self.marker >= self.square:
             raise InputError(
                 f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
@@ -137,6 +138,18 @@ class Board:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.columns}x{self.rows}, square {self.square:g}"
+
+
+def find_dictionary(name: str) -> str:
+    """The dictionary of markers of this name, in capitals or not.
+
+    **Raises:** `InputError` with all names, before any photograph is read."""
+    known = {one.casefold(): one for one in DICTIONARIES}
+    if not isinstance(name, str) or name.casefold() not in known:
+        raise InputError(
+            f"there is no dictionary {show(name)} of markers; known: {', '.join(DICTIONARIES)}"
+        )
+    return known[name.casefold()]
 
 
 def require_board(board: Board) -> Board:

@@ -23,9 +23,10 @@ from jaxtyping import Float, UInt8
 from jaxbundle.choices import CODED_TARGETS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import APRILTAGS, ARUCO, Board, find_dictionary
 from jaxbundle.measure.corners import find_board_points, memory_of_search
 from jaxbundle.measure.marker_corners import fit_marker_corners
+from jaxbundle.measure.tag_grids import get_dictionary
 from jaxbundle.measure.targets import Target, centre_by_ellipse
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.photographs.opencv import need_opencv
@@ -93,10 +94,8 @@ def find_coded_targets(grey: Grey, kind: str, rings: RingSettings | None = None)
         return _without_repeated(_rings(grey, bits, rings) or _rings(255 - grey, bits, rings))
     if name == "charuco":
         return _without_repeated(_charuco(grey, option))
-    if name == "aruco":
-        return _markers(grey, option or "DICT_4X4_50", 1)
     border = 2 if name == "aprilgrid" else 1
-    return _markers(grey, f"DICT_APRILTAG_{(option or '36h11').upper()}", border)
+    return _markers(grey, _dictionary_of(name, option), border)
 
 
 def memory_of_targets(rows: int, columns: int, kind: str) -> float:
@@ -108,14 +107,27 @@ def memory_of_targets(rows: int, columns: int, kind: str) -> float:
 
 
 def check_kind(kind: str) -> None:
-    """Refuse unknown kinds.
+    """Refuse unknown kinds and options.
 
     **Raises:** `InputError`."""
-    name = kind.partition(":")[0]
+    name, _, option = kind.partition(":")
     if name not in CODED_TARGETS:
         raise InputError(
             f"coded targets {kind!r}: {', '.join(CODED_TARGETS)}{did_you_mean(name, CODED_TARGETS)}"
         )
+    if name.startswith("ring") and option:
+        raise InputError(f"coded targets {kind!r}: {name} has no options")
+    if name == "charuco":
+        _charuco_board(option)
+    elif not name.startswith("ring"):
+        _dictionary_of(name, option)
+
+
+def _dictionary_of(name: str, option: str) -> str:
+    """The dictionary of a kind of markers, `option` of its name."""
+    if name == "aruco":
+        return find_dictionary(option or ARUCO)
+    return find_dictionary(f"DICT_APRILTAG_{option}" if option else APRILTAGS)
 
 
 def _without_repeated(found: Sequence[MeasuredPoint]) -> NamedPoints:
@@ -131,10 +143,7 @@ def _without_repeated(found: Sequence[MeasuredPoint]) -> NamedPoints:
 
 def _markers(grey: Grey, dictionary: str, border: int) -> NamedPoints:
     cv2 = need_opencv()
-    known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
-    if dictionary.upper() not in known:
-        raise InputError(f"dictionary {dictionary!r}{did_you_mean(dictionary, known)}")
-    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, known[dictionary.upper()]))
+    words = get_dictionary(dictionary)
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
     for parameters.detectInvertedMarker in (False, True):
@@ -159,13 +168,17 @@ def _markers(grey: Grey, dictionary: str, border: int) -> NamedPoints:
     )
 
 
-def _charuco(grey: Grey, option: str) -> list[MeasuredPoint]:
+def _charuco_board(option: str) -> Board:
     try:
         columns, rows = (int(n) for n in option.lower().split(":")[0].split("x"))
     except ValueError:
         raise InputError(f"charuco:{option}: COLUMNSxROWS is expected, such as 8x6") from None
-    dictionary = option.split(":")[1] if ":" in option else "DICT_4X4_50"
-    board = Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
+    dictionary = option.split(":")[1] if ":" in option else ARUCO
+    return Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
+
+
+def _charuco(grey: Grey, option: str) -> list[MeasuredPoint]:
+    board = _charuco_board(option)
     try:
         points = find_board_points(grey, board)
     except InputError:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxbundle.choices import DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.measure.board_points import BoardPoints, make_points
 from jaxbundle.measure.boards import SMALLEST_SIDE, Board
@@ -117,8 +118,8 @@ def _with_other_markers(grey: Grey, board: Board) -> Board | None:
     """The board with the dictionary of most markers in the photograph; of several with
     the same markers the smallest."""
     aruco = need_opencv().aruco
-    names = sorted(name for name in dir(aruco) if name.startswith("DICT_"))
-    known = {name: aruco.getPredefinedDictionary(getattr(aruco, name)) for name in names}
+    names = sorted(name for name in DICTIONARIES if hasattr(aruco, name))
+    known = {name: get_dictionary(name) for name in names}
     markers = board.columns * board.rows // 2
     best, most = None, 3  # up to three markers may be false readings of another dictionary
     for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.board_points import BoardPoints, make_points
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import Board, find_dictionary
 from jaxbundle.measure.saddles import fit_saddles
 
 Grey = UInt8[np.ndarray, "rows columns"]
@@ -28,12 +28,12 @@ MIN_TAGS = 4
 def get_dictionary(name: str) -> Any:
     """OpenCV's dictionary of this name.
 
-    **Raises:** `InputError` for an unknown one."""
+    **Raises:** `InputError` for an unknown one, or one that the installed OpenCV lacks."""
     import cv2
 
-    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    if name not in names:
-        raise InputError(f"there is no dictionary {name!r} of markers; known: {', '.join(names)}")
+    name = find_dictionary(name)
+    if not hasattr(cv2.aruco, name):
+        raise InputError(f"OpenCV {cv2.__version__} has no dictionary {name}; install a newer one")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import render
 
+from jaxbundle.choices import DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.measure import Board, find_board, measure_boards, read_photograph
+from jaxbundle.measure.coded_targets import check_kind
 from jaxbundle.measure.corners import other_sizes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
@@ -116,6 +118,36 @@ def test_impossible_boards(given, said):
         Board(*given)
 
 
+def test_dictionaries_are_those_of_opencv():
+    there = {name.casefold() for name in dir(cv2.aruco) if name.startswith("DICT_")}
+    assert {name.casefold() for name in DICTIONARIES} == there
+
+
+@pytest.mark.parametrize("make", [
+    lambda name: Board(9, 6, 0.03, "charuco", dictionary=f"DICT_{name}"),
+    lambda name: check_kind(f"aruco:DICT_{name}"), lambda name: check_kind(f"apriltag:{name}"),
+    lambda name: check_kind(f"charuco:8x6:DICT_{name}"),
+])  # fmt: skip
+def test_an_unknown_dictionary_is_refused_before_any_photograph(make):
+    with pytest.raises(InputError, match="no dictionary 'DICT_.*DICT_4X4_50, .*_APRILTAG_36h11"):
+        make("9X9")
+    with pytest.raises(InputError, match="charuco:8: COLUMNSxROWS is expected"):
+        check_kind("charuco:8")
+    with pytest.raises(InputError, match="ring12 has no options"):
+        check_kind("ring12:8")
+    assert Board(9, 6, 0.03, "charuco", dictionary="dict_4x4_100").dictionary == "DICT_4X4_100"
+
+
+@pytest.mark.parametrize("run", [
+    ("calibrate", "photos", "--kind", "charuco"),
+    ("batch", "photos", "--json-lines", "lines.jsonl"),
+])  # fmt: skip
+def test_the_commands_list_the_dictionaries(command, run):
+    told = command(*run, "--board", "9x6", "--square", 0.03, "--dictionary", "dict_4x4_60")
+    assert told.status == 2 and "--dictionary 'dict_4x4_60': one of DICT_4X4_50, " in told.err
+    assert "did you mean 'DICT_4X4_50'" in told.err
+
+
 def test_what_cannot_be_found_says_so():
     picture, _ = taken(CHESS, 20, 10, 5, 0.5)
     with pytest.raises(InputError, match="no chessboard of 8 × 5 inner corners"):
@@ -124,8 +156,6 @@ def test_what_cannot_be_found_says_so():
         find_board(picture, CIRCLES)
     with pytest.raises(InputError, match="fewer than 4 corners of a ChArUco"):
         find_board(picture, CHARUCO)
-    with pytest.raises(InputError, match="no dictionary 'DICT_9'"):
-        find_board(picture, Board(9, 6, 0.03, "charuco", dictionary="DICT_9"))
     with pytest.raises(InputError, match="5 × 5 pixels is too small"):
         find_board(picture[:5, :5], CHESS)
     assert other_sizes(picture, Board(10, 7, 0.03)) == CHESS
