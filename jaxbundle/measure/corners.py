@@ -134,21 +134,65 @@ def _with_other_markers(grey: Grey, board: Board) -> Board | None:
 
 def largest_chessboard(grey: Grey, board: Board) -> Board | None:
     """The chessboard in the photograph with all its corners, of any number; searched in a
-    reduced copy. More columns than rows, or as in `board`."""
+    reduced copy. More columns than rows, or as in `board`. None for textures that the search takes
+    for a small board."""
     cv2 = need_opencv()
     grey, _ = _reduce(cv2, grey, QUICK_SIDE)
     least = SMALLEST_SIDE["chessboard"]
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     try:
-        found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags)
+        found, xy, grid = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags)
     except cv2.error:
         return None
-    if not found:
+    if not found or not is_chessboard(cv2, grey, xy.reshape(*grid.shape[:2], 2).astype(float)):
         return None
     rows, columns = sorted(grid.shape[:2])
     if board.columns < board.rows:
         rows, columns = columns, rows
     return dataclasses.replace(board, columns=columns, rows=rows)
+
+
+def is_chessboard(
+    cv2: ModuleType,
+    grey: Grey,
+    xy: Grid,
+    least_contrast: float = 0.5,
+    misfit_of_four: float = 0.05,
+    largest_misfit: float = 0.25,
+) -> bool:
+    """Whether a grid of corners has the evidence of a chessboard: its squares alternate, and every
+    3 × 3 corners are the image of a plane grid.
+
+    The search finds boards of 3 × 3 to 5 × 3 corners in each of 57 photographs of landscapes,
+    fronts and rooms. They and 9 photographs of a board were compared by the smallest difference of
+    neighbouring squares, in units of the mean difference, and by the largest RMS of 3 × 3 corners
+    against their homography, in units of their step:
+
+    - `least_contrast`: a board has 0.97; 51 of the 57 have less than ½, the others are 3 × 3;
+    - `misfit_of_four`: a board has 0.007, those six 0.072 and more. That of four squares; it grows
+      with the number of squares, since no texture of more than four alternates,
+    - up to `largest_misfit`: a fisheye with 9 × 6 corners to 120° from the axis has 0.24.
+    """
+    middle = (xy[:-1, :-1] + xy[1:, 1:] + xy[:-1, 1:] + xy[1:, :-1]) / 4
+    column, row = np.rint(middle).astype(int).reshape(-1, 2).T
+    shade = grey[row, column].astype(float).reshape(middle.shape[:2])
+    sign = 1 - 2 * (np.indices(shade.shape).sum(0) % 2)
+    steps = [np.diff(shade, axis=k) * np.delete(sign, 0, axis=k) for k in (0, 1)]
+    steps = np.concatenate([step.ravel() for step in steps])
+    steps *= np.sign(steps.mean())  # either colour may be the first
+    if not steps.min() >= least_contrast * steps.mean() > 0:
+        return False
+    plane = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), -1).reshape(-1, 2)
+    misfit = 0.0
+    for i, j in np.ndindex(len(xy) - 2, len(xy[0]) - 2):
+        near = xy[i : i + 3, j : j + 3].reshape(-1, 2)
+        H, _ = cv2.findHomography(plane, near)
+        if H is None:
+            return False
+        away = cv2.perspectiveTransform(plane[None], H)[0] - near
+        step = np.sqrt(abs(np.linalg.det([near[2] - near[0], near[6] - near[0]]))) / 2
+        misfit = max(misfit, np.sqrt(np.mean(np.sum(away**2, 1))) / max(step, 1.0))
+    return misfit <= min(misfit_of_four * shade.size / 4, largest_misfit)
 
 
 def _chessboard(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:

@@ -12,7 +12,7 @@ from jaxbundle.choices import DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.measure import Board, find_board, measure_boards, read_photograph
 from jaxbundle.measure.coded_targets import check_kind
-from jaxbundle.measure.corners import other_sizes
+from jaxbundle.measure.corners import is_chessboard, other_sizes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
 MARGIN = 0.03
@@ -200,6 +200,48 @@ def test_reading_photographs(tmp_path):
     ):  # fmt: skip
         with pytest.raises(InputError, match=said):
             read_photograph(tmp_path / name)
+
+
+LANDSCAPES = sorted((EXAMPLE.parent / "four_photographs" / "photos").glob("*.jpg"))
+
+
+def test_no_board_is_seen_in_a_landscape():
+    """OpenCV's search finds boards of 3 × 3 to 5 × 3 corners in all four."""
+    assert len(LANDSCAPES) == 4
+    for path in LANDSCAPES:
+        assert other_sizes(read_photograph(path), Board(9, 6, 0.03)) is None
+    for path in sorted(EXAMPLE.glob("*.jpg"))[:2]:
+        assert other_sizes(read_photograph(path), Board(7, 5, 0.03)).grid == (6, 9)
+
+
+def test_photographs_without_a_board_get_no_size_of_one(tmp_path, command):
+    """A batch of landscapes: that there is no board, and nothing to try instead."""
+    photos = tmp_path / "landscapes"
+    photos.mkdir()
+    for path in LANDSCAPES[:2]:
+        (photos / path.name).write_bytes(path.read_bytes())
+    options = "--board", "9x6", "--square", 0.03
+    told = command("batch", photos, *options, "--json-lines", tmp_path / "lines.jsonl")
+    (line,) = (tmp_path / "lines.jsonl").read_text().splitlines()
+    told_twice = command("calibrate", photos, *options)
+    assert (told.status, told_twice.status) == (3, 2)
+    for text in (line, told_twice.err):
+        assert "no photograph of 2 shows the board" in text and "give --board" not in text, text
+
+
+def test_a_board_in_a_fisheye_is_one():
+    """9 × 6 corners to 67° from the axis, equidistant."""
+    x, y = np.meshgrid(np.arange(9) - 4, np.arange(6) - 2.5)
+    theta, phi = np.arctan2(np.hypot(x, y), 2.0), np.arctan2(y, x)
+    xy = 250 * theta[..., None] * np.stack([np.cos(phi), np.sin(phi)], -1) + (350, 350)
+    v, u = np.indices((700, 700))
+    away = np.hypot(u - 350, v - 350) / 250
+    ray = 2.0 * np.tan(np.clip(away, 0, 1.5)) / np.maximum(away, 1e-9) / 250
+    square = np.floor((u - 350) * ray) + np.floor((v - 350) * ray + 0.5)
+    grey = np.where(square % 2 == 1, 20, 220).astype(np.uint8)
+    assert is_chessboard(cv2, grey, xy)
+    assert not is_chessboard(cv2, grey, xy + np.random.default_rng(1).normal(0, 15, xy.shape))
+    assert not is_chessboard(cv2, np.full_like(grey, 100), xy)
 
 
 def test_markers_of_another_dictionary_are_named():
