@@ -34,6 +34,14 @@ from jaxbundle.photographs.formats import SUFFIXES
 from jaxbundle.system.workers import Failed, Workers
 
 
+class NotSearched(str):
+    """Why a photograph could not be searched: the machine lacked memory, or the search crashed."""
+
+
+NOT_SEARCHED = "photographs_not_searched"
+"""The entry of a line: names of photographs that the result lacks by a fault of the machine."""
+
+
 def is_photograph_folder(path: str | Path) -> bool:
     """Whether an input is a folder, and none that holds a network."""
     return os.path.isdir(path) and recognise_format(Path(path)) is None
@@ -83,11 +91,11 @@ class PhotographFolders:
             for path, content in contents.items()
             if content and self.kept.look(content, self.board) is None
         }
-        died: dict[str, str] = {}
+        died: dict[str, NotSearched] = {}
         for done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
             content = contents[task[0]]
             if isinstance(look, Failed):
-                died[content] = look.why  # not kept: another run may have more memory
+                died[content] = NotSearched(look.why)  # not kept: another run may have more memory
             else:
                 self.kept.keep(content, self.board, look)
             tell(done / len(tasks))
@@ -98,7 +106,7 @@ class PhotographFolders:
         folder: int,
         files: Mapping[str, Path],
         contents: Mapping[Path, str],
-        died: Mapping[str, str],
+        died: Mapping[str, NotSearched],
     ) -> BoardViews | str:
         if not files:
             return _why_empty(self.folders[folder])
@@ -158,6 +166,12 @@ def of_photographs(views: BoardViews, brief: bool) -> dict:
     row: dict[str, Any] = {"image_size": list(views.image_size)}
     if not brief:
         row["photographs"] = list(views.names)
-    if views.failed:
-        row["photographs_not_used"] = dict(views.failed)
-    return row
+    return row | of_unused(dict(views.failed))
+
+
+def of_unused(failed: Mapping[str, str]) -> dict[str, Any]:
+    """The entries of a line about photographs that were not used, with the reasons."""
+    unsearched = [name for name, why in failed.items() if isinstance(why, NotSearched)]
+    return ({"photographs_not_used": dict(failed)} if failed else {}) | (
+        {NOT_SEARCHED: unsearched} if unsearched else {}
+    )

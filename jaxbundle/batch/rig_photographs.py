@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from jaxbundle.batch.epochs import epoch_keys
-from jaxbundle.batch.photographs import PhotographFolders, camera_folders
+from jaxbundle.batch.photographs import PhotographFolders, camera_folders, of_unused
 from jaxbundle.batch.rigs import RigViews
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
@@ -66,7 +66,7 @@ def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
     except InputError as error:
         return str(error)
     failed = {f"{name}/{photo}": why for name, one in given.items() for photo, why in one.failed}
-    return rig, {"photographs_not_used": failed} if failed else {}
+    return rig, of_unused(failed)
 
 
 def rig_of_views(views: Mapping[str, BoardViews]) -> RigViews:

@@ -21,6 +21,7 @@ import numpy as np
 
 from jaxbundle.arguments import integer
 from jaxbundle.batch.camera import LIMIT, SOLVED, STATUS
+from jaxbundle.batch.photographs import NOT_SEARCHED
 from jaxbundle.batch.work import WHERE_GIVEN, BatchSettings, Tell, Work, plan_works
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
@@ -72,7 +73,8 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
       `rolling_shutter.KEY` and `rig.KEY` (`calibrate_rigs`).
     - `part`: (I, N): of all cameras and networks the I-th and every N-th after it, I from 1.
     - `brief`: no poses and covariances of cameras.
-    - `retry`: compute inputs without a result in the file again.
+    - `retry`: compute inputs without a result in the file again, and those that lack photographs
+      for which there was no memory.
     - `renew`: compute inputs with results of other settings or other data again.
     - `portion`: cameras between two writes: what an interruption loses, a quarter of a second.
     - `known`: another file of results; inputs in it are skipped.
@@ -198,7 +200,7 @@ def _again(
         head = lines.heads.get(key)
         if head is None:
             continue
-        if retry and head.get("status") not in SOLVED:
+        if retry and (head.get("status") not in SOLVED or head.get(NOT_SEARCHED)):
             again.append(key)
         elif difference := _difference(head, work, i):
             other[key] = difference

@@ -62,7 +62,10 @@ def batch(  # noqa: PLR0913 - the options of the command
     portion: Annotated[int, typer.Option(min=1, help="cameras computed between writes")] = 256,
     brief: Annotated[bool, typer.Option("--brief", help="omit poses and covariances")] = False,
     retry: Annotated[
-        bool, typer.Option("--retry", help="recompute inputs without a result")
+        bool,
+        typer.Option(
+            "--retry", help="recompute inputs without a result, or without unsearched photographs"
+        ),
     ] = False,
     renew: Annotated[
         bool, typer.Option("--renew", help="recompute results of other settings or data")
@@ -221,6 +224,8 @@ def batch(  # noqa: PLR0913 - the options of the command
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
         if any(counts[status] for status in STATUSES_WITH_REASON):
             _print_reasons(inputs, json_lines)
+    if first and known:
+        _name_unsearched(inputs, json_lines)
     if first and total and not solved:
         raise NotSolvedError(f"{json_lines}: none of {count(total, 'input')} has a result: {said}")
     if first and quiet and solved < total:
@@ -253,6 +258,30 @@ def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5)
     print(*reasons[:max_reasons], sep="\n")
     if len(reasons) > max_reasons:
         print(f'and {len(reasons) - max_reasons} more: see "error" in {json_lines}')
+
+
+def _name_unsearched(inputs: Sequence[str], json_lines: str, most: int = 5) -> None:
+    """Warn of photographs that results lack by a fault of the machine, with the reason."""
+    from jaxbundle.batch.photographs import NOT_SEARCHED
+    from jaxbundle.batch.run import result_rows
+
+    rows = result_rows(inputs, json_lines) if os.path.isfile(json_lines) else ()
+    lost = [
+        f"{row['key']}/{name}: {row['photographs_not_used'][name]}"
+        for row in rows
+        for name in row.get(NOT_SEARCHED, ())
+    ]
+    if lost:
+        were = "photograph was" if len(lost) == 1 else "photographs were"
+        more = [f"and {len(lost) - most} more: see {NOT_SEARCHED!r} in {json_lines}"]
+        print(
+            f"warning: {len(lost)} {were} not searched and missing from the results; run the "
+            "command again with --retry to search again",
+            *lost[:most],
+            *(more if len(lost) > most else []),
+            sep="\n",
+            file=sys.stderr,
+        )
 
 
 def _reason(row: dict) -> str:

@@ -96,7 +96,8 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
             try:
                 result = function(task)
             except Exception as error:
-                result = Failed(f"{type(error).__name__}: {error}")
+                named = isinstance(error, MemoryError) and str(error)
+                result = Failed(named or f"{type(error).__name__}: {error}")
             connection.send(result)
     except (EOFError, OSError):
         os._exit(0)  # the parent process is gone

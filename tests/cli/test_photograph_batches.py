@@ -153,3 +153,45 @@ def test_what_a_process_dies_of_spoils_its_task_alone():
     assert found[0] is None and found[signal.SIGCONT] is None
     assert found[signal.SIGKILL] == Failed("its worker process died (signal 9)")
     assert "ValueError" in found[9999].why or "OSError" in found[9999].why
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+def test_a_photograph_without_memory_is_named_and_searched_again(
+    command, tmp_path, monkeypatch, quiet
+):
+    """The result of the others is kept; the missing photograph is said, with the way to add it."""
+    folder, lacks = folder_of(tmp_path / "first", range(1, 8)), ["photo_03.jpg"]
+
+    class Short(Workers):
+        def run(self, tasks):
+            for path, board in tasks:
+                why = f"{path}: not enough memory for 480 × 360 pixels"
+                short = path.name in lacks
+                yield (path, board), Failed(why) if short else search_board(path, board)
+
+    monkeypatch.setattr(batches, "Workers", Short)
+    file = tmp_path / "results.jsonl"
+    run = ("batch", folder, "--board", "9x6", "--square", 0.03, "--free", ",".join(FREE),
+           "--json-lines", file, *quiet)  # fmt: skip
+    told = command(*run)
+    assert told.status == 0 and rows(file)[0]["photographs_not_searched"] == ["photo_03.jpg"]
+    assert "not enough memory" in rows(file)[0]["photographs_not_used"]["photo_03.jpg"]
+    for words in ("1 photograph was not searched", "first/photo_03.jpg: ", "not enough memory",
+                  "--retry"):  # fmt: skip
+        assert words in told.err, told
+    lacks.clear()
+    told = command(*run)  # skipped, and still said
+    assert "first/photo_03.jpg: " in told.err and rows(file)[0]["views"] == 6
+    told = command(*run, "--retry")
+    assert (told.status, told.err) == (0, "") and rows(file)[0]["views"] == 7
+    assert "photographs_not_searched" not in rows(file)[0]
+
+
+def test_a_shortage_of_memory_in_a_process_says_its_own_words():
+    with Workers(short_of_memory, 1) as workers:
+        ((_, found),) = workers.run(["photo.jpg"])
+    assert found == Failed("photo.jpg: not enough memory")
+
+
+def short_of_memory(name):
+    raise MemoryError(f"{name}: not enough memory")
