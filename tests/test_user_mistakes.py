@@ -16,7 +16,11 @@ from jaxbundle.network.unit_mistakes import (
     name_sigma_unit,
     name_unit_of_positions,
 )
-from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+from jaxbundle.orientation.conventions import (
+    explains_better,
+    name_image_convention,
+    name_image_extent,
+)
 from jaxbundle.orientation.network import without_placeholders
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
@@ -242,6 +246,35 @@ def said_of(given) -> str:
     return said
 
 
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+def test_a_mirrored_control_is_named_whatever_the_unit_of_weight(unit):
+    """σ that nobody stated only scale σ0: the residuals, in principal distances, are the same."""
+    given = network(dataclasses.replace(PX, free=("fx", "cx", "cy")), **CONTROL)
+    sigma = np.full_like(given.observations.sigma, unit)
+    free = dataclasses.replace(given.observations, sigma=sigma, sigma_origin="unit")
+    points = dataclasses.replace(given.points, sigma=given.points.sigma * unit)
+    given = given.replace(observations=free, points=points)
+    said = said_of(with_control_at(given, lambda X: X[:, [1, 0, 2]]))
+    assert "the control points fit the mirror image of the network" in said
+
+
+def test_the_rule_of_conventions_is_one():
+    """A fifth of the misfit: of image coordinates by start values, of control by σ0."""
+    assert explains_better(0.9, 5.0) and not explains_better(1.1, 5.0)
+    given = network(FREE, **CONTROL)
+    for mirrored, sigma0, named in ((0.9, 5.0, True), (1.1, 5.0, False), (1.0, None, True),
+                                    (6.0, None, False)):  # fmt: skip
+        said = name_mirrored(without_start_values(given), sigma0, lambda _, s=mirrored: s, 5.0)
+        assert bool(said) == named
+
+
+def test_other_findings_make_another_result(convergent4):
+    changed = convergent4.with_changes(findings=("a cause",), sigma_factors={"image": 2.0})
+    assert (convergent4.findings, convergent4.sigma_factors) == ((), {})
+    assert changed.findings == ("a cause",) and changed.sigma_origin == "estimated"
+    assert changed.verdict is not convergent4.verdict and changed.sigma0 == convergent4.sigma0
+
+
 def test_flipped_images_without_start_values_are_named():
     given = with_xy(network(FREE, **CONTROL), lambda xy: xy * [1, -1])
     said = said_of(without_start_values(given))
@@ -283,7 +316,7 @@ def test_poor_start_values_are_not_taken_for_a_mirror_image():
     """The mirrored images fit better than a solution that went astray, but as given they fit as
     well from computed start values."""
     given, sigma0 = network(FREE, **CONTROL), iter((3.0, 2.9))
-    assert name_mirrored(given, 1700.0, lambda network: next(sigma0)) == ""
+    assert name_mirrored(given, 1700.0, lambda network: next(sigma0), 5.0) == ""
     assert next(sigma0, None) is None
 
 

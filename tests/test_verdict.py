@@ -19,7 +19,15 @@ from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.network.tables import ESTIMATED, STATED, UNIT, LeftOut
 from jaxbundle.report.page import compose
-from jaxbundle.report.verdict import BAD, DOUBTFUL, GOOD, NOTED, explained_by_chance
+from jaxbundle.report.verdict import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    NOTED,
+    explained_by_chance,
+    judge_blunders,
+    judge_check_points,
+)
 from jaxbundle.statistics.global_test import chi_squared_test, describe_test
 
 WORDS = "no a priori σ was given: 1 mm is a unit of weight; σ0 a posteriori estimates it"
@@ -237,3 +245,20 @@ def test_a_prior_beside_fixed_points_needs_a_stated_sigma_too():
         observations=rays, cameras=(prior,),
     ))  # fmt: skip
     assert result.weights_matter and finding(result, "χ² test").state == DOUBTFUL
+
+
+def test_the_judgement_of_blunders_is_one():
+    """1000 standard normal values, one of them far: by the critical values of the normal
+    distribution at 0.1 % (3.29) and of the largest of 1000 (4.89)."""
+    good = 0.9 * stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
+    critical = lambda level: stats.norm.isf(level / 2)
+    judge = lambda size, removed=0: judge_blunders(np.abs(size), critical, "|w|", removed, 500.0)
+    assert judge(good).state == GOOD
+    found = judge(np.r_[good, 6.0])
+    assert (found.state, found.brief) == (DOUBTFUL, "1 blunder likely")
+    assert "1 of 1001 observations over the critical value 3.29" in found.words
+    assert judge(good, removed=50).state == DOUBTFUL
+    assert judge(np.r_[good, np.full(10, 4.0)]).state == NOTED
+    check = lambda ratio: judge_check_points(2, "RMS 1 m", np.array(ratio), 4.0)
+    assert (check([3.9, 1.0]).state, check([4.1]).state) == (GOOD, DOUBTFUL)
+    assert check([4.1]).brief == "a check point 4.10 σ off"

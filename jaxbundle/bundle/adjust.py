@@ -53,7 +53,7 @@ from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import Network, require_network
+from jaxbundle.network.tables import UNIT, Network, require_network
 from jaxbundle.network.unit_mistakes import (
     name_lengths,
     name_pixels,
@@ -73,8 +73,10 @@ from jaxbundle.types import Progress, present
 LARGEST_START_MISFIT = 0.1
 """Radians, RMS: no start values in the right convention predict image points so badly that an
 adjustment from them settles by itself."""
-MISFIT = 5.0
-"""For a larger σ0, likely causes are searched for."""
+MISFIT, COARSEST_RAYS = 5.0, 1e-3
+"""For a larger σ0 likely causes are searched for; for larger residuals (RMS, radians), if σ is only
+a unit of weight: a pixel of cameras with 1000 pixels in the principal distance. A search that finds
+nothing costs time only."""
 EVALUATIONS_BEFORE_A_LOOK = 6
 """Evaluations before points that rays may not determine are looked for: the images are then nearly
 where they end, and such points have not yet slowed them."""
@@ -151,13 +153,14 @@ def adjust(
     )
     given = without_placeholders(require_network(network))
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
-    mirror = partial(name_mirrored, given, try_again=partial(_try_mirrored, reduction, options))
+    try_again = partial(_try_mirrored, reduction, options)
+    mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, _largest_sigma0(given))
     oriented = None
     if lacks_start_values(given):
         try:
             oriented = _place(orient(given))
         except NotSolvedError as error:
-            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(sigma0=None)):
+            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
                 raise NotSolvedError(
                     f"no start values found: {mirrored}", [*error.undetermined]
                 ) from None
@@ -183,12 +186,14 @@ def adjust(
     result = found.adjustment(check)
     sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
     if found.inspection:
-        result.findings += _compare_with_start(given, result)
-    misfit = sigma0 is None or sigma0 > MISFIT
+        result = result.with_changes(
+            findings=(*result.findings, *_compare_with_start(given, result))
+        )
+    misfit = sigma0 is None or sigma0 > _largest_sigma0(given)
     # Only guesses so far: a mirrored system is not found by a look at the start values.
     if misfit and not also and not _name_conventions(problem, minimum, found.inspection):
-        if mirrored := mirror(sigma0=sigma0):
-            result.findings = (mirrored,)
+        if mirrored := mirror(sigma0):
+            result = result.with_changes(findings=(mirrored,))
     return result
 
 
@@ -441,12 +446,13 @@ def _likely_causes(
     tried = int(minimum.iterations)
     accepted = np.asarray(minimum.history.accepted)[:tried]
     vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
-    if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
+    largest = _largest_sigma0(network)
+    if inspection and not (vtpv > largest**2 * problem.counts.redundancy).any():
         # Settled far from its start, it may be a mirror image; or σ is in a larger unit.
         start = np.sqrt(
             2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
         )
-        far = start * noise_of_rays(problem) > LARGEST_START_MISFIT
+        far = start * noise_of_rays(problem.network) > LARGEST_START_MISFIT
         sigma0 = _sigma0(problem, minimum)
         poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
         causes = (
@@ -483,10 +489,18 @@ def _name_conventions(
     return tuple(filter(None, causes))
 
 
+def _largest_sigma0(network: Network) -> float:
+    """The largest σ0 of a network without mistakes; it depends on the unit of weight, if σ is no
+    more than that."""
+    if network.observations.sigma_origin != UNIT:
+        return MISFIT
+    return COARSEST_RAYS / noise_of_rays(network)
+
+
 def _noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
     """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
     of the rays."""
-    return min(_sigma0(problem, minimum), MISFIT)
+    return min(_sigma0(problem, minimum), _largest_sigma0(problem.network))
 
 
 def _sigma0(problem: NetworkProblem, minimum: Minimum) -> float:

@@ -151,7 +151,7 @@ def _find_candidates(problem: NetworkProblem, values: Values, factor: float | No
     network = problem.network
     ties, one = network.points.has_role("tie"), len(network.images)
     none = np.zeros(len(ties), bool), np.zeros(one, bool)
-    noise = noise_of_rays(problem)
+    noise = noise_of_rays(problem.network)
     if not are_finite(problem, values) or factor is None and noise > LARGEST_SIGMA:
         return none
     noise *= VAGUE * (factor or 1.0)

@@ -24,6 +24,7 @@ from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.leastsquares.problem import with_data, with_factor, with_free
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.tables import Network
 from jaxbundle.orientation.many import matrices_of_quaternions
 from jaxbundle.orientation.sights import sights
 from jaxbundle.types import present
@@ -56,7 +57,7 @@ def minimise_at_any_distance(
     if not (angle < NARROW).any():
         return problem, find_minimum(problem, start, max_steps=max_steps, **options)
     mostly = lambda narrow: 2 * narrow.sum() >= (angle < np.pi).sum()
-    legs, parallel = [], angle < max(PARALLEL, min(VAGUE * noise_of_rays(problem), NARROW))
+    legs, parallel = [], angle < max(PARALLEL, min(VAGUE * noise_of_rays(problem.network), NARROW))
     for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
             patience = EVALUATIONS_BEFORE_RELEASE * (2 if mostly(angle < NARROW) else 1)
@@ -105,9 +106,8 @@ def minimise_with_infinity(
             problem = _hold_at_infinity(problem, held, start)
 
 
-def noise_of_rays(problem: NetworkProblem) -> float:
+def noise_of_rays(network: Network) -> float:
     """The median a priori σ of an image coordinate, in principal distances."""
-    network = problem.network
     c = np.array(
         [
             min(
@@ -117,7 +117,8 @@ def noise_of_rays(problem: NetworkProblem) -> float:
             for camera in network.cameras
         ]
     )
-    return float(np.median(network.observations.sigma.max(1) / np.abs(c[problem.camera])))
+    camera = network.images.camera[network.observations.image]
+    return float(np.median(network.observations.sigma.max(1) / np.abs(c[camera])))
 
 
 def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " points"]:

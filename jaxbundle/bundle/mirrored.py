@@ -17,11 +17,9 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.sightings import count_controlled_axes
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.conventions import EXPECTED_CONVENTION, image_frame
+from jaxbundle.orientation.conventions import EXPECTED_CONVENTION, explains_better, image_frame
 from jaxbundle.orientation.network import lacks_start_values
 
-MUCH_BETTER = 5.0
-"""Least ratio of σ0 of the given images and of the mirrored ones; below, control is no witness."""
 SAME_DISTANCE = 2.0
 """Largest ratio of the distances of an image and its mirror image from the points: start values of
 a block are good to a few percent, and those that say nothing (0, 0, 0) are seldom as far."""
@@ -35,22 +33,27 @@ contradict it."""
 
 
 def name_mirrored(
-    network: Network, sigma0: float | None, try_again: Callable[[Network], float | None]
+    network: Network,
+    sigma0: float | None,
+    try_again: Callable[[Network], float | None],
+    largest: float,
 ) -> str:
     """That control fits the mirror image of the network, in words; else empty.
 
     **Arguments:** `sigma0`: as given, None without a solution; `try_again(network)`: σ0 of
-    another network, None without a solution."""
+    another network, None without a solution; `largest` σ0 of a network without mistakes."""
     given = np.isfinite(network.images.sigma).any()
     if network.further or given or count_controlled_axes(network.points).sum() < FEWEST_AXES:
         return ""
     mirrored = _try(_without_start_values(_mirror(network)), try_again)
-    if mirrored is None or MUCH_BETTER * mirrored > (sigma0 or MUCH_BETTER**2):
+    if mirrored is None or mirrored > largest:
+        return ""
+    if sigma0 and not explains_better(mirrored, sigma0):
         return ""
     # As given, from computed start values as well: else poor start values look like a mirror.
     if not lacks_start_values(network):
         plain = _try(_without_start_values(network), try_again)
-        if plain is not None and MUCH_BETTER * mirrored > plain:
+        if plain is not None and not explains_better(mirrored, plain):
             return ""
     instead = f" instead of {sigma0:.3g}" if sigma0 else ""
     unit = get_model(network.cameras[0].model).unit

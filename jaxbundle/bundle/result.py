@@ -4,6 +4,7 @@ Every σ is a posteriori (times σ0) unless called a priori. Cofactors and redun
 computed on first access. Without a solution every accessor raises `NotSolvedError` with the reason.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -130,6 +131,23 @@ class Adjustment:
         self.check = check
 
     # --- how it ended -----------------------------------------------------------------------
+
+    def with_changes(
+        self,
+        *,
+        sigma_factors: Mapping[str, float] | None = None,
+        findings: tuple[str, ...] | None = None,
+    ) -> "Adjustment":
+        """The same result with other factors of σ, or other findings; what follows from neither is
+        not computed again."""
+        changed = copy.copy(self)
+        for name in ("verdict", "doubts", "variance_components", "check_points", "fingerprint"):
+            changed.__dict__.pop(name, None)
+        if sigma_factors is not None:
+            changed.sigma_factors = dict(sigma_factors)
+        if findings is not None:
+            changed.findings = findings
+        return changed
 
     @property
     def converged(self) -> bool:

@@ -83,13 +83,6 @@ class WeightedAdjustment:
     agreeing_rays: int
     unused_points: int = 0
 
-    def __post_init__(self):
-        if self.adjustment.converged:
-            # σ estimated from the residuals are not confirmed by them: no χ² test
-            self.adjustment.sigma_factors = {
-                f"image points {name}": factor for name, factor in self.factors.items()
-            }
-
     @property
     def worst(self) -> float:
         """The largest factor."""
@@ -272,6 +265,11 @@ def _weight(
     factors = {
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }
+    if result.converged:
+        # σ estimated from the residuals are not confirmed by them: no χ² test
+        result = result.with_changes(
+            sigma_factors={f"image points {name}": factor for name, factor in factors.items()}
+        )
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
 

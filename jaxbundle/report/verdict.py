@@ -6,7 +6,7 @@ network, a few things left out. `doubtful` is a test that a good result fails on
 were stated are contradicted.
 """
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -140,11 +140,7 @@ def _tested(
     tau = tau[np.isfinite(tau)]
     largest = float(np.fmax.reduce(tau, initial=np.nan))
     limit = critical_value(adjustment, level=level_of_one(LEVEL, len(tau)))
-    words = (
-        f"{significant(largest)}, critical value of the largest of {len(tau)} at "
-        f"{100 * LEVEL:g} % {significant(limit)}"
-    )
-    return largest, limit, words
+    return largest, limit, _compare_largest(largest, limit, len(tau))
 
 
 def _control(adjustment: "Adjustment") -> Finding:
@@ -206,16 +202,31 @@ def _checks(adjustment: "Adjustment") -> list[Finding]:
     given = np.concatenate(present(adjustment.check)[0].sigma.T)
     s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
     known = (s > 0) & np.isfinite(d)
-    largest = np.fmax.reduce(np.abs(d[known]) / s[known], initial=np.nan)
-    limit = critical_value(adjustment, level=level_of_one(LEVEL, int(known.sum())))
+    ratio = np.abs(d[known]) / s[known]
+    limit = critical_value(adjustment, level=level_of_one(LEVEL, len(ratio)))
+    rms = f"RMS of intersected − given {rms} {unit}"
+    return [
+        judge_check_points(
+            len(found.id), rms, ratio, limit, ", of intersection and given coordinates"
+        )
+    ]
+
+
+def judge_check_points(
+    number: int, rms: str, ratio: Float[np.ndarray, " n"], limit: float, sigma_of: str = ""
+) -> Finding:
+    """The finding about check points: whether the largest difference is one of good points.
+
+    **Arguments:** `rms` in words; `ratio` of every difference to its σ; `limit`: the critical value
+    of the largest of them; `sigma_of`: of what, in words.
+    """
+    largest = float(np.fmax.reduce(ratio, initial=np.nan))
     words = (
-        f"{count(len(found.id), 'point')}; RMS of intersected − given {rms} {unit}; largest "
-        f"difference {significant(largest)} times its σ, of intersection and given coordinates, "
-        f"critical value {significant(limit)}"
+        f"{count(number, 'point')}; {rms}; largest difference {significant(largest)} times its "
+        f"σ{sigma_of}, critical value {significant(limit)}"
     )
-    state = DOUBTFUL if largest > limit else GOOD
     brief = f"a check point {significant(largest)} σ off"
-    return [Finding("Check points", state, words, brief)]
+    return Finding("Check points", DOUBTFUL if largest > limit else GOOD, words, brief)
 
 
 def describe_reliability(
@@ -238,28 +249,59 @@ def describe_reliability(
 
 
 def _blunders(adjustment: "Adjustment") -> Finding:
-    tau = np.abs(adjustment.residuals["tau"])
-    critical, expected = critical_value(adjustment, level=LEVEL), LEVEL * len(tau)
-    over = int((tau > critical).sum())
-    largest, limit, said = _tested(adjustment, slice(None))
-    words = (
-        f"{over} of {count(len(tau), 'observation')} over the critical value "
-        f"{significant(critical)} of |τ| at {100 * LEVEL:g} % (by chance about "
-        f"{significant(expected, 2)}); largest {said}"
+    removed = len(adjustment.removed)
+    return judge_blunders(
+        np.abs(adjustment.residuals["tau"]),
+        lambda level: critical_value(adjustment, level=level),
+        "|τ|",
+        removed,
+        adjustment.counts.observations / 2 + removed,
+        len(adjustment.suspects),
     )
-    removed, suspects = len(adjustment.removed), len(adjustment.suspects)
+
+
+def judge_blunders(
+    size: Float[np.ndarray, " n"],
+    critical: Callable[[float], float],
+    symbol: str,
+    removed: int,
+    rays: float,
+    suspects: int = 0,
+) -> Finding:
+    """The finding about blunders: in the largest test, the share that was removed, and more large
+    residuals than chance explains.
+
+    **Arguments:** `size` of the test values, NaN where uncontrolled; `critical` value at a level;
+    `removed` and suspected ones of as many `rays`.
+    """
+    tested = size[np.isfinite(size)]
+    largest = float(np.fmax.reduce(tested, initial=np.nan))
+    single, limit = critical(LEVEL), critical(level_of_one(LEVEL, len(tested)))
+    over, expected = int((size > single).sum()), LEVEL * len(size)
+    words = (
+        f"{over} of {count(len(size), 'observation')} over the critical value "
+        f"{significant(single)} of {symbol} at {100 * LEVEL:g} % (by chance about "
+        f"{significant(expected, 2)}); largest {_compare_largest(largest, limit, len(tested))}"
+    )
     if removed or suspects:
         words += f"; {removed} removed by data snooping, {suspects} suspected"
-    rays = adjustment.counts.observations / 2 + removed
     if largest > limit:
-        left = int((tau > limit).sum())
+        left = int((size > limit).sum())
         return Finding("Blunders", DOUBTFUL, words, f"{count(left, 'blunder')} likely")
     if removed > max(LARGEST_REMOVED * rays, explained_by_chance(rays)):
         brief = f"{removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
     # more than chance explains, but none that stands out: σ of some are too small
-    many = over > explained_by_chance(len(tau))
+    many = over > explained_by_chance(len(size))
     return Finding("Blunders", NOTED if many else GOOD, words, count(over, "large residual"))
+
+
+def _compare_largest(largest: float, limit: float, number: int) -> str:
+    """The largest test value of a number of observations and its critical value, in words."""
+    return (
+        f"{significant(largest)}, critical value of the largest of {number} at "
+        f"{100 * LEVEL:g} % {significant(limit)}"
+    )
 
 
 def explained_by_chance(number: float, level: float = LEVEL) -> float:
