@@ -1,8 +1,10 @@
 """Figures draw what the tables say, with units, and files appear whole or not at all."""
 
+import copy
 import dataclasses
 import os
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -426,3 +428,14 @@ def test_a_figure_of_its_own(convergent4):
     ax = convergent4.plot_histogram()
     assert pyplot.fignum_exists(ax.figure.number)
     pyplot.close(ax.figure)
+
+
+@pytest.mark.parametrize("name", ["项目", "مشروع", "😀"])
+def test_names_in_any_script_are_drawn_without_a_warning(convergent4, name):
+    """The font may lack them: boxes in the figure, and nothing on the terminal, also from
+    drawings that measure their text first."""
+    named = copy.copy(convergent4)
+    named.network = convergent4.network.replace(name=name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert files.png((6, 5), None, named.plot_plan).startswith(b"\x89PNG")

@@ -194,11 +194,11 @@ def png(
     layout = ConstrainedLayoutEngine(w_pad=margin, h_pad=margin)
     figure = Figure(figsize=size, dpi=dots_per_inch, layout=layout)
     canvas = FigureCanvasAgg(figure)
-    draw(ax=figure.add_subplot(projection=projection))
     data = io.BytesIO()
     with warnings.catch_warnings():
-        # ids in a script missing from the font: boxes in the figure, no action required
+        # names in a script missing from the font: boxes in the figure, no action required
         warnings.filterwarnings("ignore", message="Glyph .* missing")
+        draw(ax=figure.add_subplot(projection=projection))  # some measure their text
         canvas.print_png(data)
     return data.getvalue()
 

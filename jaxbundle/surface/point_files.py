@@ -20,6 +20,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes, write_text
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.files import read_cloud_csv, write_cloud_csv
+from jaxbundle.system.file_content import missing
 
 if TYPE_CHECKING:
     import laspy
@@ -64,7 +65,7 @@ def read_cloud(path: str | Path) -> Cloud:
     **Raises:** `InputError` if it cannot be read."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise missing(path, "a cloud, .csv, .ply, .las or .laz")
     readers = {".csv": read_cloud_csv, ".txt": read_cloud_csv, ".xyz": read_cloud_csv,
                ".ply": _read_ply, ".las": _read_las, ".laz": _read_las}  # fmt: skip
     suffix = path.suffix.lower()

@@ -32,6 +32,7 @@ from jaxbundle.surface.ground import (
     neighbourhood,
 )
 from jaxbundle.surface.views import Grey
+from jaxbundle.system.file_content import missing
 
 if TYPE_CHECKING:
     import pyproj
@@ -198,7 +199,7 @@ def _transformer(crs: str) -> "pyproj.Transformer":
 def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
     """The polynomials, or the scanner's image and Earth; and the raster."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise missing(path, "a raster with RPC, or a scanner file")
     if path.suffix.lower() in IMAGES:
         beside = [path.with_name(path.stem + end) for end in COMPANION_ENDINGS]
         source = next((p for p in beside if p.is_file()), path)

@@ -53,6 +53,13 @@ def is_plain(path: str | Path) -> bool:
     return os.path.isfile(path)
 
 
+def missing(path: str | Path, expected: str = "a file") -> InputError:
+    """That no file has this name, or that it is a folder."""
+    if os.path.isdir(path):
+        return InputError(f"{path}: is a folder; expected {expected}")
+    return InputError(f"{path}: no such file")
+
+
 def beginning(path: str | Path, length: int) -> bytes:
     """The first bytes of a regular file; empty for other or unreadable files."""
     if not is_plain(path):

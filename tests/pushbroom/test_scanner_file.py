@@ -110,14 +110,25 @@ def test_a_wrong_source_is_said_with_the_kinds_there_are(tmp_path, command, sour
     assert all(kind in told.err for kind in (*KINDS, "source")), told
 
 
-@pytest.mark.parametrize("name", ["image.tif", "folder.json", "object.json"])
+@pytest.mark.parametrize("name", ["image.tif", "folder.json", "object.json", "flight.toml"])
 def test_what_is_no_scanner_image(tmp_path, command, name):
     (tmp_path / "folder.json").mkdir()
     (tmp_path / "image.tif").touch()
     (tmp_path / "object.json").write_text('{"a": 1}')
+    (tmp_path / "flight.toml").write_text("[scanner]\nlines = 9\n[track]\nheight = 5e5\n")
     told = command("pushbroom", "locate", tmp_path / name)
     assert told.status == 2 and told.err.startswith(f"jaxbundle: {tmp_path / name}"), told
-    assert "expected" in told.err, told
+    assert ("simulate" if name == "flight.toml" else "expected") in told.err, told
+
+
+@pytest.mark.parametrize("name", ["folder", "text.csv"])
+def test_what_is_no_raster(tmp_path, command, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "text.csv").write_text("a,b\n1,2\n")
+    scanner, out = write_scanner(tmp_path), tmp_path / "map.tif"
+    told = command("pushbroom", "correct", scanner, tmp_path / name, "--out", out)
+    assert told.status == 2 and "expected a raster, such as a GeoTIFF" in told.err, told
+    assert told.err.startswith(f"jaxbundle: {tmp_path / name}: ") and not out.exists()
 
 
 @pytest.mark.parametrize("column, value, words", [

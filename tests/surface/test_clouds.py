@@ -194,3 +194,9 @@ def test_an_orthophoto_shows_what_the_image_sees_and_nothing_behind_a_roof():
     behind = (x < -1.35) & (x > -1.7) & (np.abs(y + 0.2) < 0.8)
     assert np.isnan(grey[behind]).mean() > 0.9 and np.isfinite(grey[x > 1]).mean() > 0.95
     assert np.nanmax(steep) <= 1 and steep[20, 110] > steep[20, 30]
+
+
+def test_a_folder_where_a_cloud_is_expected(tmp_path, command):
+    told = command("cloud", tmp_path)
+    assert told.status == 2
+    assert told.err.startswith(f"jaxbundle: {tmp_path}: is a folder; expected a cloud, .csv")

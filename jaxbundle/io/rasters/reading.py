@@ -1,5 +1,6 @@
 """Rasters through rasterio: terrain models, and functions common to readers and writers."""
 
+import os
 import warnings
 from pathlib import Path
 from types import ModuleType
@@ -33,8 +34,14 @@ def rasterio() -> ModuleType:
 
 
 def unreadable(path: str | Path, error: Exception) -> InputError:
-    """The message of rasterio about a file, in one line."""
-    return InputError(f"{path}: {' '.join(str(error).split())}")
+    """The message of rasterio about a file, in one line; what GDAL does not know is said as
+    that."""
+    if os.path.isdir(path):
+        return InputError(f"{path}: is a folder; expected a raster, such as a GeoTIFF")
+    said = " ".join(str(error).split())
+    if "not recognized" in said:
+        return InputError(f"{path}: expected a raster, such as a GeoTIFF; GDAL does not know it")
+    return InputError(f"{path}: {said}")
 
 
 def open_plain(path: str | Path, *arguments: str, **options: Any) -> Any:

@@ -12,6 +12,7 @@ from jaxbundle.io.scanner.pvl import read_support_data
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.scanner.scanner_file import REQUIRED_FIELDS, SECTIONS, scanner_of
 from jaxbundle.io.scanner.worldview import read_worldview
+from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.io.text.xml_fields import XmlFields, read_xml
 from jaxbundle.network.columns import show
@@ -37,6 +38,11 @@ def read_scanner(path: str | Path) -> ScannerInput:
         return check_against_rpc(_read_product(path), path)
     if path.suffix.lower() != ".toml" and path.exists():
         raise InputError(f"{path}: expected a scanner file (.toml), {EXPECTED_PRODUCTS}")
+    if path.suffix.lower() == ".toml" and "track" in read_toml(path):
+        raise InputError(
+            f"{path}: a flight file, of an image still to be simulated; simulate it (jaxbundle "
+            "pushbroom simulate), and give the scanner.toml of its folder"
+        )
     # a file with a source needs no other section
     file = read_sections(path, SECTIONS, REQUIRED_FIELDS[:1])
     scanner = file.section("scanner")
