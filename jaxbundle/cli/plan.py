@@ -47,6 +47,8 @@ def plan(  # noqa: PLR0913 - the options of the command
     if out is not None:
         check_folder(out, "plan", FILES, force=force)
     image_format, extent = _require_pair("--image", image), _require_pair("--area", area)
+    if sum(value is not None for value in (height, scale, ground_pixel)) != 1:
+        raise InputError("give one of --height, --scale, --ground-pixel (with --pixel)")
     design = design_block(
         c,
         image_format,

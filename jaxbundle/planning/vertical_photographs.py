@@ -112,9 +112,13 @@ def design_block(
             "pixel": pixel,
         },
     )
+    _check_millimetres(c, image_format)
     for name, overlap in (("forward_overlap", forward_overlap), ("side_overlap", side_overlap)):
         if not 0 <= overlap < 1:
-            raise InputError(f"{name} is {overlap}; a fraction from 0, below 1 is expected")
+            percent = " (60 % is 0.6)" if 1 < overlap < 100 else ""
+            raise InputError(
+                f"{name} is {overlap}; a fraction from 0, below 1 is expected{percent}"
+            )
     if pixel_on_ground is not None:
         if pixel is None:
             raise InputError("pixel_on_ground needs the pixel size (pixel, mm)")
@@ -143,6 +147,24 @@ def design_block(
         sigma_plan=sigma_plan(c, height, sigma_image),
         sigma_height=sigma_height(c, height, base, sigma_image),
     )
+
+
+def _check_millimetres(
+    c: float, image: tuple[float, float], sides: tuple[float, float] = (1.0, 1000.0)
+) -> None:
+    """Refuse a camera in another unit.
+
+    **Arguments:** `sides`: smallest and largest mm of the longer side of a format: the sensors of
+    the smallest cameras, 100 × 100 pixels, have 1 mm; aerial film has 230 mm.
+
+    **Raises:** `InputError`."""
+    low, high = sides
+    if not low <= max(image) <= high:
+        unit = "m" if max(image) < low else "pixels"
+        raise InputError(
+            f"c {c:g} mm and a format of {image[0]:g} × {image[1]:g} mm: are they in {unit}? "
+            "Expected are millimetres"
+        )
 
 
 def _check_lengths(heights: Mapping[str, float | None], others: Mapping[str, float | None]) -> None:

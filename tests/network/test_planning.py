@@ -74,7 +74,10 @@ def test_three_ways_to_give_the_height():
         (dict(height=-1.0), "height is -1.0; it must be positive"),
         (dict(height=1.0, c=float("nan")), "c is nan"),
         (dict(height=1.0, forward_overlap=1.0), "forward_overlap is 1.0"),
+        (dict(height=1.0, forward_overlap=60), r"forward_overlap is 60; .* \(60 % is 0.6\)"),
         (dict(pixel_on_ground=0.1), "needs the pixel size"),
+        (dict(height=1.0, c=0.153, image_format=(0.23, 0.23)), "are they in m"),
+        (dict(height=1.0, c=8000.0, image_format=(6000, 4000)), "are they in pixels"),
     ],
 )
 def test_impossible_plans(changes, message):
@@ -139,7 +142,7 @@ def test_the_command(monkeypatch, capsys, tmp_path):
     code, said = run(monkeypatch, capsys, "plan", *options, "--height", 10)
     assert code == 2 and "photographs: too many for a covariance" in said.err
     code, said = run(monkeypatch, capsys, "plan", *options)
-    assert code == 2 and "give one of height" in said.err
+    assert code == 2 and "give one of --height, --scale, --ground-pixel" in said.err
 
 
 def test_compare_on_the_command_line(monkeypatch, capsys, tmp_path):

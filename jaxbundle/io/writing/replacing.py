@@ -60,6 +60,8 @@ def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
 def unwritable(path: str | Path, error: OSError) -> InputError:
     """Why a file or folder cannot be written, in one line; a full disk is named."""
     why = error.strerror or " ".join(str(error).split())
+    if isinstance(error, FileNotFoundError) and not Path(path).absolute().parent.is_dir():
+        why = f"there is no folder {Path(path).parent}"
     full = error.errno in DISK_FULL and (os.path.isfile(path) or not os.path.exists(path))
     return InputError(f"{path}: cannot be written: {why}{disk_of(path) if full else ''}")
 
