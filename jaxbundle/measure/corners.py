@@ -74,7 +74,7 @@ def memory_of_search(rows: int, columns: int, kind: str) -> float:
     # chessboard that is not there, the worst case, 230 of the largest copy
     if kind in ("charuco", "aprilgrid"):
         return 6 * rows * columns
-    factor = min(1.0, SIDES[-1] / max(rows, columns))
+    factor = min(1.0, SIDES[-1] / max(rows, columns, 1))
     return 230 * factor**2 * rows * columns
 
 

@@ -250,3 +250,13 @@ def test_markers_of_another_dictionary_are_named():
     other = dataclasses.replace(CHARUCO, dictionary="DICT_6X6_250")
     assert other_sizes(picture, other).dictionary == "DICT_4X4_50"
     assert other_sizes(np.full_like(picture, 128), other) is None
+
+
+@pytest.mark.parametrize("content", [b"", b"id,X,Y,Z\n"])
+def test_a_file_that_is_no_photograph_is_said_so(tmp_path, command, content):
+    """Also where no file tells the size of an image, and hence the memory of a search."""
+    path = tmp_path / "control.csv"
+    path.write_bytes(content)
+    told = command("calibrate", path, "--board", "9x6", "--square", 0.03)
+    assert told.status == 2 and str(path) in told.err, told
+    assert "no photograph of 1 shows the board" in told.err
