@@ -1,37 +1,48 @@
 """Mutants: lines that no test guards.
 
-    python tests/mutants.py [NUMBER] [--seed N] [--rooms NAME …] [--workers N] [--list]
+    python tests/mutants.py [NUMBER] [--seed N] [--rooms NAME …] [--tests PATH …] [--seconds S]
+    python tests/mutants.py --again [--seconds S]     those that survived, once more
+    python tests/mutants.py --list
 
 A mutant is the package with one change: a statement or a condition dropped, a comparison turned, an
-argument left out, a number doubled. The tests that execute the changed line are run on it, the
-fastest file first, until one fails; a mutant that none of them notices survives. Whether it changes
-a result, a person must say: `x < 1e-9` may be `x < 2e-9`, and a cache may be left out.
+argument left out, a number doubled. The single tests that execute the changed line run on it, the
+fastest first, until one fails; a mutant that none of them notices survives. Whether it changes a
+result, a person must say: `x < 1e-9` may be `x < 2e-9`, and a cache may be left out.
 
-The first call finds what every test file executes (the time of the whole suite, kept in
-.cache/mutants until a test file changes). Results are appended to out/mutants.jsonl, and a second
-call goes on after the last; `--list` prints those that survived.
+The first call finds what every test executes and how long it takes (twice the time of these tests,
+kept in .cache/mutants until a test file changes). Results are appended to out/mutants.jsonl, and a
+second call goes on after the last.
 """
 
 import argparse
 import ast
-import copy
 import hashlib
 import json
+import multiprocessing
 import os
 import random
 import shutil
-import subprocess
+import signal
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
 from pathlib import Path
-from queue import Queue
+from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).parent.parent
 CACHE, RESULTS = ROOT / ".cache" / "mutants", ROOT / "out" / "mutants.jsonl"
+
+# Before JAX is imported. Programs are kept by their content: that of a changed program is another.
+os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(CACHE / "jax"), "OPENBLAS_NUM_THREADS": "1"}
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+# What every child process needs and no mutant changes; JAX starts its threads later, in the child.
+import equinox, hypothesis, jax, lineax, optimistix, pytest, scipy.optimize  # noqa: E401, E402, F401, I001
+
 ROOMS = ("leastsquares", "network", "orientation", "reconstruction", "tiepoints", "surface")
-TIMES_AS_LONG, LEAST = 4, 60
-"""A mutant that takes this many times as long as the package, and so many seconds, is noticed."""
+TESTS = (*ROOMS, "adjustment", "calibration", "test_bundle.py")
+TIMES_AS_LONG, LEAST = 6, 60
+"""A test that takes this many times as long as with the package, and so many seconds, fails."""
 TURNED = {
     ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -45,40 +56,35 @@ def main() -> int:
     parser.add_argument("number", nargs="?", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=ROOMS, metavar="NAME")
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--tests", nargs="+", default=TESTS, metavar="PATH", help="below tests/")
+    parser.add_argument(
+        "--seconds", type=float, default=120.0, help="of the tests on a mutant, the fastest first"
+    )
+    parser.add_argument("--again", action="store_true")
     parser.add_argument("--list", action="store_true")
-    given = parser.parse_args()
+    options = parser.parse_args()
     lines = RESULTS.read_text(encoding="utf-8").splitlines() if RESULTS.exists() else []
-    known = [json.loads(line) for line in lines]
-    if given.list:
-        for result in known:
-            if not result["noticed"]:
-                print(f"{result['place']}: {result['change']}", *result["after"][:4], sep="\n    ")
+    known = {result["mutant"]: result for result in map(json.loads, lines)}
+    survivors = [name for name, result in known.items() if not result["noticed"]]
+    if options.list:
+        for name in survivors:
+            print(f"{known[name]['place']} {name}", *known[name]["lines"][:4], sep="\n    ")
         return 0
-    executed = what_tests_execute(given.workers)
-    sites = [site for room in given.rooms for site in sites_of(room)]
-    random.Random(given.seed).shuffle(sites)
-    done = {result["place"] for result in known}
-    chosen = [site for site in sites[: given.number] if site.place not in done]
+    sites = [site for room in options.rooms for site in find_sites(room)]
+    if options.again:
+        chosen = [site for site in sites if site.name in survivors]
+    else:
+        random.Random(options.seed).shuffle(sites)
+        chosen = [site for site in sites[: options.number] if site.name not in known]
+    executed = what_tests_execute(options.tests)
     RESULTS.parent.mkdir(exist_ok=True)
-    copies: Queue = Queue()
-    for worker in range(given.workers):
-        copies.put(worker)
-
-    def examine(site) -> dict:
-        worker = copies.get()
-        try:
-            return site.examine(CACHE / f"copy{worker}", executed)
-        finally:
-            copies.put(worker)
-
-    with ThreadPoolExecutor(given.workers) as pool, RESULTS.open("a", encoding="utf-8") as file:
-        for result in pool.map(examine, chosen):
-            known.append(result)
-            print(json.dumps(result, ensure_ascii=False), file=file, flush=True)
-            verdict = f"noticed by {result['noticed']}" if result["noticed"] else "SURVIVED"
-            print(f"{result['place']}: {result['change']}: {verdict}", flush=True)
-    survived = sum(not result["noticed"] for result in known)
+    for site in chosen:
+        known[site.name] = result = examine(site, executed, options.seconds)
+        with RESULTS.open("a", encoding="utf-8") as file:
+            print(json.dumps(result, ensure_ascii=False), file=file)
+        verdict = f"noticed by {result['noticed']}" if result["noticed"] else "SURVIVED"
+        print(f"{result['place']} {site.name}: {verdict} ({result['took']:.0f} s)", flush=True)
+    survived = sum(not result["noticed"] for result in known.values())
     print(f"{survived} of {len(known)} survived ({100 * survived / max(len(known), 1):.1f} %)")
     return 0
 
@@ -87,94 +93,58 @@ def main() -> int:
 
 
 class Site:
-    """One change of one file: `number` is that of its node in `ast.walk`; `inside`: of a function,
-    where the tests that execute its line are known. Others are executed when they are imported."""
+    """A change of one node of a file; `lines`: those that a test must execute to notice it. Its
+    `name` has no line, so that results remain valid when other lines change."""
 
-    def __init__(self, path: Path, number: int, kind: str, node, detail: int, inside: bool):
+    def __init__(self, path: Path, number: int, kind: str, detail: int, node: ast.AST):
         self.path, self.number, self.kind, self.detail = path, number, kind, detail
-        self.inside = inside
-        self.line, self.end = node.lineno, node.end_lineno
-        self.place = f"{path.relative_to(ROOT)}:{node.lineno}:{node.col_offset} {kind} {detail}"
+        self.file = str(path.relative_to(ROOT))
+        self.name = f"{self.file} {kind} {detail}: {ast.unparse(node)[:160]}"
+        last = node.test.end_lineno if isinstance(node, ast.If) else node.end_lineno
+        self.lines = range(node.lineno, last + 1)
 
-    def mutated(self, tree: ast.Module) -> tuple[ast.Module, str, str]:
-        """The changed module, and the changed piece before and after."""
-        tree = copy.deepcopy(tree)
-        nodes = list(ast.walk(tree))
-        node = nodes[self.number]
-        before = ast.unparse(node)
-        if self.kind == "drop":
-            self._replace(tree, node, ast.Pass())
-            return tree, before, "pass"
-        if self.kind == "turn":
-            node.ops[self.detail] = TURNED[type(node.ops[self.detail])]()
-        elif self.kind == "condition":
-            del node.values[self.detail]
-        elif self.kind == "factor":
-            node.right, node.op = node.left, ast.BitOr()  # x & y becomes x | x
-        elif self.kind == "argument":
-            del node.keywords[self.detail]
-        else:
-            node.value = 2 * node.value
-        return tree, before, ast.unparse(node)
-
-    @staticmethod
-    def _replace(tree, old, new) -> None:
-        for parent in ast.walk(tree):
-            for field in ("body", "orelse", "finalbody"):
-                block = getattr(parent, field, None)
-                if isinstance(block, list) and old in block:
-                    block[block.index(old)] = ast.copy_location(new, old)
-
-    def examine(self, folder: Path, executed: dict) -> dict:
-        """Run the tests that execute the line on a copy of the package with the change."""
-        source = self.path.read_text(encoding="utf-8")
-        tree, before, after = self.mutated(ast.parse(source))
-        result = {"place": self.place, "change": f"{before[:120]} → {after[:120]}", "noticed": ""}
-        shutil.rmtree(folder, ignore_errors=True)
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / "jaxbundle", folder / "jaxbundle", ignore=ignored)
-        target = folder / self.path.relative_to(ROOT)
-        target.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
-        name = str(self.path.relative_to(ROOT))
-        lines = set(range(self.line, self.end + 1)) if self.inside else _lines_of_functions(source)
-        tests = [
-            (found["seconds"], test) for test, found in executed.items()
-            if lines & set(found["lines"].get(name, ()))
-        ]  # fmt: skip
-        result["after"] = source.splitlines()[self.line - 1 : self.end]
-        result["tests"] = [test for _, test in sorted(tests)]
-        for seconds, test in sorted(tests):
-            if run_tests(test, folder, max(LEAST, TIMES_AS_LONG * seconds)):
-                return result | {"noticed": test}
-        return result
+    def mutate(self, tree: ast.Module) -> str:
+        """Change the module, and return the changed piece."""
+        node = list(ast.walk(tree))[self.number]
+        match self.kind:
+            case "drop":
+                for parent in ast.walk(tree):
+                    for field in ("body", "orelse", "finalbody"):
+                        block = getattr(parent, field, None)
+                        if isinstance(block, list) and node in block:
+                            block[block.index(node)] = ast.copy_location(ast.Pass(), node)
+                return "pass"
+            case "turn":
+                node.ops[self.detail] = TURNED[type(node.ops[self.detail])]()
+            case "condition":
+                del node.values[self.detail]
+            case "factor":
+                node.right, node.op = node.left, ast.BitOr()  # x & y becomes x | x
+            case "argument":
+                del node.keywords[self.detail]
+            case "double":
+                node.value = 2 * node.value
+        return ast.unparse(node)
 
 
-def sites_of(room: str) -> list[Site]:
+def find_sites(room: str) -> list[Site]:
     """All changes of a room, in the order of its files."""
-    found = []
+    sites, names = [], Counter()
     for path in sorted((ROOT / "jaxbundle" / room).rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        functions = _lines_of_functions(path.read_text(encoding="utf-8"))
-        for number, node in enumerate(ast.walk(tree)):
-            inside = getattr(node, "lineno", 0) in functions
-            found += [Site(path, number, kind, node, k, inside) for kind, k in kinds_of(node)]
-    return found
+        for number, node in enumerate(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+            for kind, detail in changes(node):
+                sites.append(site := Site(path, number, kind, detail, node))
+                names[site.name] += 1
+                site.name += f" ({names[site.name]})" if names[site.name] > 1 else ""
+    return sites
 
 
-def _lines_of_functions(source: str) -> set[int]:
-    """The lines of the bodies of all functions of a module."""
-    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
-    return {k for n in functions for k in range(n.body[0].lineno, n.end_lineno + 1)}
-
-
-def kinds_of(node: ast.AST) -> list[tuple[str, int]]:
-    """The changes of a node that leave a program which may run."""
+def changes(node: ast.AST) -> list[tuple[str, int]]:
+    """The changes of a node that leave a program which may run: kind, and number of the part."""
     match node:
-        case ast.AugAssign() | ast.Expr(value=ast.Call()):
+        case ast.AugAssign() | ast.Expr(value=ast.Call()) | ast.If(orelse=[]):
             return [("drop", 0)]
         case ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
-            return [("drop", 0)]
-        case ast.If(orelse=[]):
             return [("drop", 0)]
         case ast.Compare():
             return [("turn", k) for k in range(len(node.ops))]
@@ -191,54 +161,173 @@ def kinds_of(node: ast.AST) -> list[tuple[str, int]]:
     return []
 
 
+def examine(site: Site, executed: dict, seconds: float) -> dict:
+    """Run the tests that execute the line on a copy of the package with the change."""
+    begin, source = time.monotonic(), site.path.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    inside = {k for node in functions for k in range(node.body[0].lineno, node.end_lineno + 1)}
+    # Lines outside functions are executed when the module is imported: any test may notice them.
+    lines = set(site.lines) if site.lines[0] in inside else inside
+    reaching = [
+        (found["seconds"], test) for test, found in executed.items()
+        if lines & set(found["lines"].get(site.file, ()))
+    ]  # fmt: skip
+    limits, total = {}, 0.0
+    for duration, test in sorted(reaching):
+        total += duration
+        if total < seconds:
+            limits[test] = max(LEAST, TIMES_AS_LONG * duration)
+    change = site.mutate(tree)
+    with TemporaryDirectory(prefix="mutant") as folder:
+        # With its byte code, which is valid for unchanged files.
+        shutil.copytree(ROOT / "jaxbundle", Path(folder, "jaxbundle"))
+        changed = ast.unparse(ast.fix_missing_locations(tree))
+        Path(folder, site.file).write_text(changed, encoding="utf-8")
+        noticed = run_tests_in_child(limits, folder) if limits else None
+    return {
+        "mutant": site.name, "place": f"{site.file}:{site.lines[0]}", "change": change[:160],
+        "lines": source.splitlines()[site.lines[0] - 1 : site.lines[-1]], "noticed": noticed,
+        "tests": len(limits), "reaching": len(reaching), "took": time.monotonic() - begin,
+    }  # fmt: skip
+
+
 # ------------------------------------------------------------------------------- the tests
 
 
-def run_tests(test: str, folder: Path, seconds: float, *how: str) -> bool:
-    """Whether the tests of a file fail, with the package of a folder."""
-    environment = os.environ | {"PYTHONPATH": str(folder), "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, *how, "-m", "pytest", "-x", "-q", "-m", "not further", test]
+def run_in_child(function, *arguments):
+    """Start a function that sends its results to a connection, in a process with what is imported
+    here, and return process and connection."""
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+
+    def run() -> None:
+        os.setsid()  # so that it ends with the processes that it has started
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        sys.dont_write_bytecode = True
+        function(there, *arguments)
+
+    (process := context.Process(target=run)).start()
+    there.close()
+    return process, here
+
+
+def run_pytest(tests: list[str], plugin: object, *options: str) -> int:
+    settings = ("-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+    paths = [str(ROOT / test) for test in tests]
+    return pytest.main([*settings, *options, "--rootdir", str(ROOT), *paths], [plugin])
+
+
+def run_tests_in_child(limits: dict[str, float], folder: str) -> str | None:
+    """The first test that fails with the package of a folder, or takes longer than its limit."""
+
+    def run(connection) -> None:
+        class Teller:
+            def pytest_runtest_logstart(self, nodeid):
+                connection.send(nodeid)
+
+        sys.path.insert(0, folder)
+        os.environ["PYTHONPATH"] = folder
+        connection.send(int(run_pytest(list(limits), Teller(), "-x")))
+
+    process, connection = run_in_child(run)
+    test, status = "the import of the package", None
     try:
-        done = subprocess.run(
-            command, cwd=ROOT, env=environment, timeout=seconds,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return True
-    return done.returncode not in (0, 5)  # 5: no test was left to run
+        while status is None and connection.poll(limits.get(test, 2 * LEAST)):
+            match connection.recv():
+                case int(number):
+                    status = number
+                case name:
+                    test = name
+    except EOFError:  # the process has died
+        pass
+    os.killpg(process.pid, signal.SIGKILL)
+    process.join()
+    return None if status == 0 else test
 
 
-def what_tests_execute(workers: int) -> dict:
-    """Of every test file the seconds it takes and the lines of the package that it executes."""
-    tests = [str(p.relative_to(ROOT)) for p in sorted((ROOT / "tests").rglob("test_*.py"))]
+def what_tests_execute(names) -> dict:
+    """Of every test that passes the seconds that it takes alone, with its fixtures, and the lines
+    of the package that it executes by file."""
     CACHE.mkdir(parents=True, exist_ok=True)
-
-    def examine(test: str) -> dict:
-        digest = hashlib.sha256((ROOT / test).read_bytes()).hexdigest()[:16]
-        kept = CACHE / f"{test.replace('/', '.')}.{digest}.json"
-        if not kept.exists():
-            data = kept.with_suffix(".coverage")
-            begin = time.monotonic()
-            how = ("-m", "coverage", "run", f"--data-file={data}", f"--include={ROOT}/jaxbundle/*")
-            run_tests(test, ROOT, 3600, *how)
-            seconds = time.monotonic() - begin
-            kept.write_text(json.dumps({"seconds": seconds, "lines": read_coverage(data)}))
-            data.unlink(missing_ok=True)
-            print(f"{test}: {seconds:.0f} s", flush=True)
-        return json.loads(kept.read_text(encoding="utf-8"))
-
-    with ThreadPoolExecutor(workers) as pool:
-        return dict(zip(tests, pool.map(examine, tests)))
+    executed = {}
+    for name in names:
+        folder = ROOT / "tests" / name
+        for path in [folder] if folder.is_file() else sorted(folder.rglob("test_*.py")):
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+            kept = CACHE / f"{path.stem}.{digest}.json"
+            if not kept.exists():
+                begin = time.monotonic()
+                _, connection = run_in_child(record_tests, str(path.relative_to(ROOT)))
+                kept.write_text(json.dumps(connection.recv()), encoding="utf-8")
+                print(f"{path.name}: {time.monotonic() - begin:.0f} s", flush=True)
+            executed |= json.loads(kept.read_text(encoding="utf-8"))
+    return executed
 
 
-def read_coverage(path: Path) -> dict[str, list[int]]:
-    """The executed lines by file; none where nothing was executed."""
-    from coverage import CoverageData
+def record_tests(connection, file: str) -> None:
+    """Run the tests of a file, and send what they execute."""
+    from coverage import Coverage
 
-    data = CoverageData(str(path))
-    data.read()
-    name = lambda file: str(Path(file).relative_to(ROOT))
-    return {name(file): sorted(data.lines(file) or ()) for file in data.measured_files()}
+    coverage = Coverage(data_file=None, config_file=False, include=[f"{ROOT}/jaxbundle/*"])
+    recorder = Recorder(coverage)
+    coverage.start()
+    run_pytest([file], recorder, "-m", "not further")
+    coverage.stop()
+    data, lines = coverage.get_data(), {}
+    for path in data.measured_files():
+        for line, contexts in data.contexts_by_lineno(path).items():
+            for context in contexts:
+                of_context = lines.setdefault(context, {})
+                of_context.setdefault(str(Path(path).relative_to(ROOT)), []).append(line)
+    executed = {}
+    for test, fixtures in recorder.fixtures.items():
+        parts = [test, *(name for name in fixtures if name in recorder.seconds)]
+        together: dict[str, set] = {}
+        for part in parts:
+            for path, numbers in lines.get(part, {}).items():
+                together.setdefault(path, set()).update(numbers)
+        executed[test] = {
+            "seconds": sum(recorder.seconds[part] for part in parts),
+            "lines": {path: sorted(numbers) for path, numbers in together.items()},
+        }
+    connection.send(executed)
+
+
+class Recorder:
+    """A pytest plugin that tells `coverage` which test or fixture runs. Functions are traced again
+    for every test, as they are when it runs alone."""
+
+    def __init__(self, coverage):
+        self.coverage, self.running = coverage, [""]
+        self.seconds, self.fixtures = Counter(), {}
+
+    def _run(self, name: str):
+        begin = time.monotonic()
+        self.running.append(name)
+        self.coverage.switch_context(name)
+        result = yield
+        self.running.pop()
+        self.coverage.switch_context(self.running[-1])
+        self.seconds[name] += (elapsed := time.monotonic() - begin)
+        self.seconds[self.running[-1]] -= elapsed
+        return result
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        jax.clear_caches()
+        return (yield from self._run(item.nodeid))
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef):
+        return (yield from self._run(f"fixture {fixturedef.argname}"))
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item):
+        result = yield  # raises where the test fails or is skipped
+        self.fixtures[item.nodeid] = [f"fixture {name}" for name in item.fixturenames]
+        return result
 
 
 if __name__ == "__main__":
