@@ -1,0 +1,102 @@
+"""Tracks in photographs that are similarity transformations of one texture: positions are known."""
+
+import numpy as np
+import pytest
+
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings, measure_tracks
+
+SIDE = 400
+TURN, SCALE = np.radians([0.0, 15.0, 0.0]), np.array([1.0, 1.1, 2.0])
+MIDDLE = SIDE / 2 - 0.5
+
+
+def turn(k):
+    c, s = np.cos(TURN[k]), np.sin(TURN[k])
+    return np.array([[c, -s], [s, c]])
+
+
+def in_photograph(k, xy):
+    """Pixels of points of the texture, which has its origin in the middle of the photographs."""
+    return SCALE[k] * xy @ turn(k).T + MIDDLE
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Three photographs, of which one is turned and one has twice the scale, and tracks of features
+    a fraction of a pixel from the points; the last feature of the first track is 8 pixels wrong."""
+    rng = np.random.default_rng(3)
+    direction, phase = rng.uniform(0, 2 * np.pi, (2, 60))
+    wave = 2 * np.pi / rng.uniform(9, 30, 60) * np.stack([np.cos(direction), np.sin(direction)])
+    v, u = np.indices((SIDE, SIDE))
+    pixels = np.stack([u.ravel(), v.ravel()], 1) - MIDDLE
+    photographs, features = [], []
+    for k in range(3):
+        of_texture = pixels @ turn(k) / SCALE[k]
+        grey = 127 + 10 * np.sin(of_texture @ wave + phase).sum(1).reshape(SIDE, SIDE)
+        grey += rng.normal(size=grey.shape)
+        grey = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+        photographs.append(np.repeat(grey[:, :, None], 3, axis=2))
+    points, n = rng.uniform(-70, 70, (40, 2)), 40
+    for k in range(3):
+        xy = in_photograph(k, points) + SCALE[k] * rng.uniform(-0.4, 0.4, points.shape)
+        xy[0] += 8 * SCALE[k] * (k == 2)
+        size, angle = np.full(n, 7 * SCALE[k]), np.full(n, TURN[k])
+        features.append(Features(xy, size, angle, np.zeros((n, 128), np.uint8)))
+    return photographs, features
+
+
+def measure(scene, **settings):
+    photographs, features = scene
+    tracks = [[(k, t) for k in range(3)] for t in range(len(features[0].xy))]
+    given = TrackMatchingSettings(**settings)
+    return measure_tracks(tracks, features, photographs.__getitem__, settings=given)
+
+
+def by_track(values):
+    return values.reshape(-1, 3, *values.shape[1:])
+
+
+def test_points_are_where_the_texture_is_with_half_the_variance_each(scene):
+    """The window is that of the feature of median size, its point the pixel nearest to it; the
+    photograph of twice the scale is matched on level 1."""
+    measured = measure(scene)
+    xy, sigma = by_track(measured.xy), by_track(measured.sigma)
+    assert by_track(measured.is_template)[:, 1].all() and measured.is_template.sum() == len(xy)
+    np.testing.assert_array_equal(xy[:, 1], np.rint(scene[1][1].xy))
+    np.testing.assert_array_equal(by_track(measured.level)[1:], [[0, 0, 1]] * (len(xy) - 1))
+    point = (xy[:, 1] - MIDDLE) @ turn(1) / SCALE[1]
+    for k in (0, 2):
+        error = (xy[:, k] - in_photograph(k, point))[1:]
+        # both windows have noise: σ² of each is half of that of the match
+        length = error / (np.sqrt(2) * sigma[1:, k])
+        assert 0.75 < np.sqrt(np.mean(length**2)) < 1.35, k
+    of_level = sigma / 2.0 ** np.maximum(by_track(measured.level), 0)[..., None]
+    np.testing.assert_allclose(sigma[1:, 1] ** 2, (of_level[1:, ::2] ** 2).mean(1))
+    np.testing.assert_allclose(sigma[0, 1], sigma[0, 0])  # its other match failed
+
+
+def test_features_without_a_match_stay_where_they_are(scene):
+    """The wrong one, as far from its feature as the point of the window, turned and scaled; and all
+    if no match is exact enough. σ grows with their size."""
+    measured = measure(scene)
+    assert np.flatnonzero(measured.level < 0).tolist() == [2]
+    offset = SCALE[2] / SCALE[1] * turn(2) @ turn(1).T @ (measured.xy[1] - scene[1][1].xy[0])
+    np.testing.assert_allclose(measured.xy[2], scene[1][2].xy[0] + offset)
+    np.testing.assert_allclose(measured.sigma[2], 0.12 * 7 * SCALE[2])
+    none = measure(scene, max_sigma=1e-6)
+    assert (none.level == -1).all()
+    features = np.stack([one.xy for one in scene[1]], 1)
+    np.testing.assert_array_equal(by_track(none.xy), features)
+    np.testing.assert_allclose(by_track(none.sigma), np.tile(0.84 * SCALE[:, None], (40, 1, 2)))
+
+
+def test_sigma_has_a_floor_in_quadrature(scene):
+    """Otherwise strong edges, whose σ by noise alone is thousandths of a pixel, outweigh the other
+    measurements a hundred times."""
+    with_floor, without = measure(scene, min_sigma=0.05), measure(scene, min_sigma=0.0)
+    scale = np.where(with_floor.level < 0, 0.0, 2.0**with_floor.level)[:, None]
+    difference = with_floor.sigma**2 - without.sigma**2
+    np.testing.assert_allclose(difference, np.tile((0.05 * scale) ** 2, 2), rtol=1e-6)
+    default = measure(scene)
+    assert (default.sigma >= 0.01 * scale).all() and (without.sigma < 0.02).any()
