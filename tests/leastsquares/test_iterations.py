@@ -1,10 +1,13 @@
 """Where iterations end: the rules of stopping on problems whose iterations are known by hand."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxbundle import leastsquares as ls
+from jaxbundle.leastsquares.iterations.stopping import STOPPING, Approach
 
 ANGLE = ls.Kind("angle", lambda x, measured: jnp.arctan(x) - measured, of=("x",))
 
@@ -20,3 +23,37 @@ def test_gauss_newton_that_diverges_has_not_converged(start):
     damped = ls.adjust(*problem)
     assert damped.converged
     np.testing.assert_allclose(damped["x"].value, 0.0, atol=1e-6)
+
+
+STEP = {"last_size": 1.0, "first": False, "accept": True, "predicted": 0.04, "gain_ratio": 0.99}
+
+
+@pytest.mark.parametrize("other", [
+    {}, {"gain_ratio": 0.9}, {"predicted": 0.06}, {"predicted": 0.15}, {"first": True},
+    {"accept": False},
+])  # fmt: skip
+def test_the_damping_is_dropped_where_steps_converge_quadratically(other):
+    """Gain ratio near 1, and a predicted decrease below a tenth of the cost and half of the one
+    before: 0.1 in the first case and all others but that of 0.15, which is below half of 1."""
+    before = jnp.asarray(1.0 if other.get("predicted") == 0.15 else 0.1)
+    approach = dataclasses.replace(Approach.begin(STOPPING), predicted=before)
+    step = {name: jnp.asarray(value) for name, value in (STEP | other).items()}
+    size, after = approach.choose_step(jnp.asarray(3.0), cost=jnp.asarray(1.0), **step)
+    assert size == (3.0 if other else jnp.inf)
+    assert after.predicted == (step["predicted"] if step["accept"] else before)
+    # equations that could not be solved without damping are damped to the end
+    singular = dataclasses.replace(approach, singular=jnp.asarray(True))
+    assert singular.choose_step(jnp.asarray(3.0), cost=jnp.asarray(1.0), **step)[0] == 3.0
+
+
+@pytest.mark.parametrize("last_size, again", [(1.0, jnp.inf), (jnp.inf, 3.0)])
+def test_a_rejected_undamped_step_was_tried_too_early(last_size, again):
+    """After it, a decrease ten times smaller counts as near the minimum; a rejected damped step
+    changes nothing."""
+    approach = dataclasses.replace(Approach.begin(STOPPING), predicted=jnp.asarray(0.1))
+    step = {name: jnp.asarray(value) for name, value in STEP.items()}
+    sizes = {"step_size": jnp.asarray(3.0), "cost": jnp.asarray(1.0)}
+    rejected = {"last_size": jnp.asarray(last_size), "accept": jnp.asarray(False)}
+    _, approach = approach.choose_step(**sizes, **(step | rejected))
+    assert approach.choose_step(**sizes, **step)[0] == again
+    assert approach.choose_step(**sizes, **(step | {"predicted": jnp.asarray(0.009)}))[0] == jnp.inf
