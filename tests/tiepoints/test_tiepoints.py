@@ -12,20 +12,27 @@ from jaxbundle.errors import InputError
 from jaxbundle.tiepoints.camera_starts import start_cameras
 from jaxbundle.tiepoints.closure import (
     ClosureMinimum,
+    ClosureSettings,
     close_rotations,
     count_independent,
     find_loops,
 )
-from jaxbundle.tiepoints.coplanarity import estimate_interior
+from jaxbundle.tiepoints.coplanarity import CoplanaritySettings, estimate_interior
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import FeatureMatches, distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
-from jaxbundle.tiepoints.still import without_marks
+from jaxbundle.tiepoints.search import _with_ideal
+from jaxbundle.tiepoints.still import MarkSettings, without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
-from jaxbundle.tiepoints.verification import Pair, rotation_angle, verify_pairs
+from jaxbundle.tiepoints.verification import (
+    Pair,
+    VerificationSettings,
+    rotation_angle,
+    verify_pairs,
+)
 
 SIZE, F, K1 = (1200, 900), 1000.0, -0.1
 
@@ -137,6 +144,26 @@ def test_loops_are_three_photographs_with_three_pairs():
     assert count_independent(pairs) == 2
     apart = pairs + [(i + 9, j + 9) for i, j in pairs]
     assert count_independent(apart) == 4 and count_independent([]) == 0
+
+
+def test_numbers_of_matches_and_loops_follow_from_one_another():
+    """A pair is oriented by so many matches; as many must have moved beside marks, and remain when
+    a third of those that give the principal distance are wrong. Four photographs with all their
+    pairs have one independent loop more than there are unknowns, c and K1."""
+    oriented = VerificationSettings().min_matches
+    assert MarkSettings().min_moved == oriented
+    assert CoplanaritySettings().min_matches * 2 / 3 == oriented
+    all_pairs = list(combinations(range(4), 2))
+    assert ClosureSettings().min_loops == count_independent(all_pairs) == 2 + 1
+
+
+def test_matches_need_rays_in_both_photographs():
+    """A feature outside the valid field of the camera has none."""
+    ideal = [np.zeros((4, 2)), np.zeros((4, 2))]
+    ideal[0][1], ideal[1][2, 0] = np.nan, np.nan
+    rows = np.tile(np.arange(4)[:, None], 2)
+    matches = FeatureMatches((0, 1), rows, np.arange(4.0), np.ones(4, bool))
+    assert _with_ideal(ideal, matches).rows[:, 0].tolist() == [0, 3]
 
 
 def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
