@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxbundle import leastsquares as ls
+from jaxbundle.leastsquares.datum.conditions import DATUM_MOTION, moves_on
 from jaxbundle.leastsquares.iterations.stopping import STOPPING, Approach
 
 ANGLE = ls.Kind("angle", lambda x, measured: jnp.arctan(x) - measured, of=("x",))
@@ -57,3 +58,13 @@ def test_a_rejected_undamped_step_was_tried_too_early(last_size, again):
     _, approach = approach.choose_step(**sizes, **(step | rejected))
     assert approach.choose_step(**sizes, **step)[0] == again
     assert approach.choose_step(**sizes, **(step | {"predicted": jnp.asarray(0.009)}))[0] == jnp.inf
+
+
+def test_a_motion_to_the_datum_ends():
+    """It goes on while its steps are long, or halve; never without end, as a step that turns to and
+    fro would."""
+    size, most = np.float64(1.0), DATUM_MOTION.max_steps
+    near, arrived = 0.5 * DATUM_MOTION.small, 0.5 * DATUM_MOTION.reached
+    assert moves_on(size, 0.5, 0.4, most - 1) and not moves_on(size, 0.5, 0.4, most)
+    assert moves_on(size, near, 2.1 * near, 1) and not moves_on(size, near, 1.9 * near, 1)
+    assert not moves_on(size, arrived, 1.0, 1)
