@@ -154,7 +154,7 @@ def changes(node: ast.AST) -> list[tuple[str, int]]:
             return [("factor", 0)]
         case ast.Call():
             return [("argument", k) for k, word in enumerate(node.keywords) if word.arg]
-        case ast.Constant(value=float()):
+        case ast.Constant(value=float()) if node.value:
             return [("double", 0)]
         case ast.Constant(value=int()) if node.value > 2 and node.value is not True:
             return [("double", 0)]

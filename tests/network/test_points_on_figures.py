@@ -6,6 +6,7 @@ from further_checks import check_jacobians, sample
 
 import jaxbundle
 from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.build import make_further
 from jaxbundle.network.kinds.fit_figures import fit
 
@@ -113,6 +114,16 @@ def test_figures_are_found(simulated, result):
     report = result.report()
     for words in ("Plane", "Radius of cylinder", "the sphere", "known shapes", "angles"):
         assert words in report
+
+
+def test_known_shapes_start_where_their_points_are(simulated):
+    """Each from its own points: x = M·(X − X0) holds for every point of the true network."""
+    start = jaxbundle.make_problem(conditioned(simulated.truth, SIGMA)).data.start
+    pose, X = start["shape"], np.asarray(start["point"])[-2 * len(BOARD) :]
+    for k in range(2):
+        M = np.asarray(matrix_from_quaternion(pose.rotation[k]))
+        x = (X[len(BOARD) * k :][: len(BOARD)] - pose.position[k]) @ M.T
+        np.testing.assert_allclose(x, BOARD, atol=1e-9)
 
 
 def test_jacobians(result):
