@@ -16,6 +16,7 @@ second call goes on after the last.
 
 import argparse
 import ast
+import functools
 import hashlib
 import json
 import multiprocessing
@@ -82,8 +83,9 @@ def main() -> int:
         known[site.name] = result = examine(site, executed, options.seconds)
         with RESULTS.open("a", encoding="utf-8") as file:
             print(json.dumps(result, ensure_ascii=False), file=file)
-        verdict = f"noticed by {result['noticed']}" if result["noticed"] else "SURVIVED"
-        print(f"{result['place']} {site.name}: {verdict} ({result['took']:.0f} s)", flush=True)
+        survived = f"SURVIVED {result['tests']} tests of {result['reaching']}"
+        verdict = f"noticed by {result['noticed']}" if result["noticed"] else survived
+        print(f"{site.lines[0]}: {site.name}: {verdict} ({result['took']:.0f} s)", flush=True)
     survived = sum(not result["noticed"] for result in known.values())
     print(f"{survived} of {len(known)} survived ({100 * survived / max(len(known), 1):.1f} %)")
     return 0
@@ -161,18 +163,29 @@ def changes(node: ast.AST) -> list[tuple[str, int]]:
     return []
 
 
+@functools.cache
+def read_file(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
 def examine(site: Site, executed: dict, seconds: float) -> dict:
     """Run the tests that execute the line on a copy of the package with the change."""
     begin, source = time.monotonic(), site.path.read_text(encoding="utf-8")
     tree = ast.parse(source)
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     inside = {k for node in functions for k in range(node.body[0].lineno, node.end_lineno + 1)}
-    # Lines outside functions are executed when the module is imported: any test may notice them.
-    lines = set(site.lines) if site.lines[0] in inside else inside
+    # Lines outside functions, such as defaults, are executed when the module is imported: tests of
+    # its functions, and of files that name it, may notice them.
+    in_function = site.lines[0] in inside
+    lines = set(site.lines) if in_function else inside
+    module = site.file.removesuffix(".py").replace("/", ".")
     reaching = [
-        (found["seconds"], test) for test, found in executed.items()
+        (found["seconds"], test)
+        for test, found in executed.items()
         if lines & set(found["lines"].get(site.file, ()))
-    ]  # fmt: skip
+        or not in_function
+        and module in read_file(ROOT / test.split("::")[0])
+    ]
     limits, total = {}, 0.0
     for duration, test in sorted(reaching):
         total += duration

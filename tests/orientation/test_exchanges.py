@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxbundle.orientation.alignment import similarity_of_most
+from jaxbundle.orientation.alignment import similarity, similarity_of_most
 from jaxbundle.orientation.exchanges import contradiction
 
 RNG = np.random.default_rng(5)
@@ -62,6 +62,22 @@ def test_the_tolerance_is_that_of_the_sigma_of_control():
     far = target.copy()
     far[[0, 2]] = far[[2, 0]] + [[30, 0, 0], [-30, 0, 0]]
     assert contradiction(source, far, np.full((9, 3), 0.5)) is not None
+
+
+def test_the_similarity_of_few_points_is_that_of_all():
+    """Least squares after Umeyama (1991): of five points none is taken for wrong, since one that is
+    draws the seven unknowns so far that it does not show."""
+    random = np.random.default_rng(3823)  # one residual is 11 times the median
+    source = random.normal(size=(5, 3)) * random.uniform(0.1, 3, (5, 1))
+    target = source + 0.01 * random.normal(size=(5, 3))
+    target[0] += random.normal(size=3)
+    a, b = source - source.mean(0), target - target.mean(0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
+    expected = (S @ sign) / (a**2).sum() * (U * sign) @ Vt
+    A, t = similarity(source, target)
+    np.testing.assert_allclose(A, expected, atol=1e-9)
+    np.testing.assert_allclose(A @ source.mean(0) + t, target.mean(0), atol=1e-9)
 
 
 def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():

@@ -113,6 +113,23 @@ def test_both_solutions_of_a_plane():
     assert (batch(planar_orientations)(xy1, xy2).status == Status.NO_BASE).all()
 
 
+def test_a_plane_must_be_in_front_of_the_second_camera_too():
+    """One point of the plane behind it has an image by the formulas: no solution is possible with
+    it, and the true one without."""
+    random = np.random.default_rng(6)
+    X = np.column_stack([random.uniform(2, 8, n), random.uniform(-2, 2, n), np.full(n, -5.0)])
+    X[0, 0] = -4.0
+    base, M = np.array([0.5, 0.2, -1.5]), Rotation.from_euler("y", 55, degrees=True).as_matrix()
+    images = X, (X - base) @ M.T
+    assert (images[1][:, 2] > 0).tolist() == [True] + [False] * (n - 1)
+    xy1, xy2 = (-x[:, :2] / x[:, 2:] for x in images)
+    weights = np.stack([np.ones(n), np.arange(n) > 0.0])
+    found = batch(planar_orientations)(np.stack([xy1] * 2), np.stack([xy2] * 2), weights)
+    error = np.abs(found.M - M).max((2, 3))
+    np.testing.assert_allclose(error.min(1), 0, atol=1e-9)
+    assert not found.possible[0].any() and found.possible[1, error[1].argmin()]
+
+
 def test_against_scipy():
     """The least corrections of all four coordinates of every point, with the points as unknowns:
     to first order those of Sampson. And its own misclosures, minimised by scipy, exactly."""
