@@ -189,7 +189,7 @@ def examine(site: Site, executed: dict, seconds: float) -> dict:
     limits, total = {}, 0.0
     for duration, test in sorted(reaching):
         total += duration
-        if total < seconds:
+        if total < seconds or not limits:
             limits[test] = max(LEAST, TIMES_AS_LONG * duration)
     change = site.mutate(tree)
     with TemporaryDirectory(prefix="mutant") as folder:
