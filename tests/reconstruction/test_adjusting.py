@@ -9,7 +9,7 @@ import pytest
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.planning.stations import stations_looking_at
-from jaxbundle.reconstruction import adjusting
+from jaxbundle.reconstruction import adjusting, starting
 
 COLUMNS = 18
 
@@ -39,6 +39,24 @@ def test_without_points_of_three_rays_the_first_attempt_counts(monkeypatch, firs
     else:
         assert call() is unfinished
     assert len(attempts) == 2
+
+
+def test_rays_that_agree_are_counted_with_new_positions_of_tie_points():
+    """Those of a network whose tie points had wrong start values, at the oriented photographs."""
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(
+        ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0
+    )
+    moved = network.points.position + np.random.default_rng(2).normal(size=(16, 3))
+    wrong = network.replace(points=dataclasses.replace(network.points, position=moved))
+    images = network.images
+    oriented = SimpleNamespace(
+        converged=False,
+        camera_parameters=lambda id: camera.parameters,
+        image_values=np.concatenate([images.position, images.angles], 1),
+    )
+    result = adjusting.WeightedAdjustment(oriented, {}, 0)
+    assert adjusting._count_agreeing(wrong, result, 0.001) == len(network.observations) == 64
 
 
 @pytest.mark.parametrize("removed, confirmed", [(4, True), (40, True), (40, False)])
@@ -134,3 +152,14 @@ def test_points_of_two_rays_at_different_columns_do_not_distort_the_others(share
     assert done.unused_points == (two.sum() if wrong.any() else 0)
     # those at the neighbouring column agree only by chance
     assert number - 2 * wrong.sum() <= done.agreeing_rays <= number - wrong.sum()
+
+
+def test_start_values_that_leave_out_the_fewest_photographs_come_first(monkeypatch):
+    """With a narrow tolerance three are left out, with the wide one only one."""
+    left_out = {starting.StartValueSettings().tolerance: "abc", starting.TOLERANCE: "d"}
+    assert len(left_out) == 2
+    orient = lambda network, tolerance, *_: SimpleNamespace(images=left_out[tolerance])
+    monkeypatch.setattr(starting, "_orient", orient)
+    monkeypatch.setattr(starting, "_try_other_distances", lambda *_: ())
+    found = starting.start_values(SimpleNamespace(images="abcdefgh"), (), {})
+    assert [oriented.images for oriented in found] == ["d", "abc"]

@@ -2,6 +2,7 @@
 changes."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -39,6 +40,17 @@ def test_distant_points_of_two_rays_do_not_define_the_datum():
     without = keep_points(network, np.array([id != distant for id in network.points.id]))
     near = jaxbundle.adjust(without.replace(datum_points=chosen))
     assert (sigma(result) < 1.02 * sigma(near)).all()
+
+
+def test_distant_points_of_all_photographs_do_not_define_the_datum():
+    """Their rays are nearly parallel; one that is alone in its part of the photographs, too."""
+    targets = np.vstack([grid_of_targets(7, 7, 0.5, relief=0.3, seed=1), [[60.0, 10.0, -200.0]]])
+    camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
+    network = simulate(ring_of_stations(6, 2.5, 6.0), targets, camera, noise=0.0, datum="inner")
+    assert np.bincount(network.observations.point).tolist() == [6] * 50
+    problem = jaxbundle.make_problem(network)
+    chosen = choose_datum_points(SimpleNamespace(problem=problem, values=problem.data.start))
+    assert network.points.id[-1] not in chosen and len(chosen) >= 12
 
 
 def test_every_photograph_has_datum_points_in_all_its_parts():
