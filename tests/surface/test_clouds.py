@@ -109,6 +109,9 @@ def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
         row, column = raster.index(500_007.0, 5_000_013.0)
         np.testing.assert_allclose(raster.read(1)[row, column], dsm.height[row, column])
         assert abs(dsm.height[row, column] - (30 + 1.4 - 1.3)) < 0.3
+        assert raster.descriptions == ("height",)
+    with rasterio.open(tmp_path / "sigma.tif") as raster:
+        assert raster.descriptions == ("sigma of height",)
 
 
 def test_gaps_of_a_dsm_are_filled_inside_only(plane):
