@@ -51,7 +51,7 @@ def test_the_score_is_overlap_times_the_weight_of_the_angle(base):
 def test_of_depths_the_best_counts_and_images_far_apart_are_no_pair():
     hills = lambda uv: np.tile([-400.0, 60.0], (len(uv), 1))
     flat = lambda uv: np.full((len(uv), 2), -55.0)  # the middle of the three depths
-    at_depths = [score(Vertical(0.0), lambda uv: np.full((len(uv), 2), q), Vertical(60.0))
+    at_depths = [score(Vertical(0.0), lambda uv, q=q: np.full((len(uv), 2), q), Vertical(60.0))
                  for q in (-285.0, -170.0, -55.0)]  # fmt: skip
     assert score(Vertical(0.0), hills, Vertical(60.0)) == max(at_depths) > min(at_depths)
     assert score(Vertical(0.0), flat, Vertical(300.0)) == 0.0

@@ -63,7 +63,10 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeyp
     e = cloud.X[:, 2] - truth[0][v, u][:, 2]
     assert np.median(np.abs(e)) < 0.02 and (np.abs(e) > 0.3).mean() < 0.01
     assert report["sigma_includes"] == ["matching"]
-    first, *_ = (out / "report.txt").read_text().splitlines()
+    first, *lines = (out / "report.txt").read_text().splitlines()
+    assert all(any(line.startswith(f"σ{axis}  mean ") for line in lines) for axis in "XYZ")
+    for row in report["images"]:
+        assert row["matched"] + sum(row["rejected"].values()) == row["points"]
     assert "project.toml" in first and "computed 2001-09-09 01:46 UTC, jaxbundle" in first
     assert report["check_points"]["points"] == 9 and report["check_points"]["rms_Z"] < 0.05
     with rasterio.open(out / "dsm.tif") as raster, rasterio.open(out / "orthophoto.tif") as photo:
