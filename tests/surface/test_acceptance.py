@@ -1,4 +1,4 @@
-"""What is done with matches, whose points and residuals are given."""
+"""What is done with matches, whose points and residuals are given, and what is not matched."""
 
 from collections import Counter
 from types import SimpleNamespace
@@ -6,9 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surface import relative
+from jaxbundle.surface.dense_ground import DenseSettings, _match_piece
 from jaxbundle.surface.intersection import IntersectedPoints
 from jaxbundle.surface.matching import MatchingSettings, _accept
+from jaxbundle.surface.subpixel_matching import refine
 
 
 def test_every_rejected_point_has_one_reason():
@@ -56,3 +59,20 @@ def test_an_image_is_shifted_by_what_its_matches_are_beside_their_lines(monkeypa
     else:
         assert found == pytest.approx(true + sum(rest))
         np.testing.assert_allclose(other.shift, [-found, 2.0])
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_windows_at_the_edge_of_the_other_image_are_not_matched(side):
+    """Beyond it there are no grey values; they would be those of the edge."""
+    image = SimpleNamespace(grey=np.random.default_rng(0).uniform(size=(60, 60)), size=(60, 60))
+    start = np.array([[29.5 + side * 25.0, 30.0]])
+    found = refine(image, image, np.array([[30.0, 30.0]]), start, np.eye(2)[None], 4)
+    assert found.status == int(MatchingStatus.OUTSIDE) and np.isnan(found.rho).all()
+
+
+def test_a_piece_with_few_nodes_of_the_guide_is_not_straightened():
+    """Four in the corner of an image determine no direction of epipolar lines."""
+    nodes = np.zeros(9, int), np.arange(9), np.column_stack([10.0 * np.arange(9), np.zeros(9)])
+    guide, window = SimpleNamespace(good_nodes=lambda: nodes), (0, 0, 39, 39)
+    found = _match_piece(None, None, guide, None, window, np.zeros((0, 2)), DenseSettings())
+    assert found is None
