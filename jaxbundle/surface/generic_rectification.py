@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
 
 from jaxbundle.surface.segments import windows
 from jaxbundle.surface.views import OrientedImage, Places
@@ -102,15 +103,15 @@ def _sample_other(
     # positions of a scanner are so smooth that a node every 47 pixels is enough.
     nodes_per_side = 33
     r, c = (np.linspace(0, n - 1, nodes_per_side) for n in shape)
-    nodes = np.stack(np.meshgrid(c - pair.lowest, r), -1).reshape(-1, 2)
-    uv = pair.base_places(nodes)
+    uv = pair.base_places(np.stack(np.meshgrid(c - pair.lowest, r), -1).reshape(-1, 2))
     places = other.project(base.points(uv, np.full(len(uv), pair.q0)))
     places = places.reshape(nodes_per_side, nodes_per_side, 2)
     places = np.where(np.isfinite(places), places, -1e4)
-    y, x = np.mgrid[0:rows, 0:columns]
-    last = nodes_per_side - 1
-    node = [y * (last / max(rows - 1, 1)), x * (last / max(columns - 1, 1))]
-    fine = [ndimage.map_coordinates(places[..., k], node, order=3, mode="nearest") for k in (0, 1)]
+    # By FITPACK, whose splines (not-a-knot) continue at the edges: those of scipy.ndimage have no
+    # slope there, and are wrong by a tenth of the distance of two nodes.
+    nodes = np.arange(nodes_per_side)
+    y, x = (np.arange(n) * (nodes[-1] / max(n - 1, 1)) for n in shape)
+    fine = [RectBivariateSpline(nodes, nodes, places[..., k])(y, x) for k in (0, 1)]
     return _sample(other, np.stack(fine, -1).reshape(-1, 2)).reshape(shape)
 
 

@@ -19,6 +19,8 @@ def adjusted(start=START, rows=ENDS, rise=RISE, free=(False, True, True), labels
     (dict(start=[100.0, np.nan, 103.5]), "height 2: a start value is not a finite number"),
     (dict(start=np.ma.array(START, mask=[0, 0, 1])), "height 3: a start value"),
     (dict(start=["100", "101", "103"]), "the start values must be arrays of numbers"),
+    (dict(start=101.0), "the values must be arrays of rows"),
+    (dict(start=()), "the values must be arrays of rows"),
     (dict(free="yes"), "`free` must be truth values"),
     (dict(free=[[True, False]] * 3), r"`free` must be \[rows, 1\]"),
     (dict(rows=([0, 1, 0.5], [1, 2, 2])), "row numbers or labels, not 0.5"),
