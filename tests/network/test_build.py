@@ -8,7 +8,9 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
-from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.build import make_cameras, make_further, make_network
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.network.units import to_image_unit
 
 CAMERAS = [{"id": "a", "c": 50.0, "free": "c, x0", "sigma": {"c": 0.1}}]
@@ -220,3 +222,26 @@ def test_cameras_may_be_given_as_such():
     camera = Camera("a", "brown", {"c": 50.0})
     assert build(cameras=camera).cameras == (camera,)
     assert make_cameras({"id": "a", "c": 50.0}) == (camera,)
+
+
+def test_names_are_listed_only_where_they_are_few():
+    """A network may have thousands of images: of these only the closest one is named."""
+    assert did_you_mean("i10", ["other", "more"]) == "; known: other, more"
+    assert did_you_mean("i10", ["other", "more"], listing=False) == ""
+    assert did_you_mean("othr", ["other", "more"], listing=False) == "; did you mean 'other'?"
+    assert did_you_mean("i10", []) == ""
+
+
+def test_unknown_images_of_priors_are_named_with_their_row():
+    given = make_network(
+        [{"id": "cam", "c": 100.0}],
+        [{"id": id, "camera": "cam"} | dict.fromkeys(EXTERIOR, 0.0) for id in ("a", "b")],
+        [{"id": "p", "role": "tie", "X": 0.0, "Y": 0.0, "Z": 0.0}],
+        [{"image": id, "point": "p", "x": 0.0, "y": 0.0} for id in ("a", "b")],
+        image_unit="mm",
+    )
+    row = dict.fromkeys(EXTERIOR, 0.0) | {f"s{name}": 0.1 for name in EXTERIOR}
+    rows = [{"image": id} | row for id in ("a", "elsewhere")]
+    (priors,) = make_further({"exterior_priors": rows}, 1.0)
+    with pytest.raises(InputError, match="exterior_priors, row 2: .*'elsewhere'"):
+        priors.check(given)
