@@ -31,6 +31,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).parent.parent
+BEGIN = time.time()
 CACHE, RESULTS = ROOT / ".cache" / "mutants", ROOT / "out" / "mutants.jsonl"
 
 # Before JAX is imported. Programs are kept by their content: that of a changed program is another.
@@ -191,6 +192,8 @@ def examine(site: Site, executed: dict, seconds: float) -> dict:
         total += duration
         if total < seconds or not limits:
             limits[test] = max(LEAST, TIMES_AS_LONG * duration)
+    if any((ROOT / test.split("::")[0]).stat().st_mtime > BEGIN for test in limits):
+        sys.exit("a test file has changed: start again")
     change = site.mutate(tree)
     with TemporaryDirectory(prefix="mutant") as folder:
         # With its byte code, which is valid for unchanged files.
