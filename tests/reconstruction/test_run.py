@@ -1,0 +1,53 @@
+"""Stages of a reconstruction whose parts are given."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxbundle.reconstruction import aspect_ratio, reconstruct
+from jaxbundle.reconstruction.reconstruct import ReconstructionSettings, _ReconstructionRun
+from jaxbundle.tiepoints.matching import FeatureMatches
+
+
+@pytest.fixture
+def run():
+    photographs = [
+        SimpleNamespace(name=f"{k}.jpg", fingerprint=str(k), size=(9, 6)) for k in range(3)
+    ]
+    return _ReconstructionRun(
+        photographs, {}, SimpleNamespace(notes=()), ReconstructionSettings(),
+        SimpleNamespace(drop_unused=lambda: None), lambda *_: None, SimpleNamespace(positions=None),
+    )  # fmt: skip
+
+
+def test_pairs_with_matches_are_known_with_those_that_are_only_marks(run, monkeypatch):
+    """They were compared, whatever was found: without them superimposed parts would not show.
+    Duplicates take no part."""
+    rows = np.zeros((4, 2), int)
+    matches = [FeatureMatches(pair, rows, np.ones(4), np.ones(4, bool))
+               for pair in ((0, 1), (0, 2), (1, 2))]  # fmt: skip
+    monkeypatch.setattr(run, "_detect", lambda: [])
+    monkeypatch.setattr(reconstruct, "match", lambda *_: matches)
+    monkeypatch.setattr(reconstruct, "find_duplicates", lambda *_: {2: (0, 4, 4)})
+    monkeypatch.setattr(reconstruct, "without_marks", lambda *_: ([], 2))
+    assert run._match() == ([], [])
+    assert run.matched_pairs == {(0, 1)} and run.left_out.keys() == {"2.jpg"}
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
+    run, monkeypatch, confirmed
+):
+    """Otherwise the adjustment with square pixels is the result."""
+    ratio = aspect_ratio.Ratio(0.02, 0.001)
+    monkeypatch.setattr(aspect_ratio, "contradicted_ratios", lambda _: {"cam": ratio})
+    monkeypatch.setattr(aspect_ratio, "replicated_ratios", lambda _: {"cam": (ratio, ratio)})
+    monkeypatch.setattr(aspect_ratio, "is_replicated", lambda *_: confirmed)
+    monkeypatch.setattr(aspect_ratio, "release", lambda network, ids: (network, [*ids]))
+    monkeypatch.setattr(reconstruct.dataclasses, "replace", lambda _, network: network)
+    monkeypatch.setattr(run, "_adjust", lambda network, measured: (network, "again"))
+    oriented, weighted = SimpleNamespace(network="network"), SimpleNamespace(adjustment=None)
+    found = run._check_ratios(oriented, weighted, None, "first")
+    assert found == ((("network", ["cam"]), "again") if confirmed else (weighted, "first"))
+    assert ("are not square" in run.notes[-1]) == confirmed
