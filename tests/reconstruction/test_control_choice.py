@@ -1,4 +1,4 @@
-"""Rays of doubtful control points are compared with their coordinates in the frame of the others."""
+"""Rays of doubtful control points are compared with coordinates in the frame of the others."""
 
 from types import SimpleNamespace
 
