@@ -1,0 +1,25 @@
+"""Principal distances that are tried when the first fails."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from jaxbundle import Camera
+from jaxbundle.reconstruction import starting
+
+
+def test_other_distances_of_cameras_that_files_do_not_tell(monkeypatch):
+    """Relative to the longer side, for all guessed cameras at once; not the present one again."""
+    monkeypatch.setattr(starting, "_with_distances", lambda network, distances: distances)
+    settings = starting.StartValueSettings(other_distances=(0.8, 1.2, 2.0), distinct_ratio=1.1)
+    camera = lambda id, f, size: Camera(id, "opencv", {"fx": f, "fy": f}, image_size=size)
+    network = SimpleNamespace(cameras=[
+        camera("a", 1200.0, (1000, 700)), camera("b", 2400.0, (1400, 2000)),
+        camera("told", 900.0, (1000, 700)), camera("without size", 900.0, None),
+    ])  # fmt: skip
+    found = list(starting._try_other_distances(network, ["a", "b", "without size"], settings))
+    expected = [{"a": 800.0, "b": 1600.0}, {"a": 2000.0, "b": 4000.0}]
+    assert [one.keys() for one in found] == [one.keys() for one in expected]
+    for one, distances in zip(found, expected, strict=True):
+        np.testing.assert_allclose([*one.values()], [*distances.values()])
+    assert list(starting._try_other_distances(network, [], settings)) == []
