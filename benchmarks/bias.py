@@ -31,7 +31,7 @@ def main() -> int:
     parser.add_argument("--json", type=machine.target, help="file for the figures; - for stdout")
     options = parser.parse_args()
     import jaxbundle
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.calibration.bias import find_bias
     from jaxbundle.leastsquares.problem import with_data
     from jaxbundle.leastsquares.solution import find_minimum

@@ -28,7 +28,7 @@ from lifelike_sets import LIFELIKE
 from photograph_sets import SETS, WIDTH, Shot, convergent, write
 
 import jaxbundle
-from jaxbundle.bundle.orientations import orientation_covariance
+from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import reconstruct

@@ -18,21 +18,24 @@ TYPE_CHECKING = False  # avoids importing typing
 if TYPE_CHECKING:
     from jaxbundle.adjustment import make_problem as make_problem
     from jaxbundle.adjustment import solve as solve
+    from jaxbundle.adjustment.adjust import adjust as adjust
+    from jaxbundle.adjustment.compare import AdjustmentComparison as AdjustmentComparison
+    from jaxbundle.adjustment.compare import compare as compare
     from jaxbundle.adjustment.gradients import check_gradients as check_gradients
+    from jaxbundle.adjustment.influence import Influence as Influence
+    from jaxbundle.adjustment.influence import influence as influence
+    from jaxbundle.adjustment.load import load_adjustment as load_adjustment
+    from jaxbundle.adjustment.orient import orient as orient
+    from jaxbundle.adjustment.quality.precision import Precision as Precision
+    from jaxbundle.adjustment.quality.precision import precision as precision
+    from jaxbundle.adjustment.quality.precision import redundancy as redundancy
+    from jaxbundle.adjustment.result import Adjustment as Adjustment
+    from jaxbundle.adjustment.sensitivity import Budget as Budget
+    from jaxbundle.adjustment.sensitivity import sensitivity as sensitivity
     from jaxbundle.batch.calibrate import BatchCalibration as BatchCalibration
     from jaxbundle.batch.calibrate import calibrate_batch as calibrate_batch
     from jaxbundle.batch.calibrate_rigs import RigBatch as RigBatch
     from jaxbundle.batch.calibrate_rigs import calibrate_rigs as calibrate_rigs
-    from jaxbundle.bundle.adjust import adjust as adjust
-    from jaxbundle.bundle.compare import AdjustmentComparison as AdjustmentComparison
-    from jaxbundle.bundle.compare import compare as compare
-    from jaxbundle.bundle.influence import Influence as Influence
-    from jaxbundle.bundle.influence import influence as influence
-    from jaxbundle.bundle.load import load_adjustment as load_adjustment
-    from jaxbundle.bundle.orient import orient as orient
-    from jaxbundle.bundle.result import Adjustment as Adjustment
-    from jaxbundle.bundle.sensitivity import Budget as Budget
-    from jaxbundle.bundle.sensitivity import sensitivity as sensitivity
     from jaxbundle.calibration import Board as Board
     from jaxbundle.calibration import BoardViews as BoardViews
     from jaxbundle.calibration import Calibration as Calibration
@@ -66,9 +69,6 @@ if TYPE_CHECKING:
     from jaxbundle.planning.stations import grid_of_targets as grid_of_targets
     from jaxbundle.planning.stations import ring_of_stations as ring_of_stations
     from jaxbundle.planning.stations import stations_looking_at as stations_looking_at
-    from jaxbundle.statistics.precision import Precision as Precision
-    from jaxbundle.statistics.precision import precision as precision
-    from jaxbundle.statistics.precision import redundancy as redundancy
     from jaxbundle.system.configuration import join_processes as join_processes
     from jaxbundle.system.configuration import keep_programs as keep_programs
     from jaxbundle.system.configuration import use_cores as use_cores
@@ -78,7 +78,7 @@ _HOME = {
     "jaxbundle.adjustment": ("make_problem", "solve"),
     "jaxbundle.batch.calibrate": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.batch.calibrate_rigs": ("RigBatch", "calibrate_rigs"),
-    "jaxbundle.bundle.adjust": ("adjust",),
+    "jaxbundle.adjustment.adjust": ("adjust",),
     "jaxbundle.calibration": (
         "Board",
         "BoardViews",
@@ -111,13 +111,13 @@ _HOME = {
         "stations_looking_at",
     ),
     "jaxbundle.orientation.network": ("Oriented",),
-    "jaxbundle.bundle.orient": ("orient",),
-    "jaxbundle.bundle.result": ("Adjustment",),
-    "jaxbundle.bundle.load": ("load_adjustment",),
-    "jaxbundle.bundle.compare": ("AdjustmentComparison", "compare"),
-    "jaxbundle.bundle.sensitivity": ("Budget", "sensitivity"),
-    "jaxbundle.bundle.influence": ("Influence", "influence"),
-    "jaxbundle.statistics.precision": ("Precision", "precision", "redundancy"),
+    "jaxbundle.adjustment.orient": ("orient",),
+    "jaxbundle.adjustment.result": ("Adjustment",),
+    "jaxbundle.adjustment.load": ("load_adjustment",),
+    "jaxbundle.adjustment.compare": ("AdjustmentComparison", "compare"),
+    "jaxbundle.adjustment.sensitivity": ("Budget", "sensitivity"),
+    "jaxbundle.adjustment.influence": ("Influence", "influence"),
+    "jaxbundle.adjustment.quality.precision": ("Precision", "precision", "redundancy"),
 }
 # Imported on first use, so that the command line can configure JAX and the linear algebra library
 # before they start.

@@ -47,7 +47,9 @@ def integer(name: str, value: Any, least: int = 1, most: int = LARGEST_INTEGER) 
     return number
 
 
-def number(name: str, value: Any, expected: str = "a number", good=math.isfinite) -> float:
+def number(
+    name: str, value: Any, expected: str = "a number", good: Callable[[float], bool] = math.isfinite
+) -> float:
     """A number that satisfies `good`, by default a finite one.
 
     **Raises:** `InputError`."""

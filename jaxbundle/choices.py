@@ -13,6 +13,9 @@ ESTIMATORS = ("huber", "cauchy", "tukey")
 """Robust estimators."""
 TESTS = ("pope", "baarda")
 """Tests of data snooping."""
+STATED, UNIT, ESTIMATED = SIGMA_ORIGINS = ("stated", "unit", "estimated")
+"""Where a priori σ come from: somebody stated them; nobody did, so that they are units of weight;
+they were estimated from the residuals of the same measurements."""
 
 CAMERA_MODELS = (
     "brown", "brown-projected", "usgs", "bingo", "opencv", "snavely", "division",

@@ -11,6 +11,7 @@ factorisation of A.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,7 +37,7 @@ def implicit_root(
 
 
 @implicit_root.def_jvp
-def _(primals, tangents):
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     equations, solve, root, fixed, data = primals
     root = implicit_root(*primals)
     at_root = lambda data: equations(root, fixed, data)
@@ -69,5 +70,5 @@ def differentiable_once(x: PyTree, message: str) -> PyTree:
 
 
 @differentiable_once.def_jvp
-def _(primals, tangents):
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     raise InputError(primals[1])

@@ -12,8 +12,9 @@ from scipy import integrate
 
 import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
-from jaxbundle.bundle import far_points
-from jaxbundle.bundle.adjust import adjust
+from jaxbundle.adjustment import far_points
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.choices import ESTIMATORS
 from jaxbundle.geometry import matrix_from_quaternion
@@ -21,11 +22,10 @@ from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
-from jaxbundle.leastsquares.quality.snooping import Removed, _passing, _Touched, _worst, without
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, _passing, _Touched, _worst, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.network import Distances
 from jaxbundle.report import text
-from jaxbundle.statistics.inspection import Inspection
 
 SIGMA = 0.002
 TRUE = {"c": 24.0, "x0": 0.05, "y0": -0.03, "K1": 1.2e-4}
@@ -101,7 +101,7 @@ def test_what_agrees_comes_back(network):
     spoilt, bad, _ = with_blunders(network, 1)
     whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
     wrong, right = np.flatnonzero(bad), np.flatnonzero(~bad)[::97]
-    removed = [Removed("image", int(row), None, 9.0) for row in (*wrong, *right)]
+    removed = [RemovedRow("image", int(row), None, 9.0) for row in (*wrong, *right)]
     less = without(whole, removed)
     found = Solution(less, find_minimum(less, max_steps=101).values)
     back = {row for _, row, _ in _passing(whole, found, _Touched(whole), removed, 4.5)}
@@ -113,7 +113,7 @@ def test_predicted_test_of_an_observation(network):
     """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
     problem = jaxbundle.make_problem(jaxbundle.check_network(network))
     row, data = 123, problem.data
-    less = without(problem, [Removed("image", row, None, 0.0)])
+    less = without(problem, [RemovedRow("image", row, None, 0.0)])
     minimum = find_minimum(less, data.start, max_steps=101)
     found = Inspection(less, minimum.values).solution
     predicted = found.predicted_tests(problem.data)["image"][row]

@@ -9,7 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera
-from jaxbundle.bundle.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results import result_json
 from jaxbundle.io.results.result_json import result_dict, result_text, without_nan
@@ -195,7 +195,7 @@ def test_check_points_have_the_sigma_of_the_estimated_weights(estimated):
 
 
 def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
-    for module in ("leastsquares.quality.components", "bundle.readjust"):
+    for module in ("leastsquares.quality.components", "adjustment.readjust"):
         monkeypatch.setattr(f"jaxbundle.{module}.ROUNDS", 1)
     network = simulation.network
     observations = dataclasses.replace(

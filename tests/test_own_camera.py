@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 import jaxbundle
 from jaxbundle import Camera, CameraModel, InputError, adjust, plotting, simulate_with_truth
 from jaxbundle.adjustment import design_matrix, make_problem, residuals
+from jaxbundle.adjustment.readjust import _without_parameter
 from jaxbundle.adjustment.unknowns import Name
-from jaxbundle.bundle.readjust import _without_parameter
 from jaxbundle.cameras import brown, get_model
 from jaxbundle.io import read_cameras
 from jaxbundle.io.cameras.camera_files import write_cameras

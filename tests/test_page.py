@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from page_reader import Page, column, decode
 
 import jaxbundle
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cli.outputs import check_targets
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.report.head import NO_RESULT

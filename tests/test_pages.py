@@ -10,9 +10,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from page_reader import Page, column
 
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.batch.page import compose_batch
 from jaxbundle.batch.run import result_rows
-from jaxbundle.bundle.result import Adjustment
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.page import compose_part

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from jaxbundle import plotting
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model, project
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion

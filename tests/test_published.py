@@ -13,7 +13,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment import make_problem
-from jaxbundle.bundle.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from jaxbundle import report
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.quality.check_points import CheckPoints
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import FAMILIES, MODEL_NAMES, get_model
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, STUCK
 from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.network.blunders import Removed
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS, equations
-from jaxbundle.statistics.blunders import Removed
-from jaxbundle.statistics.check_points import CheckPoints
 
 SECTIONS = (
     "Counts",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.bundle.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust
 
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 PROJECTS = (

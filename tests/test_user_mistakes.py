@@ -8,7 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
-from jaxbundle.bundle.mirrored import name_mirrored, name_other_side
+from jaxbundle.adjustment.mirror_image import name_mirrored, name_other_side
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.network.unit_mistakes import (

@@ -17,6 +17,7 @@ import jaxbundle
 from jaxbundle import Adjustment, Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.io.results.result_project import readjustable_network
+from jaxbundle.leastsquares.quality.global_test import chi_squared_test, describe_test
 from jaxbundle.network.tables import ESTIMATED, STATED, UNIT, LeftOut
 from jaxbundle.report.page import compose
 from jaxbundle.report.verdict import (
@@ -28,7 +29,6 @@ from jaxbundle.report.verdict import (
     judge_blunders,
     judge_check_points,
 )
-from jaxbundle.statistics.global_test import chi_squared_test, describe_test
 
 WORDS = "no a priori σ was given: 1 mm is a unit of weight; σ0 a posteriori estimates it"
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)

@@ -11,12 +11,17 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate, stations_looking_at
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.weakness import (
+    VAGUE_RATIO,
+    Weakness,
+    weakness,
+    weakness_of_unsolved,
+)
 from jaxbundle.cli.outputs import why_not
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
-from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.weakness import VAGUE_RATIO, Weakness, weakness, weakness_of_unsolved
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)

@@ -1,7 +1,8 @@
-"""The adjustment of networks, cameras and rigs, declared on the engine.
+"""The adjustment of networks: from a network to its result.
 
-`solve` is the differentiable core (arrays in, arrays out); `jaxbundle.adjust` adds networks and
-statistics.
+`make_problem` declares a network to the engine, `solve` is the differentiable core (arrays in,
+arrays out); `jaxbundle.adjust` (`adjust.py`) adds start values, the rounds of a whole adjustment
+and the `Adjustment` (`result.py`), whose statistics are in `quality`.
 """
 
 from jaxbundle.adjustment.equations import design_matrix as design_matrix

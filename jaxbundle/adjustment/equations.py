@@ -36,10 +36,12 @@ def design_matrix(
     still, unravel = ravel_pytree(
         {t.name: jnp.zeros((t.rows, t.space.width)) for t in problem.tables}
     )
+    # The engine never forms this matrix; here J is one forward pass per unknown, for tests and for
+    # readers who want to see it.
     which = ravel_pytree({t.name: jnp.asarray(t.free) for t in problem.tables})[0]
     free = np.flatnonzero(which)
 
-    def rows(change):
+    def rows(change: Float[Array, " unknowns"]) -> Float[Array, " rows"]:
         moved = dict(values)
         for name, d in unravel(still.at[free].set(change)).items():
             space = problem.declared.spaces[name]

@@ -1,13 +1,15 @@
 """Derivatives compared with finite differences, for camera models, adjustments, any function."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.solve import solve
 from jaxbundle.arguments import integer, positive, show
@@ -15,10 +17,6 @@ from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.indexing.rows import Data
 from jaxbundle.leastsquares.problem import Problem
-
-MOST_HALVINGS = 10
-"""The shortest step is 2¹⁰ = 1000 times shorter than the given one: from 1e-4 to 1e-7, whose
-differences rounding (1e-16/step) makes less exact again than longer ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,12 +49,12 @@ class GradientCheck:
 
 def check_gradients(
     function: Callable | CameraModel | Problem,
-    *arguments,
+    *arguments: Any,
     directions: int = 5,
     step: float = 1e-4,
     tolerance: float = 1e-6,
     seed: int = 0,
-    **options,
+    **options: Any,
 ) -> GradientCheck:
     """Compare the derivatives of a function with finite differences, in random directions.
 
@@ -78,29 +76,14 @@ def check_gradients(
         )
     directions = integer("directions", directions)
     step, tolerance = positive("step", step), positive("tolerance", tolerance)
-    by_effect = isinstance(function, CameraModel)
+    f, x, sizes = _flatten(*_as_function(function, arguments, options))
     if isinstance(function, CameraModel):
-        model = function
-        function = lambda p, ray: jnp.stack(project(model, tuple(p), *ray))
-        arguments = tuple(jnp.asarray(leaf, float) for leaf in arguments)
-    elif isinstance(function, Problem):
-        problem = function
-        arguments = arguments or (problem.data.measured,)
-        if isinstance(arguments[0], Data):
-            function = lambda data: solve(problem, data, **options)
-        else:
-            with_measured = partial(dataclasses.replace, problem.data)
-            function = lambda measured: solve(problem, with_measured(measured=measured), **options)
-    x, unravel = ravel_pytree(tuple(jax.tree.map(jnp.asarray, arguments)))
-    sizes = ravel_pytree(
-        jax.tree.map(lambda a: jnp.full(jnp.shape(a), _size(a)), tuple(arguments))
-    )[0]
-    f = lambda x: ravel_pytree(function(*unravel(x)))[0]
-    if by_effect:
         sizes = _sizes_by_effect(f, x, sizes)
 
     @jax.jit
-    def derivatives(x, d, c):
+    def derivatives(
+        x: Float[Array, " n"], d: Float[Array, " n"], c: Float[Array, " m"]
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """f(x), its derivative along d, and c times its Jacobian: one program, compiled once."""
         y, forward = jax.linearize(f, x)
         return y, forward(d), jax.linear_transpose(forward, x)(c)[0]
@@ -109,6 +92,8 @@ def check_gradients(
     random = np.random.default_rng(integer("seed", seed, 0))
     forward, reverse, differences = [], [], []
     for _ in range(directions):
+        # Random directions see every entry of the Jacobian at once; c·(J·d) = (c·J)·d tests reverse
+        # mode without any differences.
         d = jnp.asarray(random.normal(size=x.shape)) * sizes
         c = jnp.asarray(random.normal(size=outputs))
         _, along, pulled = derivatives(x, d, c)
@@ -123,6 +108,38 @@ def check_gradients(
     return GradientCheck(largest(forward), largest(reverse), tolerance, largest(differences))
 
 
+def _as_function(
+    function: Any, arguments: tuple[Any, ...], options: Mapping[str, Any]
+) -> tuple[Callable, tuple[Any, ...]]:
+    """The function that a camera model or a problem stands for, and its arguments."""
+    if isinstance(function, CameraModel):
+        project_ray = lambda p, ray: jnp.stack(project(function, tuple(p), *ray))
+        return project_ray, tuple(jnp.asarray(leaf, float) for leaf in arguments)
+    if not isinstance(function, Problem):
+        return function, arguments
+    arguments = arguments or (function.data.measured,)
+    if isinstance(arguments[0], Data):
+        return lambda data: solve(function, data, **options), arguments
+    replace = partial(dataclasses.replace, function.data)
+    return lambda measured: solve(function, replace(measured=measured), **options), arguments
+
+
+def _flatten(
+    function: Callable, arguments: tuple[Any, ...]
+) -> tuple[Callable, Float[Array, " n"], Float[Array, " n"]]:
+    """A function of one vector, the vector of the arguments, and the size of each of its numbers:
+    the RMS of the leaf it is from, 1 for a leaf of zeros."""
+
+    def size(leaf: Any) -> float:
+        array = np.asarray(leaf)
+        rms = float(np.sqrt(np.mean(array**2))) if array.size else 0.0
+        return rms if rms > 0 else 1.0
+
+    x, unravel = ravel_pytree(tuple(jax.tree.map(jnp.asarray, arguments)))
+    sizes = jax.tree.map(lambda a: jnp.full(jnp.shape(a), size(a)), tuple(arguments))
+    return lambda x: ravel_pytree(function(*unravel(x)))[0], x, ravel_pytree(sizes)[0]
+
+
 def _differentiate(y: Callable, step: float, sufficient: float) -> tuple[jax.Array, float]:
     """dy/dh at h = 0 and the norm of its error, from central differences at the steps h, h/2, …
 
@@ -134,7 +151,9 @@ def _differentiate(y: Callable, step: float, sufficient: float) -> tuple[jax.Arr
     distance = lambda a, b: float(jnp.linalg.norm(a - b))
     row = [(y(step) - y(-step)) / (2 * step)]
     best, error = row[0], np.inf
-    for _ in range(MOST_HALVINGS):
+    # Ten halvings, a thousandth of the given step: from 1e-4 to 1e-7, whose differences rounding
+    # (1e-16/step) makes less exact again than longer ones.
+    for _ in range(10):
         step, before = step / 2, row
         row = [(y(step) - y(-step)) / (2 * step)]
         for j, longer in enumerate(before, 1):
@@ -145,12 +164,6 @@ def _differentiate(y: Callable, step: float, sufficient: float) -> tuple[jax.Arr
         if error <= sufficient:
             break
     return best, error
-
-
-def _size(leaf) -> float:
-    array = np.asarray(leaf)
-    size = float(np.sqrt(np.mean(array**2))) if array.size else 0.0
-    return size if size > 0 else 1.0
 
 
 def _sizes_by_effect(f: Callable, x: jax.Array, otherwise: jax.Array) -> jax.Array:

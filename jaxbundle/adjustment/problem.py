@@ -19,7 +19,7 @@ from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.leastsquares.datum.defect import CannotHold
 from jaxbundle.leastsquares.datum.motions import SEVEN
-from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.network.camera_tables import CameraTable
 from jaxbundle.network.datum_words import open_directions_in_words
@@ -33,7 +33,8 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import AnyArray, present
 
 HELD = 1e-6
-"""Below this part of a motion a datum direction counts as none."""
+"""Below this part of a motion a datum direction counts as none. The directions are unit vectors:
+a motion that is open has a part of the size of one, a determined one rounding. Not critical."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +118,8 @@ class NetworkProblem(engine.Problem):
         return dataclasses.replace(data, weight={**data.weight, **changed})
 
     def _in_order(self, parts: Mapping[str, Any]) -> Any:
+        # Cameras of several models are several sets for the engine, which compiles one formula a
+        # set; the network has all its image points in one table.
         if len(parts) == 1:
             return next(iter(parts.values()))
         shape = np.shape(next(iter(parts.values()), np.zeros((0, 2))))[1:]
@@ -132,13 +135,19 @@ class NetworkProblem(engine.Problem):
 
     @property
     def image_weights(self) -> Float[np.ndarray, "rays 2"]:
-        """1/σ of the image coordinates, 0 for those that take no part."""
+        """1/σ of the image coordinates, the root of their weight p = 1/σ²; 0 for those that take no
+        part."""
         return np.asarray(self.image_points(self.data.weight))
+
+    @property
+    def used_coordinates(self) -> Bool[np.ndarray, "rays 2"]:
+        """Which image coordinates take part in the adjustment."""
+        return self.image_weights > 0
 
     @property
     def used(self) -> Bool[np.ndarray, " rays"]:
         """Which image points take part in the adjustment."""
-        return np.asarray((self.image_weights > 0).any(1))
+        return np.asarray(self.used_coordinates.any(1))
 
     def interior_orientation(self, values: Values) -> AnyArray:
         """The parameters of all cameras, in the order of those of their models, padded with 0."""
@@ -180,6 +189,8 @@ class NetworkProblem(engine.Problem):
     def excluded(self) -> Bool[np.ndarray, " points"]:
         """Which points data snooping left with too few rays, or with rays that do not determine
         them."""
+        # Snooping takes the weight of rays and holds the point: without rays, and held although it
+        # is not given.
         rays = np.bincount(self.point[self.used], minlength=len(self.network.points))
         held = ~self.table("point").free.any(1)
         return ~self.network.points.has_role("fixed") & held & (rays == 0)
@@ -236,7 +247,7 @@ def make_problem(
     network: Network,
     *,
     reduction: str | None = None,
-    also: Sequence[Table | Observations] = (),
+    also: Sequence[Table | ObservationSet] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> NetworkProblem:
     """Plan, data and datum of a checked network (see `jaxbundle.network.check.check_network`).
@@ -256,8 +267,12 @@ def make_problem(
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
     chosen, origin = _datum_points(network), None
+    # Points at any distance are directions from the origin, which is then among the stations; their
+    # distance is uncertain by its own size, so that they would carry a datum of no precision.
     if lengths is not None:
         chosen, origin = chosen & (lengths == 0), np.round(network.images.position.mean(0))
+    # Points are eliminated: they are many, and two of them share no observation but those of
+    # further kinds, which the planner keeps in the reduced system.
     declared = declare(network, origin, also, lengths)
     try:
         problem = engine.make_problem(
@@ -281,6 +296,7 @@ def make_problem(
 def _of_network(
     problem: engine.Problem, network: Network, declared: DeclaredNetwork
 ) -> NetworkProblem:
+    # A problem of the engine with further fields: whatever takes a problem takes this one.
     own = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)}
     return NetworkProblem(
         **own,
@@ -299,6 +315,8 @@ def _datum_points(network: Network) -> Bool[np.ndarray, " points"]:
     points = network.points
     if network.datum_points:
         return np.isin(np.array(points.id, dtype=object), network.datum_points)
+    # All tie points: the trace of their covariance is then the smallest of all datums.
+    # Control points are weighted by their σ and carry none, unless there is nothing else.
     chosen = points.has_role("tie")
     return chosen if chosen.any() else points.has_role("control")
 
@@ -319,7 +337,9 @@ def _datum(
             f" ({gauge.shape[1]} of 7). Give control points or distances, or choose datum = "
             '"inner" or "minimal".'
         )
-    sized = [one for one in among(network) if one.has_size]
+    # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
+    # minimum would be a network of size 0.
+    sized = [one for one in among(network) if one.needs_scale]
     if sized and np.abs(gauge[SEVEN.index("scale")]).max() > HELD:
         raise InputError(
             f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
@@ -331,6 +351,7 @@ def _datum(
 def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:
     """A problem of other points of the network with the orientations and cameras of `values`,
     without priors and datum: for excluded points."""
+    # Of all further kinds only the rolling shutter changes where a point is seen.
     shutters = tuple(one for one in network.further if isinstance(one, RollingShutter))
     declared = declare(network.replace(further=shutters), like.origin)
     known: dict[str, Any] = {name: jax.tree.map(np.asarray, rows) for name, rows in values.items()}

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.arguments import show
@@ -19,6 +20,7 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.types import AnyArray
 
 
 def find_unknowns(problem: NetworkProblem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
@@ -73,8 +75,11 @@ def value_of(problem: NetworkProblem, name: Name, values: Values):
     raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
 
 
-def angles_near(rotation, d_theta, given):
+def angles_near(
+    rotation: Float[AnyArray, "4"], d_theta: Float[AnyArray, "3"], given: Float[AnyArray, "3"]
+) -> Float[Array, "3"]:
     """ω, φ, κ after a small rotation, on the same turn and branch as the given ones."""
+    # ω, φ, κ jump by turns and have two branches: reported angles stay near those of the network.
     return omega_phi_kappa_near(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
     )

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import integer, numeric_array, one_of, positive, show, vector
 from jaxbundle.batch.camera import SOLVED
 from jaxbundle.batch.input import any_model, free_parameters
 from jaxbundle.batch.population import Population
 from jaxbundle.batch.rigs import RigSettings, RigViews, solve_rigs, with_free
 from jaxbundle.batch.snooping import TESTS
-from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
 from jaxbundle.batch.epochs import contradicting
 from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
 from jaxbundle.batch.input import LARGEST_NUMBER
 from jaxbundle.batch.misfit import misfits
 from jaxbundle.batch.weakness import is_vague
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel, key_of
 from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError, NotSolvedError

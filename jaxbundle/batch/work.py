@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import SECTIONS, rig_settings
@@ -26,7 +27,6 @@ from jaxbundle.batch.rig_photographs import RigFolders, rig_of_views
 from jaxbundle.batch.rigs import UNEXPECTED, RigSettings, solve_rigs
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.batch.stacks import CameraStack, is_camera_stack, read_camera_stack
-from jaxbundle.bundle.adjust import adjust
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network

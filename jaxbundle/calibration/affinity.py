@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration.observation_equations import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
 from jaxbundle.display import print_in_one_screen

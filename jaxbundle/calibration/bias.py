@@ -44,7 +44,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration.observation_equations import (
     LinearisedImagePoints,
     lagrange_multipliers,

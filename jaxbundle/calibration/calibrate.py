@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.adjustment.adjust import adjust, check_options
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import number, positive, show, text, vector
-from jaxbundle.bundle.adjust import adjust, check_options
-from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import CalibrationStart, start_values
@@ -41,7 +41,7 @@ from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
-from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Progress, Scalar, present
 
@@ -231,7 +231,7 @@ def _without_eccentricity(
     views, model = start.views, get_model(camera.model)
     p = np.asarray(result.values["camera"])[0]
     M = jax.vmap(matrix_from_quaternion)(result.values["image"].rotation)
-    poses = Pose(jnp.asarray(result.image_values[:, :3]), M)
+    poses = CameraPose(jnp.asarray(result.image_values[:, :3]), M)
     radius = present(views.board.diameter) / 2
     shift = _shifts(model, p, poses, views.board.points, radius)
     xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
@@ -242,7 +242,7 @@ def _without_eccentricity(
 def _shifts(
     model: CameraModel,
     p: Float[AnyArray, " parameters"],
-    poses: Pose,
+    poses: CameraPose,
     centres: Float[AnyArray, "points 3"],
     radius: Scalar,
 ) -> Float[Array, "views points 2"]:

@@ -31,9 +31,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle import plotting
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.quality.calibration_difference import expected_difference
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import integer, show
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import (
@@ -49,7 +50,6 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.statistics.difference import expected_difference
 from jaxbundle.types import Progress
 
 if TYPE_CHECKING:

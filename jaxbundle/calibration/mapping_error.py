@@ -1,8 +1,9 @@
 r"""The expected mapping error of a calibration: one number, comparable between camera models.
 
 With true parameters p + Δp in place of p, the image of every ray moves. After removing the rotation
-that later orientations absorb (A' of `statistics.projection`, frame "rotation"), the mean squared
-displacement over the grid of `cameras.compare` is, to first order, the quadratic form
+that later orientations absorb (A' of `adjustment.quality.projection_uncertainty`, frame
+"rotation"), the mean squared displacement over the grid of `cameras.compare` is, to first order,
+the quadratic form
 
     K = Δpᵀ·H·Δp,       H = mean of A'ᵀA' over the image
 
@@ -25,16 +26,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.quality.projection_uncertainty import have_rays, slopes_of_images
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import grid_of
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
 from jaxbundle.cameras.pixel_frame import in_model_units
+from jaxbundle.cameras.validity import measured_centre
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.tables import Camera
-from jaxbundle.statistics.projection import have_rays, slopes_of_images
-from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 from jaxbundle.types import present
 
 
@@ -84,7 +85,7 @@ def mapping_error(
     xy = xy[have_rays(model, p, xy)]
     whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
     # "measured": up to the farthest point from the distortion's centre, since distortion is radial
-    farthest = farthest_measurements(problem, adjustment.values)[column]
+    farthest = adjustment.farthest_measurements[column]
     away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
     near = xy[away <= farthest]
     # two points determine the rotation: three angles from two coordinates each

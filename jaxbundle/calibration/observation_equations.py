@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.kinds.image_points import ImagePoint

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.quality.projection_uncertainty import (
+    FRAMES,
+    have_rays,
+    images_through_scene,
+    interior_covariance_of_images,
+)
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
@@ -18,12 +24,6 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.display import data_set, print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.statistics.projection import (
-    FRAMES,
-    have_rays,
-    images_through_scene,
-    interior_covariance_of_images,
-)
 
 GRID = (11, 9)
 """Columns and rows of the grid of a map: odd, so that the middle of the image is a point of it; σ
@@ -41,8 +41,8 @@ class UncertaintyMap:
     """Standard deviations of a projected point over the image.
 
     **Fields:** `frame`, `distance`: the frame in which the point is fixed, see
-    `jaxbundle.statistics.projection`; `uv` pixels of the grid; `covariance` and `sigma`, √((σx² +
-    σy²)/2), pixels; NaN where there is no image.
+    `jaxbundle.adjustment.quality.projection_uncertainty`; `uv` pixels of the grid;
+    `covariance` and `sigma`, √((σx² + σy²)/2), pixels; NaN where there is no image.
     """
 
     frame: str

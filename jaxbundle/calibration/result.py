@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle import plotting
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice, suggest
 from jaxbundle.calibration.affinity import find_missing_affinity
@@ -171,7 +171,7 @@ class Calibration:
         self, distance: float = np.inf, frame: str = "scene", grid: tuple[int, int] = quality.GRID
     ) -> UncertaintyMap:
         """Uncertainty of a projected point over the image, pixels, for a distance in the object
-        unit; frames: see `jaxbundle.statistics.projection`."""
+        unit; frames: see `jaxbundle.adjustment.quality.projection_uncertainty`."""
         key = (distance, frame, grid)
         if key not in self._maps:
             self._maps[key] = quality.uncertainty_map(

@@ -34,13 +34,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.quality.calibration_difference import Covariance
 from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
-from jaxbundle.statistics.difference import Covariance
 
 
 @dataclasses.dataclass(frozen=True)

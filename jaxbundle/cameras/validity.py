@@ -13,13 +13,14 @@ from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jaxtyping import Array, Float
 
 from jaxbundle.cameras.inverse import value_and_derivative
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
 
 
 def turning_radius(
@@ -91,6 +92,12 @@ def validity_message(
     )
 
 
+@partial(compile_once, static=0)
+def measured_centre(model: CameraModel, p: Float[AnyArray, " parameters"]) -> Float[Array, "2"]:
+    """The image of a camera's axis, the centre of its distortion."""
+    return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))
+
+
 def _in_order(
     model: CameraModel, parameters: Mapping[str, float] | Sequence[float]
 ) -> Sequence[float]:
@@ -102,7 +109,7 @@ def _in_order(
 
 @partial(compile_once, static=0)
 def _along(
-    model: CameraModel, p: tuple[float, ...], azimuth: np.ndarray, radius: np.ndarray
+    model: CameraModel, p: tuple[Scalar, ...], azimuth: AnyArray, radius: AnyArray
 ) -> tuple[Array, Array]:
     """Jacobian determinant and radius in the measured image, `radius` out from the centre."""
     formula = getattr(model, model.own_formula)

@@ -1,11 +1,11 @@
 """The option `jaxbundle adjust --budget`."""
 
+from jaxbundle.adjustment.quality.fixed_quantities import split_name
 from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
 from jaxbundle.network.kinds.base import ANGLES
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.statistics.held import split_name
 
 
 def held_of(given: list[str] | None, network: Network) -> dict[str, float]:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from jaxbundle.adjustment.quality.calibration_difference import Covariance
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
@@ -12,7 +13,6 @@ from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.formats import FORMATS, recognise_format
 from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
-from jaxbundle.statistics.difference import Covariance
 
 
 def camera_given(text: str) -> Camera:

@@ -54,12 +54,12 @@ def compare(
         return _compare_adjustments(a, b, csv)
     import numpy as np
 
+    from jaxbundle.adjustment.quality.calibration_difference import expected_difference
     from jaxbundle.cameras import get_model
     from jaxbundle.cameras.compare import compare_cameras, difference_rings
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
     from jaxbundle.io.networks.assemble import all_parameters
     from jaxbundle.io.text.csv_tables import write_csv
-    from jaxbundle.statistics.difference import expected_difference
 
     (first, C_first), (second, C_second) = calibration_given(a), calibration_given(b)
     sizes = [list(c.image_size) for c in (first, second) if c.image_size is not None]
@@ -114,8 +114,8 @@ def compare(
 
 
 def _compare_adjustments(a: str, b: str, csv: Path | None) -> None:
-    from jaxbundle.bundle.compare import compare as compare_adjustments
-    from jaxbundle.bundle.load import load_adjustment
+    from jaxbundle.adjustment.compare import compare as compare_adjustments
+    from jaxbundle.adjustment.load import load_adjustment
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
     found = compare_adjustments(load_adjustment(a), load_adjustment(b))

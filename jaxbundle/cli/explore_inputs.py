@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.bundle.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.calibration.files import COMMAND
 from jaxbundle.choices import EXPLORED
 from jaxbundle.cli.camera_inputs import calibration_given, pair
@@ -16,8 +16,8 @@ from jaxbundle.cli.pushbroom.shared import open_scanner
 from jaxbundle.errors import InputError
 from jaxbundle.explore.camera import CameraView
 from jaxbundle.explore.network import NetworkView
-from jaxbundle.explore.scanner import ScannerView
-from jaxbundle.explore.view import View
+from jaxbundle.explore.scanner import FlightView
+from jaxbundle.explore.view import ExplorerView
 from jaxbundle.io import read_network
 from jaxbundle.io.cameras.calibrated import is_result
 from jaxbundle.io.cameras.camera_files import is_camera_file
@@ -85,7 +85,7 @@ def open_view(
     format: str | None,
     control: Path | None,
     quiet: bool,
-) -> View:
+) -> ExplorerView:
     """The view of an input; options that are for another kind are refused.
 
     **Raises:** `InputError`, `NotSolvedError`."""
@@ -137,7 +137,7 @@ def open_camera(input: str, photo: Path | None, image_size: str, pixel_size: str
     return CameraView(camera, sigma, picture, trace_files(files, {}))
 
 
-def open_flight_or_scanner(path: Path, truth: Path | None) -> ScannerView:
+def open_flight_or_scanner(path: Path, truth: Path | None) -> FlightView:
     """A scanner file, or a flight file, which has a track."""
     known = None if truth is None else open_scanner(truth).image
     files = [path, *([] if truth is None else [truth])]
@@ -147,6 +147,6 @@ def open_flight_or_scanner(path: Path, truth: Path | None) -> ScannerView:
             raise InputError("--truth: a flight file contains its truth; omit it")
         flight = read_flight(path)
         name = flight.file.section("scanner").text("name", path.stem)
-        return ScannerView(name, flight.flight, flight.earth, origin=origin)
+        return FlightView(name, flight.flight, flight.earth, origin=origin)
     scanner = open_scanner(path)
-    return ScannerView(scanner.name, scanner.image, scanner.earth, known, origin)
+    return FlightView(scanner.name, scanner.image, scanner.earth, known, origin)

@@ -13,9 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from jaxbundle import report
-from jaxbundle.bundle.orientations import orientation_covariance
-from jaxbundle.bundle.result import Adjustment
-from jaxbundle.bundle.sensitivity import Budget
+from jaxbundle.adjustment.orientation_covariance import orientation_covariance
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.adjustment.sensitivity import Budget
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.orientation_covariance import FILE as PRECISION
 from jaxbundle.io.networks.orientation_covariance import write_orientation_covariance

@@ -35,6 +35,7 @@ def plan(  # noqa: PLR0913 - the options of the command
     """Plan a block of vertical photographs: strips, photographs, expected precision."""
     import numpy as np
 
+    from jaxbundle.adjustment.quality.expected_precision import expected_precision
     from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
     from jaxbundle.io import write_project
     from jaxbundle.io.networks.project import FILES
@@ -42,7 +43,6 @@ def plan(  # noqa: PLR0913 - the options of the command
     from jaxbundle.network.tables import Camera
     from jaxbundle.planning.planned_block import planned_network
     from jaxbundle.planning.vertical_photographs import design_block, relief_displacement
-    from jaxbundle.statistics.expected import expected_precision
 
     if out is not None:
         check_folder(out, "plan", FILES, force=force)

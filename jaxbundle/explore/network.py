@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import coordinates
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.quality.precision import Precision, precision
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
@@ -50,7 +51,6 @@ from jaxbundle.report.page.sections import network as network_section
 from jaxbundle.report.page.sections import photographs
 from jaxbundle.report.page.tables import collect_tables
 from jaxbundle.report.summary import summary
-from jaxbundle.statistics.precision import Precision, precision
 from jaxbundle.types import AnyArray
 
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}

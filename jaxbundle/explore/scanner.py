@@ -91,7 +91,7 @@ class Chosen(NamedTuple):
     truth: PushbroomImage
 
 
-class ScannerView:
+class FlightView:
     """The image of a scanner file, or what a flight file simulates.
 
     **Arguments:** `given` the image, or the flight; `earth`: the ellipsoid, None in a local frame;

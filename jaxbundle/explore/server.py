@@ -25,7 +25,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NoReturn
 
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.explore.view import File, Given, View
+from jaxbundle.explore.view import ExplorerView, File, Given
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.report.page import write
 
@@ -57,7 +57,9 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, view: View, port: int = 0, tell: Callable[[str], object] = lambda _: None):
+    def __init__(
+        self, view: ExplorerView, port: int = 0, tell: Callable[[str], object] = lambda _: None
+    ):
         self.view, self.tell = view, tell
         self.token = secrets.token_urlsafe(24)
         self.computing = threading.Lock()
@@ -188,7 +190,7 @@ class Handler(BaseHTTPRequestHandler):
         return respond(self.server.view, action, _parse(body))
 
 
-def respond(view: View, action: str, given: Given) -> File:
+def respond(view: ExplorerView, action: str, given: Given) -> File:
     """The reply of a view to the values of its page: `answer`, `save`, or `export/NAME`.
 
     **Raises:** `Refused` for anything else, and what the view raises."""
@@ -215,7 +217,7 @@ def _parse(body: bytes) -> Given:
     return given
 
 
-def page_file(view: View, given: Given, live: bool) -> File:
+def page_file(view: ExplorerView, given: Given, live: bool) -> File:
     """The page of a view with these values."""
     content = "".join(write(view.page(given, live)))
     return File("page.html", HTML, content.encode("utf-8", "replace"))

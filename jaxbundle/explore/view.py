@@ -20,7 +20,7 @@ class File(NamedTuple):
     content: bytes
 
 
-class View(Protocol):
+class ExplorerView(Protocol):
     """An explorer view.
 
     `given` are the values of the controls sent by the page; methods raise `InputError` or

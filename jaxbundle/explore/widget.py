@@ -13,11 +13,11 @@ from typing import Any
 from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.explore.server import Refused, page_file, respond
-from jaxbundle.explore.view import View
+from jaxbundle.explore.view import ExplorerView
 
 
-def show(view: View, *, height: int = 800) -> Any:
-    """A widget that shows a view (`NetworkView`, `CameraView`, `ScannerView`) and answers its
+def show(view: ExplorerView, *, height: int = 800) -> Any:
+    """A widget that shows a view (`NetworkView`, `CameraView`, `FlightView`) and answers its
     controls; `height` of the frame in pixels.
 
     **Raises:** `ImportError` without anywidget (extra `widgets`)."""
@@ -29,7 +29,7 @@ def show(view: View, *, height: int = 800) -> Any:
     return widget
 
 
-def reply(view: View, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
+def reply(view: ExplorerView, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
     """The answer to a message of the page (`number`, `action`, `given`), and its content."""
     number = asked.get("number") if isinstance(asked, dict) else None
     try:

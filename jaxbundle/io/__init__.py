@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxbundle.io.formats import FORMATS as FORMATS
     from jaxbundle.io.formats import TARGETS as TARGETS
     from jaxbundle.io.formats import Format as Format
-    from jaxbundle.io.formats import Target as Target
+    from jaxbundle.io.formats import OutputFormat as OutputFormat
     from jaxbundle.io.formats import read_network as read_network
     from jaxbundle.io.networks.bal import write_bal as write_bal
     from jaxbundle.io.networks.bundler import write_bundler as write_bundler
@@ -49,7 +49,7 @@ _HOME = {
     "jaxbundle.io.cameras.camera_files": ("read_cameras", "write_cameras"),
     "jaxbundle.io.cameras.opencv_file": ("read_opencv", "write_opencv", "write_ros"),
     "jaxbundle.io.exchange": ("Converted", "convert"),
-    "jaxbundle.io.formats": ("FORMATS", "TARGETS", "Format", "Target", "read_network"),
+    "jaxbundle.io.formats": ("FORMATS", "TARGETS", "Format", "OutputFormat", "read_network"),
     "jaxbundle.io.networks.bal": ("write_bal",),
     "jaxbundle.io.networks.bundler": ("write_bundler",),
     "jaxbundle.io.networks.colmap": ("write_colmap", "write_colmap_cameras"),

@@ -31,7 +31,7 @@ from jaxbundle.io.results.coordinates import images_path
 from jaxbundle.io.writing.folders import check_folder, replace_folder
 from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.conversion import convert_cameras, convert_one
-from jaxbundle.network.outside import outside_warnings
+from jaxbundle.network.image_bounds import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 

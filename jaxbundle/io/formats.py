@@ -89,7 +89,7 @@ class Format:
 
 
 @dataclasses.dataclass(frozen=True)
-class Target:
+class OutputFormat:
     """A kind of output: how its names are recognised, its writer, and its camera models.
 
     `write` returns messages about what is not kept; no `models`: all, a name with * is a family.
@@ -109,8 +109,8 @@ class Target:
 
 @dataclasses.dataclass(frozen=True)
 class CameraTarget:
-    """A kind of output that holds cameras only: as `Target`; `one`: a single camera; `broad`: the
-    name also fits other kinds, which come first."""
+    """A kind of output that holds cameras only: as `OutputFormat`; `one`: a single camera; `broad`:
+    the name also fits other kinds, which come first."""
 
     recognises: Callable[[Path], bool]
     write: Callable[[Sequence[Camera], Path], None]
@@ -215,64 +215,64 @@ def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera],
 
 
 # The order is that of recognition; "project" takes any folder and stands last.
-TARGETS: dict[str, Target] = {
-    "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
-    "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
-    "csv": Target(_ends(".csv"), write_coordinates, "NAME.csv"),
-    "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
-    "bal": Target(
+TARGETS: dict[str, OutputFormat] = {
+    "ply": OutputFormat(_ends(".ply"), write_ply, "NAME.ply"),
+    "dxf": OutputFormat(_ends(".dxf"), write_dxf, "NAME.dxf"),
+    "csv": OutputFormat(_ends(".csv"), write_coordinates, "NAME.csv"),
+    "bundler": OutputFormat(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
+    "bal": OutputFormat(
         _ends(".txt", ".bal", *OPENERS), write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)
     ),
-    "colmap": Target(
+    "colmap": OutputFormat(
         _folder_of("colmap", "sparse"),
         partial(fill_colmap, text=False),
         "a folder with colmap or sparse in its name",
         COLMAP_MODELS,
         COLMAP_FILES,
     ),
-    "colmap-text": Target(
+    "colmap-text": OutputFormat(
         lambda _: False,  # a folder is named as for "colmap": only --to asks for text
         partial(fill_colmap, text=True),
         "by --to only",
         COLMAP_MODELS,
         COLMAP_FILES,
     ),
-    "openmvg": Target(
+    "openmvg": OutputFormat(
         _file_of("sfm_data", ".json"),
         write_openmvg,
         "NAME.json with sfm_data in its name",
         PIXEL_MODELS,
     ),
-    "opensfm": Target(
+    "opensfm": OutputFormat(
         _folder_of("opensfm"),
         fill_opensfm,
         "a folder with opensfm in its name",
         PIXEL_MODELS,
         OPENSFM_FILES,
     ),
-    "transforms": Target(
+    "transforms": OutputFormat(
         _file_of("transforms", ".json"),
         write_transforms,
         "NAME.json with transforms in its name",
         PIXEL_MODELS,
         alone=True,
     ),
-    "kalibr": Target(
+    "kalibr": OutputFormat(
         _file_of("camchain", *YAML),
         write_kalibr,
         "NAME.yaml with camchain in its name",
         KALIBR_MODELS,
         alone=True,
     ),
-    "micmac": Target(
+    "micmac": OutputFormat(
         lambda path: path.name.startswith("Ori-"),
         fill_micmac,
         "a folder Ori-NAME",
         MICMAC_MODELS,
         MICMAC_FILES,
     ),
-    "jaicov": Target(_ends(".phc"), write_jaicov, "NAME.phc", ("brown-projected",)),
-    "mrcal": Target(
+    "jaicov": OutputFormat(_ends(".phc"), write_jaicov, "NAME.phc", ("brown-projected",)),
+    "mrcal": OutputFormat(
         _folder_of("mrcal"),
         fill_mrcal,
         "a folder with mrcal in its name",
@@ -280,14 +280,14 @@ TARGETS: dict[str, Target] = {
         MRCAL_FILES,
         alone=True,
     ),
-    "opencv-stereo": Target(
+    "opencv-stereo": OutputFormat(
         _file_of("stereo", *OPENCV_SUFFIXES),
         write_opencv_stereo,
         "NAME.yaml, .yml, .json with stereo in its name",
         PIXEL_MODELS,
         parts=opencv_stereo_files,
     ),
-    "ros-stereo": Target(
+    "ros-stereo": OutputFormat(
         _folder_of("camera_info"),
         fill_ros_stereo,
         "a folder with camera_info in its name",
@@ -295,7 +295,7 @@ TARGETS: dict[str, Target] = {
         ROS_FILES,
         parts=ros_stereo_folders,
     ),
-    "project": Target(
+    "project": OutputFormat(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,
         _write_project,
         "another folder",

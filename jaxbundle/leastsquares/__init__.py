@@ -11,7 +11,7 @@ from jaxbundle.leastsquares.datum.motions import similarity as similarity
 from jaxbundle.leastsquares.datum.motions import similarity_of_plane as similarity_of_plane
 from jaxbundle.leastsquares.declarations import Kind as Kind
 from jaxbundle.leastsquares.declarations import Motions as Motions
-from jaxbundle.leastsquares.declarations import Observations as Observations
+from jaxbundle.leastsquares.declarations import ObservationSet as ObservationSet
 from jaxbundle.leastsquares.declarations import Table as Table
 from jaxbundle.leastsquares.indexing.rows import Data as Data
 from jaxbundle.leastsquares.indexing.rows import Values as Values

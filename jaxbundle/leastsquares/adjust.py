@@ -22,12 +22,12 @@ from jaxbundle.choices import ESTIMATORS, METHODS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.datum.motions import likely_motions
-from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import SINGULAR, TERMINATIONS, converged
-from jaxbundle.leastsquares.problem import Counts, Problem, make_problem, with_factor
+from jaxbundle.leastsquares.problem import Problem, SystemCounts, make_problem, with_factor
 from jaxbundle.leastsquares.quality.components import (
     Component,
     VarianceGroup,
@@ -36,8 +36,8 @@ from jaxbundle.leastsquares.quality.components import (
 )
 from jaxbundle.leastsquares.quality.names import undetermined
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
-from jaxbundle.leastsquares.quality.robust import Suspect, reweight
-from jaxbundle.leastsquares.quality.snooping import Removed, check_test, snoop
+from jaxbundle.leastsquares.quality.robust import SuspectRow, reweight
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.types import AnyArray
 
@@ -77,8 +77,8 @@ class Result:
         self,
         problem: Problem,
         minimum: Minimum[Values],
-        removed: Sequence[Removed] = (),
-        suspects: Sequence[Suspect] = (),
+        removed: Sequence[RemovedRow] = (),
+        suspects: Sequence[SuspectRow] = (),
         factors: Mapping[str, float] | None = None,
     ):
         self.problem, self.minimum = problem, minimum
@@ -122,7 +122,7 @@ class Result:
         return self._solution
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> SystemCounts:
         """Observations, unknowns, datum conditions, redundancy."""
         return self.problem.counts
 
@@ -203,7 +203,7 @@ class Result:
 
 def adjust(
     tables: Sequence[Table],
-    observations: Sequence[Observations],
+    observations: Sequence[ObservationSet],
     *,
     datum: str | Mapping[str, Any] = "given",
     motions: Motions | None = None,
@@ -309,7 +309,7 @@ def kinds_as_groups(problem: Problem) -> list[VarianceGroup]:
 
 
 def choose_eliminated(
-    tables: Sequence[Table], observations: Sequence[Observations], min_unknowns: int = 60
+    tables: Sequence[Table], observations: Sequence[ObservationSet], min_unknowns: int = 60
 ) -> str | None:
     """The table with the most unknowns of which no observation touches two rows, if elimination
     pays.

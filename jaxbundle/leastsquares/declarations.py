@@ -159,9 +159,9 @@ class Kind:
         sigma: Any = None,
         covariance: Any = None,
         name: str = "",
-    ) -> "Observations":
-        """Observations of this kind; see `Observations`."""
-        return Observations(self, tuple(rows), measured, sigma, covariance, name)
+    ) -> "ObservationSet":
+        """Observations of this kind; see `ObservationSet`."""
+        return ObservationSet(self, tuple(rows), measured, sigma, covariance, name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Motions:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Observations:
+class ObservationSet:
     """Observations of one kind.
 
     **Arguments:** `rows`: for each touched table the row (or the label of the row) every
@@ -193,7 +193,8 @@ class Observations:
     infinite: a weight of 0), or `covariance` [n, r, r] of the residuals of an observation; `name`:
     of these observations in the data and the results of a problem, by default that of their kind.
 
-    `weight` [n, r] is 1/σ, or [n, r, r] L⁻¹ of the covariance L·Lᵀ.
+    `weight` [n, r] is 1/σ, the root of p = 1/σ²; or [n, r, r] L⁻¹ of the covariance L·Lᵀ, a root of
+    P. Residuals are multiplied by it, so that their squares sum to vᵀPv.
     """
 
     kind: Kind
@@ -226,7 +227,7 @@ class Observations:
     def number(self) -> int:
         return len(self.rows[0])
 
-    def resolve_labels(self, tables: Sequence[Table]) -> "Observations":
+    def resolve_labels(self, tables: Sequence[Table]) -> "ObservationSet":
         """These observations with row numbers in place of labels.
 
         **Raises:** `InputError` for an unknown table or label."""

@@ -18,7 +18,7 @@ from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
-from jaxbundle.leastsquares.declarations import Kind, Motions, Observations, Table
+from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
 from jaxbundle.leastsquares.equations.normal import Tangent
 from jaxbundle.leastsquares.indexing.indices import Sizes, common, finish, round_up
 from jaxbundle.leastsquares.indexing.plan import Plan
@@ -47,13 +47,13 @@ class Problem:
     those of its planning (`planner.make_plan`)."""
 
     tables: tuple[Table, ...]
-    observations: tuple[Observations, ...]
+    observations: tuple[ObservationSet, ...]
     declared: Declared
     plan: Plan
     data: Data
     sizes: dict
     choices: dict
-    counts: "Counts"
+    counts: "SystemCounts"
     retraction: Callable
 
     @property
@@ -65,7 +65,7 @@ class Problem:
         """The table of this name."""
         return next(t for t in self.tables if t.name == name)
 
-    def observations_of(self, name: str) -> Observations:
+    def observations_of(self, name: str) -> ObservationSet:
         """The set of observations of this name.
 
         **Raises:** `KeyError`."""
@@ -75,7 +75,7 @@ class Problem:
         return sets[name]
 
     def weights(self, name: str) -> Float[np.ndarray, "n r"]:
-        """1/σ of the residuals of a set of observations, 0 without weight."""
+        """1/σ of the residuals of a set of observations, the root of p; 0 without weight."""
         return inverse_sigma(np.asarray(self.data.weight[name]))
 
     @property
@@ -105,7 +105,7 @@ AnyProblem = TypeVar("AnyProblem", bound=Problem)
 
 
 @dataclasses.dataclass(frozen=True)
-class Counts:
+class SystemCounts:
     """Rows with weight, and free unknowns."""
 
     observations: int
@@ -119,7 +119,7 @@ class Counts:
 
 def make_problem(
     tables: Sequence[Table],
-    observations: Sequence[Observations],
+    observations: Sequence[ObservationSet],
     eliminate: str | None = None,
     *,
     motions: Motions | None = None,
@@ -167,7 +167,7 @@ def make_problem(
 
 def _make_plan(
     tables: Sequence[Table],
-    observations: Sequence[Observations],
+    observations: Sequence[ObservationSet],
     eliminate: str | None,
     ways: Sequence[str],
     settings: PlanningSettings,
@@ -179,14 +179,14 @@ def _make_plan(
 
 
 def choose_rounding(
-    observations: Sequence[Observations], settings: PlanningSettings
+    observations: Sequence[ObservationSet], settings: PlanningSettings
 ) -> Callable[[Hashable, int], int]:
     """The rounding of plan sizes for this number of observations."""
     large = is_large(observations, settings)
     return lambda _key, n: n if large else round_up(n)
 
 
-def is_large(observations: Sequence[Observations], settings: PlanningSettings) -> bool:
+def is_large(observations: Sequence[ObservationSet], settings: PlanningSettings) -> bool:
     """Whether a problem is worth a program of its own."""
     return sum(o.number for o in observations) > settings.exact_sizes_from
 
@@ -286,15 +286,15 @@ def with_data(problem: AnyProblem, data: Data) -> AnyProblem:
     return dataclasses.replace(problem, data=data, counts=counts)
 
 
-def count(tables: Sequence[Table], data: Data) -> Counts:
+def count(tables: Sequence[Table], data: Data) -> SystemCounts:
     """Rows with weight, and free unknowns."""
-    return Counts(
+    return SystemCounts(
         sum(int(used(np.asarray(w)).sum()) for w in data.weight.values()),
         sum(int((t.free > 0).sum()) for t in tables),
     )
 
 
-def check(tables: Sequence[Table], observations: Sequence[Observations]) -> None:
+def check(tables: Sequence[Table], observations: Sequence[ObservationSet]) -> None:
     """Refuse duplicate table names, unknown tables, and rows that do not exist."""
     known = {}
     for table in tables:
@@ -312,7 +312,7 @@ def check(tables: Sequence[Table], observations: Sequence[Observations]) -> None
                 )
 
 
-def distinct_names(observations: Sequence[Observations]) -> tuple[Observations, ...]:
+def distinct_names(observations: Sequence[ObservationSet]) -> tuple[ObservationSet, ...]:
     """Sets of observations under names that differ: a second "distance" is "distance 2"."""
     taken: set[str] = set()
     found = []
@@ -326,7 +326,7 @@ def distinct_names(observations: Sequence[Observations]) -> tuple[Observations, 
 
 def check_numbers(
     tables: Sequence[Table],
-    observations: Sequence[Observations],
+    observations: Sequence[ObservationSet],
     weights: Mapping[str, Float[np.ndarray, "n ..."]],
 ) -> None:
     """Refuse start values, and measured values with weight, that are not finite."""
@@ -351,7 +351,7 @@ def check_numbers(
                 )
 
 
-def make_data(tables: Sequence[Table], observations: Sequence[Observations]) -> Data:
+def make_data(tables: Sequence[Table], observations: Sequence[ObservationSet]) -> Data:
     """The data of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = weights_of(tables, observations)
@@ -361,14 +361,14 @@ def make_data(tables: Sequence[Table], observations: Sequence[Observations]) -> 
 
 
 def weights_of(
-    tables: Sequence[Table], observations: Sequence[Observations]
+    tables: Sequence[Table], observations: Sequence[ObservationSet]
 ) -> dict[str, Float[np.ndarray, "n ..."]]:
     """The weights of sets of observations by name; the number of residuals of a kind is found from
     the shapes."""
     called = {t.name: t for t in tables}
     one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
 
-    def number(given: Observations) -> int:
+    def number(given: ObservationSet) -> int:
         touched = [called[name] for name in given.kind.of]
         values, spaces = [t.value for t in touched], tuple(t.space for t in touched)
         return len(_evaluate.eval_shape(given.kind, spaces, one(values), one(given.measured)))

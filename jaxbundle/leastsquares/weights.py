@@ -1,6 +1,6 @@
-"""Weights of observations on the host: 1/σ [n, r], or whitening matrices W = L⁻¹ [n, r, r] of
-covariances C = L·Lᵀ, so that W·v has unit covariance. A residual without weight has zeros in its
-row and column."""
+"""Roots of the weights of observations on the host: 1/σ [n, r], or whitening matrices W = L⁻¹
+[n, r, r] of covariances C = L·Lᵀ, so that W·v has unit covariance. A residual without weight has
+zeros in its row and column."""
 
 import numpy as np
 from jaxtyping import Bool, Float

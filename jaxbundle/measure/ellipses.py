@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, project
-from jaxbundle.orientation.pose import Pose, to_camera
+from jaxbundle.orientation.pose import CameraPose, to_camera
 from jaxbundle.types import AnyArray, Scalar
 
 
@@ -100,7 +100,7 @@ def fit_ellipse(
 def circle_centre_shift(
     model: CameraModel,
     p: Float[AnyArray, " parameters"],
-    pose: Pose,
+    pose: CameraPose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
     radius: Scalar,
@@ -124,7 +124,7 @@ def circle_centre_shift(
 def rim_centre_shift(
     model: CameraModel,
     p: Float[AnyArray, " parameters"],
-    pose: Pose,
+    pose: CameraPose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
     radius: Scalar,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, image_ray, project
-from jaxbundle.orientation.pose import Pose, to_camera
+from jaxbundle.orientation.pose import CameraPose, to_camera
 from jaxbundle.types import AnyArray, Scalar
 
 
@@ -22,7 +22,7 @@ class View(eqx.Module):
 
     model: CameraModel = eqx.field(static=True)
     parameters: Float[AnyArray, " parameters"]
-    pose: Pose
+    pose: CameraPose
 
 
 def line_of_sight(view: View, xy: Float[AnyArray, "2"]) -> Float[Array, "3"]:

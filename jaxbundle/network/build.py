@@ -22,6 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.arguments import text
 from jaxbundle.cameras import CameraModel, is_known
@@ -134,6 +135,7 @@ def make_network(
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
     points = _make_points(as_columns(points, "points"))
     observations = as_columns(observations, "observations")
+    # Some rows with σ and some without: 1 unit of weight beside real σ is most likely a mistake.
     lacking = np.isnan(_matrix(observations, OBSERVATION_SIGMAS))
     mixed = sigma_image is None and lacking.any() and not lacking.all()
     observations = _make_observations(observations, images, points, sigma_image, sigma_origin)
@@ -199,7 +201,7 @@ def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> t
     for name, kind in KINDS.items():
         settings = given.get(kind.SECTION, {})
         if given.get(name) is not None:
-            made.append(kind.of(as_columns(given[name], name), settings, radians))
+            made.append(kind.from_columns(as_columns(given[name], name), settings, radians))
         elif settings:
             raise InputError(f"{where}[{kind.SECTION}] is given, but no table {name}")
     return tuple(made)
@@ -238,7 +240,9 @@ def make_cameras(
     return made
 
 
-def _camera(row: Mapping[str, Any], number: int, where: str, models) -> Camera:
+def _camera(
+    row: Mapping[str, Any], number: int, where: str, models: Sequence[CameraModel]
+) -> Camera:
     id = str(row.get("id", "")).strip() if isinstance(row, Mapping) else ""
     if not id:
         raise InputError(f"{where}camera {number}: id is missing")
@@ -307,11 +311,14 @@ def _index(ids: Sequence[str]) -> dict[str, int]:
     return {id: row for row, id in enumerate(ids)}
 
 
-def _matrix(table: Columns, names, **options):
+def _matrix(
+    table: Columns, names: Sequence[str], **options: Any
+) -> Float[np.ndarray, "rows names"]:
     return np.stack([table.numbers(name, **options) for name in names], 1)
 
 
 def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> Images:
+    # Without start values at all the columns may be missing; half a group is a mistake.
     needed = [n for group in GROUPS if {*group} & {*table.values} for n in group]
     table.check_names(("id", "camera", *needed), (*EXTERIOR, *IMAGE_SIGMAS))
     ids = table.ids("id")

@@ -42,6 +42,8 @@ class CameraTable:
         own = [cameras[c] for c in self.cameras]
         unknowns = [camera.unknowns for camera in own]
         free = np.array([[name in names for name in self.parameters] for names in unknowns])
+        # Columns that are free in no camera are constants of the formula, not unknowns held at 0:
+        # the reduced matrix is smaller.
         moving = tuple(np.flatnonzero(free.any(0)).tolist())
         at = self.parameters.index
         tied = tuple(
@@ -63,6 +65,8 @@ class CameraTable:
 
 def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
     """Groups of cameras that share a table: those of one model with the same ties."""
+    # One table a model, since its rows have the same columns and one compiled formula; ties are
+    # part of the space of a table, so cameras with other ties have their own.
     sorts = [(get_model(c.model), c.tie) for c in cameras]
     different = tuple(dict.fromkeys(sorts))
     named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])

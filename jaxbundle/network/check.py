@@ -5,10 +5,11 @@ determinability: rays per point, points per image, connected parts, redundancy.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import SupportsIndex
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -55,6 +56,8 @@ def check_network(network: Network) -> Network:
 
     **Raises:** `InputError`, one line with file, row, cause and remedy.
     """
+    # Values first (a message about a row), then what they determine (a message about the network):
+    # a missing number would otherwise be reported as a missing point.
     network = leave_out_undetermined(check_tables(network))
     _check_start_values(network)
     check_parts(network)
@@ -117,7 +120,12 @@ def _check_sizes(network: Network) -> None:
             )
 
 
-def _refuse(table: Images | Points, mask, thing: str, message: Callable[[int, int], str]) -> None:
+def _refuse(
+    table: Images | Points,
+    mask: Bool[np.ndarray, "rows columns"],
+    thing: str,
+    message: Callable[[int, int], str],
+) -> None:
     """Refuse the first entry of a mask [rows, columns]; `message(row, column)` says why."""
     for row, k in np.argwhere(mask)[:1]:
         raise InputError(f"{table.source(row)}: {thing} {table.id[row]!r}: {message(row, k)}")
@@ -161,6 +169,7 @@ def _check_images(network: Network) -> None:
     hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
     _refuse(
         images,
+        # a turn, and a little for rounding: degrees read as radians are nearly always more
         np.abs(images.angles) > 2 * math.pi * 1.01,
         "image",
         lambda row, k: (
@@ -183,6 +192,7 @@ def _check_images(network: Network) -> None:
         "image",
         lambda row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
     )
+    # A rotation changes by a vector δθ in the camera frame: no column of it is one angle.
     held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
         images,
@@ -252,7 +262,7 @@ def _check_points(network: Network) -> Network:
     return network
 
 
-def _names(points: Points, mask) -> str:
+def _names(points: Points, mask: Bool[np.ndarray, " points"]) -> str:
     return list_some(points.id[row] for row in np.flatnonzero(mask))
 
 
@@ -277,6 +287,7 @@ def _check_observations(network: Network) -> None:
             f"{sigma[row, k]:g}, less than the last digit of the image coordinates ({least:.1g}); "
             "give it, or sigma_image, in the unit of the coordinates"
         )
+    # One number for image and point, so that millions of rows are compared by a sort.
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:
@@ -345,7 +356,12 @@ def _check_start_values(network: Network) -> None:
     _refuse_missing(points, taking_part, AXES, "tie point")
 
 
-def _refuse_missing(table, values, names, thing):
+def _refuse_missing(
+    table: Images | Points,
+    values: Float[np.ndarray, "rows columns"],
+    names: Sequence[str],
+    thing: str,
+) -> None:
     missing = np.isnan(values)
     more = missing.any(1).sum() - 1
     also = f" (and {more} more)" if more > 0 else ""
@@ -365,6 +381,7 @@ def _note_points_behind(network: Network) -> Network:
     see behind them."""
     images, rays = network.images, network.observations
     plain = [get_model(camera.model).image == "perspective" for camera in network.cameras]
+    # The third row of M, the axis of the camera in object space: q = axis·(X − X0) < 0 in front.
     omega, phi, _ = images.angles.T
     axis = np.stack([np.sin(phi), -np.cos(phi) * np.sin(omega), np.cos(phi) * np.cos(omega)], 1)
     ray = network.points.position[rays.point] - images.position[rays.image]

@@ -121,6 +121,7 @@ class Columns:
         self, name: str, thing: str, of: Mapping[str, int], where: str
     ) -> Int[np.ndarray, " rows"]:
         """A column of ids as indices into another table (`thing`s in `where`)."""
+        # Millions of rows: looked up at once, and searched for the unknown id only if there is one.
         ids = self.ids(name)
         try:
             return np.fromiter(map(of.__getitem__, ids), np.int64, len(ids))
@@ -229,6 +230,7 @@ def _id(value: Any) -> str:
         return value.strip()
     if is_missing(value):
         return ""
+    # A column of whole numbers with an empty cell is read as floats: 7.0 is the id "7".
     if isinstance(value, float | np.floating) and float(value).is_integer():
         value = int(value)
     return str(value)
@@ -244,6 +246,7 @@ def _plain_numbers(values: Column) -> np.ndarray | None:
         numbers = np.fromiter(map(float, values), float, len(values))
     except (TypeError, ValueError, OverflowError):
         return None
+    # float() takes more than a table means: "nan", "inf", "1_000".
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
     return None if odd else numbers

@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.cameras import CameraModel, Conversion, convert_camera, get_model, is_own, key_of
 from jaxbundle.cameras.pixel_frame import between_frames
@@ -90,11 +91,18 @@ def convert_one(
     return made, conversion
 
 
-def _convert(camera: Camera, model: str | CameraModel, r0: float, xy, measured: bool = False):
+def _convert(
+    camera: Camera,
+    model: str | CameraModel,
+    r0: float,
+    xy: Float[np.ndarray, "rays 2"],
+    measured: bool = False,
+):
     """The camera, the conversion, and shift and step of its image points."""
     source, target = get_model(camera.model), model_of(model)
     sizes = camera.image_size, camera.pixel_size
     parameters, centre = dict(camera.parameters), np.zeros(2)
+    # `snavely` has no principal point: that of the camera is moved into the image coordinates.
     if model == "snavely" and camera.model != "bingo":
         parameters, centre, sizes = _centre(camera)
     area = None

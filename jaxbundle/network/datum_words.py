@@ -1,12 +1,17 @@
 """The open part of the datum in words."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.network.motions import SIMILARITY
 
 
-def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"], about=(0.0, 0.0, 0.0)) -> str:
+def open_directions_in_words(
+    gauge: Float[np.ndarray, "7 defect"],
+    about: Sequence[float] | Float[np.ndarray, "3"] = (0.0, 0.0, 0.0),
+) -> str:
     """Which of shift, rotation and scale the observations leave open, for messages.
 
     Rotation and scale are about the point `about`: with one point known, no shift is open."""

@@ -29,11 +29,10 @@ from jaxtyping import Float, Int
 
 from jaxbundle.geometry.rotations import quaternion_from_omega_phi_kappa
 from jaxbundle.leastsquares.any_distance import AnyDistance
-from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.problem import distinct_names
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
-from jaxbundle.network.also import place, split
 from jaxbundle.network.camera_tables import CameraTable, camera_tables
 from jaxbundle.network.kinds.base import among
 from jaxbundle.network.kinds.control_points import declare_control_points
@@ -44,10 +43,12 @@ from jaxbundle.network.kinds.interior_orientation import declare_interior_orient
 from jaxbundle.network.kinds.rolling_shutter import RollingShutter
 from jaxbundle.network.motions import SIMILARITY, SIMILARITY_AT_ANY_DISTANCE
 from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.user_observations import place, split
 from jaxbundle.system.programs import compile_once
 
 LEAST_IMAGES = 64
-"""Smallest batch of rotations, so that small networks share the program."""
+"""Smallest batch of rotations, so that networks of fewer images share one compiled program:
+compiling takes a second, converting 64 rotations no time. Not critical."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +62,7 @@ class DeclaredNetwork:
     for the others, None if there are none; `motions`: the similarities that may be open."""
 
     tables: tuple[Table, ...]
-    observations: tuple[Observations, ...]
+    observations: tuple[ObservationSet, ...]
     cameras: tuple[CameraTable, ...]
     image_rows: Mapping[str, Int[np.ndarray, " rows"]]
     further_sets: tuple[str, ...]
@@ -74,13 +75,14 @@ class DeclaredNetwork:
 def declare(
     network: Network,
     origin: Float[np.ndarray, "3"] | None = None,
-    also: Sequence[Table | Observations] = (),
+    also: Sequence[Table | ObservationSet] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> DeclaredNetwork:
     """The tables and observations of a checked network (`check_network`) without check points.
 
     `origin`: default the rounded centroid of the points; `also`: tables, and observations of other
-    kinds (`also.py`)."""
+    kinds (`user_observations.py`)."""
+    # Rounded to whole units, a coordinate minus the origin keeps its written decimals.
     points = network.points
     if origin is None:
         origin = np.round(points.position.mean(0)) if len(points) else np.zeros(3)
@@ -93,10 +95,12 @@ def declare(
         *declare_interior_orientation(network, cameras),
         *declare_distances(network),
     ]
-    # Image points touch the table of velocities, even if no row of it is given.
+    # A rolling shutter is declared even where all of its rows are left out: image points touch its
+    # tables.
     shutters = [one.among(network) for one in network.further if isinstance(one, RollingShutter)]
     others = [one for one in among(network) if not isinstance(one, RollingShutter)]
     declared = [one.declare(network, origin) for one in (*shutters, *others)]
+    # Observations of users come last, and resolve ids of any table above.
     own_tables, own_observations = split(also)
     further = own_tables + [table for one in declared for table in one.tables]
     tables = [
@@ -135,6 +139,8 @@ def _table_of_points(
     lengths: Float[np.ndarray, " points"] | None,
 ) -> Table:
     points = network.points
+    # X, Y, Z, and for a network with far points the unit of their distance as a fourth number; such
+    # a row changes in direction and inverse distance.
     value, space = points.position - origin, Vector(3)
     if lengths is not None:
         value, space = np.concatenate([value, lengths[:, None]], 1), AnyDistance()

@@ -5,16 +5,19 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Network
 
-LARGEST = 1e75
-"""Normal equations and cofactors have products of four lengths; the largest number is 1.8e308."""
-FINEST, COARSEST = 1e-7, 1e-3
-"""Steps between neighbouring numbers, relative to the extent of the network: σ of the best
-networks are 1e-6 to 1e-7 of it, so larger steps are noticed; at a thousandth the object is lost.
-Where nothing of the extent is left, a unit is taken for it."""
+LARGEST = float(f"{np.finfo(float).max ** (1 / 4) / 100:.0e}")
+"""Normal equations and cofactors have products of four lengths, and sums over many of them: a
+hundredth of the fourth root of the largest number."""
 
 
-def check_coordinates(network: Network) -> Network:
+def check_coordinates(
+    network: Network, noticed_step: float = 1e-7, refused_step: float = 1e-3
+) -> Network:
     """The network, with a warning if its coordinates are so large that rounding matters.
+
+    `noticed_step`, `refused_step`: between neighbouring numbers, relative to the extent of the
+    network. σ of the best networks are 1e-6 to 1e-7 of it, so larger steps are noticed; at a
+    thousandth the object is lost. Where nothing of the extent is left, a unit is taken for it.
 
     **Raises:** `InputError` for coordinates that cannot be computed with."""
     for table, thing, axes in (
@@ -38,13 +41,13 @@ def check_coordinates(network: Network) -> Network:
             f"wide: expected more than {1 / LARGEST:g}; give its coordinates in a smaller unit"
         )
     # Equal coordinates may be poor start values, or all that is left of others.
-    if step <= FINEST * extent or extent == 0 and step < COARSEST:
+    if step <= noticed_step * extent or extent == 0 and step < refused_step:
         return network
     what = (
         f"coordinates of {largest:.3g} are held in steps of {step:.2g} {network.object_unit}, and "
         f"the network is {extent:.3g} {network.object_unit} wide: subtract a common offset from "
         "all of them"
     )
-    if step > COARSEST * extent:
+    if step > refused_step * extent:
         raise InputError(f"{network.points.source.name}: {what}")
     return network.warn(what)

@@ -6,13 +6,10 @@ They count twice in σ, and the repetition is no independent information.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Network
-
-FEWEST_EQUAL = 3
-"""Number of exactly equal image points for an image to repeat another; of images for a point."""
-
 
 MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers that spread the bits of measurements over a hash."""
@@ -35,13 +32,21 @@ def warn_of_repetitions(network: Network) -> Network:
     return network
 
 
-def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
-    """Pairs (first, repetition) whose rows (`by`, x, y) are all equal.
+def _repetitions(
+    of: Int[np.ndarray, " rays"],
+    by: Int[np.ndarray, " rays"],
+    xy: Float[np.ndarray, "rays 2"],
+    min_equal: int = 3,
+) -> Sequence[tuple[int, int]]:
+    """Pairs (first, repetition) whose rows (`by`, x, y) are all equal, `min_equal` at least: two
+    photographs may have one or two points at the same rounded place by chance.
 
     Sums of hashed rows, modulo 2⁶⁴ and so in any order, find candidates among millions of points;
     only these are compared row by row."""
     if not len(of):
         return ()
+    # Addition commutes, so the sum of the hashes of an image does not depend on the order of its
+    # rows; two images with different rows have equal sums once in 2⁶⁴.
     x, y = np.ascontiguousarray(xy.T, float).view(np.uint64)
     mixed = x * MIX[0] ^ (y * MIX[1] + by.astype(np.uint64) * MIX[2])
     mixed = (mixed ^ (mixed >> np.uint64(29))) * MIX[0]
@@ -49,7 +54,7 @@ def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     total, number = np.add.reduceat(mixed[order], first), np.diff(np.append(first, len(of)))
     _, group, size = np.unique(total, return_inverse=True, return_counts=True)
-    candidates = of[order[first]][(size[group] > 1) & (number >= FEWEST_EQUAL)]
+    candidates = of[order[first]][(size[group] > 1) & (number >= min_equal)]
     rows = np.flatnonzero(np.isin(of, candidates))
     rows = rows[np.lexsort((by[rows], of[rows]))]
     known, found = {}, []

@@ -11,17 +11,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
-from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.cameras import CameraModel, default_parameters, get_model
 from jaxbundle.cameras.model import project
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
 from jaxbundle.system.programs import compile_once
-
-POINTS_AT_ONCE = 4096
-"""Batch size of image points: all networks share one program per camera model."""
+from jaxbundle.types import AnyArray
 
 
 def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
@@ -51,14 +49,22 @@ def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
         return total / number, "px" if in_pixels else "mm"
 
 
-def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
+def _project(
+    model: CameraModel,
+    network: Network,
+    rows: Int[np.ndarray, " n"],
+    values: Float[np.ndarray, "cameras parameters"],
+) -> Float[np.ndarray, "n 2"]:
     """The images of the points of some rays, a portion at a time."""
     images, rays = network.images, network.observations
     found = np.zeros((len(rows), 2))
+    # Portions of one size, padded: all networks share one program per camera model. Larger: small
+    # networks project padding; smaller: large ones make more calls. Not critical.
+    portion = 4096
     with local_x64():
-        for first in range(0, len(rows), POINTS_AT_ONCE):
-            mine = rows[first : first + POINTS_AT_ONCE]
-            all = np.pad(mine, (0, POINTS_AT_ONCE - len(mine)), mode="edge")
+        for first in range(0, len(rows), portion):
+            mine = rows[first : first + portion]
+            all = np.pad(mine, (0, portion - len(mine)), mode="edge")
             image = rays.image[all]
             part = _portion(
                 model,
@@ -67,14 +73,25 @@ def _project(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
                 images.angles[image],
                 network.points.position[rays.point[all]],
             )
-            found[first : first + POINTS_AT_ONCE] = np.asarray(part)[: len(mine)]
+            found[first : first + portion] = np.asarray(part)[: len(mine)]
     return found
 
 
 @partial(compile_once, static=0)
-def _portion(model, values, position, angles, points):
-    def one(p, X0, angles, X):
+def _portion(
+    model: CameraModel,
+    values: Float[AnyArray, "n parameters"],
+    position: Float[AnyArray, "n 3"],
+    angles: Float[AnyArray, "n 3"],
+    points: Float[AnyArray, "n 3"],
+) -> Float[Array, "n 2"]:
+    def project_point(
+        p: Float[AnyArray, " parameters"],
+        X0: Float[AnyArray, "3"],
+        angles: Float[AnyArray, "3"],
+        X: Float[AnyArray, "3"],
+    ) -> Float[Array, "2"]:
         ray = matrix_from_omega_phi_kappa(angles) @ (X - X0)
         return jnp.stack(project(model, tuple(p), *ray))
 
-    return jax.vmap(one)(values, position, angles, points)
+    return jax.vmap(project_point)(values, position, angles, points)

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.equations.normal import Tangent, total
@@ -12,6 +13,7 @@ from jaxbundle.leastsquares.indexing.rows import Declared, Values
 from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.kinds.image_points import ImagePoint
+from jaxbundle.types import AnyArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,15 @@ class TurnAboutSeen:
             return moved
         old, new, pivot = values["image"], moved["image"], self._middle(plan, values)
 
-        def position(old, M, new_M, change, pivot):
+        def position(
+            old: Float[Array, "3"],
+            M: Float[Array, "3 3"],
+            new_M: Float[Array, "3 3"],
+            change: Float[AnyArray, "6"],
+            pivot: Float[Array, "3"],
+        ) -> Float[Array, "3"]:
+            # X0' such that the pivot is seen where the linear step sees it: M'·(X̄ − X0') equals
+            # M·(X̄ − X0) + δθ × M·(X̄ − X0) − M·δX0, the first-order change of its ray.
             Y = M @ (pivot - old)
             return pivot - new_M.T @ (Y + jnp.cross(change[3:], Y) - M @ change[:3])
 
@@ -46,7 +56,7 @@ class TurnAboutSeen:
         free = plan.groups["image"].free[:, :3].all(1, keepdims=True)
         return moved | {"image": PoseValue(jnp.where(free, turned, new.position), new.rotation)}
 
-    def _middle(self, plan: Plan, values: Values):
+    def _middle(self, plan: Plan, values: Values) -> Float[Array, "images 3"]:
         """The centre of the points that each image sees; 0 if it sees none."""
         position, points = values["image"].position, values["point"][:, :3]
         seen = jnp.zeros((position.shape[0], 4))
@@ -56,6 +66,7 @@ class TurnAboutSeen:
             image, point = part.lookup[0], points[part.lookup[-1]]
             centre = position[image] if part.by_row[0] else position[image][:, None]
             point = point if part.by_row[-1] else point[:, None]
+            # The last row of the source is that of the padding.
             used = part.source != part.place.shape[0] - 1
             square = jnp.sum((point - centre) ** 2, -1)
             weight = jnp.where(used, 1 / jnp.maximum(square, 1e-300), 0.0)[..., None]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -139,16 +140,16 @@ def _check_fields(camera: Camera, where: str) -> None:
         )
 
 
-def _are_names(given) -> bool:
+def _are_names(given: Any) -> bool:
     return isinstance(given, list | tuple) and all(isinstance(name, str) for name in given)
 
 
-def _check_ties(camera: Camera, values, where: str) -> None:
+def _check_ties(camera: Camera, values: Mapping[str, float], where: str) -> None:
     """Refuse ties of unknown parameters, of one in two groups, of different start values."""
     names = [name for group in camera.tie for name in group]
+    known = get_model(camera.model).parameters
     for name in names:
-        if name not in get_model(camera.model).parameters:
-            known = get_model(camera.model).parameters
+        if name not in known:
             raise InputError(
                 f"{where}tie names the unknown parameter {name!r}{did_you_mean(name, known)}"
             )
@@ -162,7 +163,7 @@ def _check_ties(camera: Camera, values, where: str) -> None:
             )
 
 
-def _check_pair(where, name, pair, meaning):
+def _check_pair(where: str, name: str, pair: Any, meaning: str) -> None:
     numbers = np.shape(pair) == (2,) and not isinstance(pair, str | np.ma.MaskedArray)
     if pair is not None and not (numbers and all(map(_positive, pair))):
         raise InputError(f"{where}{name} is {show(pair)}; expected {meaning}, both positive")
@@ -176,7 +177,7 @@ def check_sigma_image(sigma: float, where: str = "") -> None:
         raise InputError(f"{where}sigma_image is {show(sigma)}; it must be finite and positive")
 
 
-def _positive(value) -> bool:
+def _positive(value: Any) -> bool:
     try:
         return math.isfinite(value) and value > 0
     except (OverflowError, TypeError):

@@ -84,7 +84,7 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
     return dataclasses.replace(points, role=roles)
 
 
-def count_controlled_axes(points: Points):
+def count_controlled_axes(points: Points) -> Int[np.ndarray, " points"]:
     """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
     axes = np.isfinite(points.sigma).sum(1)
     return np.where(points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0))
@@ -125,6 +125,8 @@ def leave_out_undetermined(network: Network) -> Network:
     known = count_controlled_axes(points) + equations_of(network, "POINTS")
     given = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
     keep, used = np.ones(len(points), bool), np.ones(len(images), bool)
+    # Points and images depend on each other: without a point an image may have too few, without the
+    # image other points lose a ray. Everything is counted again until nothing changes.
     first = None
     while True:
         rays = np.bincount(point[used[image]], minlength=len(points))
@@ -139,7 +141,8 @@ def leave_out_undetermined(network: Network) -> Network:
             break
         if first is None and (still != used).any():
             measured = np.bincount(image, minlength=len(images))
-            first = _too_few_points(network, np.where(still, np.inf, measured).argmin(), seen)
+            worst = int(np.where(still, np.inf, measured).argmin())
+            first = _too_few_points(network, worst, seen)
         keep, used = kept, still
     if first is not None and 2 * (~used).sum() >= len(images):
         raise first
@@ -172,7 +175,9 @@ def leave_out_undetermined(network: Network) -> Network:
     return left
 
 
-def _too_few_points(network: Network, row, used) -> InputError | NotSolvedError:
+def _too_few_points(
+    network: Network, row: int, used: Int[np.ndarray, " images"]
+) -> InputError | NotSolvedError:
     """Why an image with only `used` [images] of its points is not determined."""
     images, points, rays = network.images, network.points, network.observations
     rays_of_point = np.bincount(rays.point, minlength=len(points))
@@ -203,6 +208,8 @@ def check_parts(network: Network) -> None:
     images, points, rays = network.images, network.points, network.observations
     known = count_controlled_axes(points) == 3
     ties = ~(known | points.has_role("check"))[rays.point]
+    # Only tie points connect: known ones have their coordinates in each part, and a check point is
+    # none of the adjustment's.
     part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
@@ -224,7 +231,9 @@ def check_parts(network: Network) -> None:
         )
 
 
-def label_connected_parts(image, point, images: int, points: int):
+def label_connected_parts(
+    image: Int[np.ndarray, " rays"], point: Int[np.ndarray, " rays"], images: int, points: int
+) -> Int[np.ndarray, " images"]:
     """A label for each image; images that share points, directly or in a chain, have the same.
 
     Smallest labels travel along the rays, with hooking and halving, so that a strip of n images
@@ -266,6 +275,8 @@ def check_redundancy(network: Network) -> None:
         + sum(len(camera.unknowns) for camera in network.cameras)
         + 3 * (~points.has_role("fixed")).sum()
     )
+    # The datum defect as it must be at least: the engine finds the true one, but only after a
+    # problem has been made, and a count says what is missing in numbers that a reader can check.
     conditions = 0
     if network.datum != "control":
         known = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()

@@ -9,18 +9,15 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Network
 
-ON_A_LINE = 1e-7
-"""Relative distances from a line that count as zero."""
-LARGEST_ROLL_SIGMA = 1.0
-"""Degrees: a larger σ of the roll is reported."""
 REMEDY = (
     "give a control point beside the strip, a σ of omega or phi, or photographs of a crossing strip"
 )
 
 
-def check_single_strip(network: Network) -> Network:
+def check_single_strip(network: Network, max_roll_sigma: float = 1.0) -> Network:
     """The network, with a warning if the rotation about the line of its projection centres is
-    poorly determined.
+    poorly determined: its σ above `max_roll_sigma`, degrees (half a metre of height 30 m beside the
+    strip).
 
     **Raises:** `InputError` if it is undetermined.
     """
@@ -37,14 +34,15 @@ def check_single_strip(network: Network) -> Network:
     if np.isfinite(images.sigma[~given, :3]).any() or not extents[0] > 0:
         return network
     where = f"{images.source.name}: the {given.sum()} projection centres with σ lie on one line"
-    if off.max() < ON_A_LINE * extents[0]:
+    # Coordinates with seven digits that lie on a line do so to their rounding.
+    if off.max() < 1e-7 * extents[0]:
         raise InputError(
             f"{where} and nothing else fixes the datum: the rotation about the axis of the strip "
             f'(its roll) is not determined; {REMEDY}, or choose datum = "inner" or "minimal"'
         )
     spread = float(np.sqrt((off**2).sum()))
     roll = float(np.degrees(np.sqrt(np.mean(sigma[given] ** 2)) / spread))
-    if roll > LARGEST_ROLL_SIGMA:
+    if roll > max_roll_sigma:
         return network.warn(
             f"{where} but for {off.max():.2g} {network.object_unit}: the rotation about the axis "
             f"of the strip (its roll) is known only to about {roll:.2g}°; {REMEDY}"

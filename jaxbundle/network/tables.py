@@ -13,7 +13,7 @@ message can name file and row. Rows refer to each other by index; ids are kept f
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from operator import index
 from typing import Any, SupportsIndex
 
@@ -22,6 +22,10 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import CameraModel, get_model, key_of
+from jaxbundle.choices import ESTIMATED as ESTIMATED
+from jaxbundle.choices import SIGMA_ORIGINS as SIGMA_ORIGINS
+from jaxbundle.choices import STATED as STATED
+from jaxbundle.choices import UNIT as UNIT
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 
@@ -29,12 +33,17 @@ ROLES = ("tie", "control", "fixed", "check")
 DATUMS = ("control", "inner", "minimal")
 RESIDUAL_DOMAINS = ("corrected", "measured")
 EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
-STATED, UNIT, ESTIMATED = SIGMA_ORIGINS = ("stated", "unit", "estimated")
-"""Where the σ of image coordinates come from: somebody stated them; nobody did, so that they are
-units of weight; they were estimated from the residuals of the same measurements."""
+Rows = Bool[np.ndarray, " n"] | Int[np.ndarray, " k"] | Sequence[int]
+"""Which rows of a table: a mask, or indices."""
 UNSTATED_BOARD_SIGMA = 0.1
 """σ of an image coordinate of a calibration, pixels, where none is stated: a unit of weight, about
 what corners of boards have, which σ0 estimates."""
+
+
+def row_indices(rows: Rows) -> Int[np.ndarray, " k"]:
+    """The chosen rows as indices."""
+    rows = np.asarray(rows)
+    return np.flatnonzero(rows) if rows.dtype == bool else rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +59,9 @@ class Source:
         number = index(row) + 1 if self.numbers is None else self.numbers[row]
         return f"{self.name}, {self.word} {number}"
 
-    def take(self, rows) -> "Source":
+    def take(self, rows: Rows) -> "Source":
         """The source of the chosen rows (a mask or indices)."""
-        rows = np.asarray(rows)
-        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        rows = row_indices(rows)
         numbers = rows + 1 if self.numbers is None else self.numbers[rows]
         return Source(self.name, numbers, self.word)
 
@@ -83,6 +91,7 @@ class Camera:
     @property
     def unknowns(self) -> tuple[str, ...]:
         """The names of the free parameters; of tied ones the first."""
+        # A group is one unknown: freeing any of it frees all.
         first = {name: group[0] for group in self.tie for name in group}
         return tuple(dict.fromkeys(first.get(name, name) for name in self.free))
 
@@ -98,6 +107,7 @@ def _fill_masked(table: Any) -> None:
         value = getattr(table, field.name)
         if not isinstance(value, np.ma.MaskedArray):
             continue
+        # A masked number is a missing one, NaN; an index or a flag cannot be missing.
         if value.dtype.kind != "f" and np.ma.is_masked(value):
             raise InputError(f"{table.source.name}: {field.name} has masked values; give all")
         filled = value.filled(np.nan) if value.dtype.kind == "f" else value.data
@@ -120,9 +130,9 @@ class Images:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, rows) -> "Images":
+    def take(self, rows: Rows) -> "Images":
         """The chosen images (a mask or indices), with their source rows."""
-        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        rows = row_indices(rows)
         return Images(
             tuple(self.id[row] for row in rows),
             self.camera[rows],
@@ -148,9 +158,9 @@ class Points:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, rows) -> "Points":
+    def take(self, rows: Rows) -> "Points":
         """The chosen points (a mask or indices), with their source rows."""
-        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        rows = row_indices(rows)
         return Points(
             tuple(self.id[row] for row in rows),
             tuple(self.role[row] for row in rows),
@@ -180,7 +190,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.image)
 
-    def take(self, rows) -> "Observations":
+    def take(self, rows: Rows) -> "Observations":
         """The chosen rows (a mask or indices), with their source rows."""
         return dataclasses.replace(
             self,
@@ -254,7 +264,7 @@ class Network:
     notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
 
-    def replace(self, **changes) -> "Network":
+    def replace(self, **changes: Any) -> "Network":
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 

@@ -2,10 +2,12 @@
 
 The widest lenses show 90° from the axis, where r/c is 2 in a stereographic image and less in other
 fisheyes; 84° in a central projection are r/c = 10. A narrow field is never refused: c may be
-arbitrarily long, as in microscopes and telescopes. If the field is narrower than `NARROW_FIELD` and
+arbitrarily long, as in microscopes and telescopes. If the field is narrower than `narrow_field` and
 the same number in pixels would be a common lens, this is reported: as a warning if the pixel size
 confirms it, else as a likely cause if the adjustment fails.
 """
+
+import dataclasses
 
 import numpy as np
 from jaxtyping import Float
@@ -15,34 +17,57 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import STATED, Camera, Network, Points
 
-LARGEST_RADIUS = 10.0
-"""Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
-FIELDS = (0.02, 5.0)
-"""Common range of r/c, used only to check a remedy."""
-COARSE, FINE, NARROW = 0.1, 1e-4, 1e-3
-"""Pixels, mm, larger or smaller than those of sensors; and r/c less than those of cameras."""
-NARROW_FIELD = 0.02
-"""r/c, half of the image points within 1.1°, below which c may be in pixels: those of sensors of
-2 to 20 µm are 50 to 500 to the millimetre."""
-USUAL_FIELDS = (0.05, 1.0)
-"""r/c of usual lenses, 3° to 45°; 600 mm before a full frame would be 3 if they were pixels."""
-LEAST_PIXELS = 300.0
-"""No camera has a c of fewer pixels."""
-HALF_OF_POINTS = 1 / 3
-"""Width of an image evenly filled from whose centre half of its points lie (sides 3 : 2)."""
-FAR, STEEP = 1000.0, 3.0
-"""Degrees: coordinates of more than this many of their extents (12 km at 120° of longitude), and
-heights that extend over more than this many (3 m to 111 km of ground)."""
-SIGMA0_RANGE = (0.1, 10.0)
-"""σ0 within these is a matter of precision; units differ by more."""
-AGREEING = 4.0
-"""Largest ratio of σ0 to the ratio of two units: a guessed σ is right to about this factor."""
-FINEST_PIXELS = 0.005
-"""No image point is measured more precisely, in pixels."""
-SMALL_PITCH = 1e-3
-"""Pixels of 1 µm are the smallest of cameras, mm."""
-MILLIMETRE_RATIOS = (300.0, 3000.0)
-"""Ratios of two lengths of one object in millimetres and in metres."""
+
+@dataclasses.dataclass(frozen=True)
+class UnitLimits:
+    """What no camera or object has, or few have: numbers beyond are in another unit.
+
+    All are far from what they tell apart, since units differ by 1000 (mm and m) or 50 to 500 (mm
+    and pixels of 2 to 20 µm): none is critical within a factor of two.
+
+    - `max_radius`: largest median r/c of the image points of a camera; 84° from the axis in a
+      central projection, and no fisheye has more than 2. A median, to ignore blunders.
+    - `fields`: r/c that cameras have, used only to check a remedy.
+    - `coarse_pixel`, `fine_pixel`: mm; larger and smaller than the pixels of sensors.
+    - `narrow_radius`: r/c less than that of any camera with such pixels.
+    - `narrow_field`: r/c, half of the image points within 1.1°, below which c may be in pixels.
+    - `usual_fields`: r/c of usual lenses, 3° to 45°; 600 mm before a full frame would be 3 if they
+      were pixels.
+    - `min_pixels`: no camera has a c of fewer pixels.
+    - `half_of_points`: the part of an image's width within which half of its evenly spread points
+      lie around the centre (sides 3 : 2, π·r² = half of the area).
+    - `far`: coordinates of more than this many of their extents may be degrees: 12 km at 120° of
+      longitude.
+    - `steep`: so may those whose heights extend over more than this many of them: 3 m to 111 km of
+      ground.
+    - `sigma0`: within these σ0 is a matter of precision, beyond perhaps of a unit.
+    - `agreement`: largest ratio of σ0 to the ratio of two units: a guessed σ is right to about this
+      factor.
+    - `min_sigma`: pixels; no image point is measured more precisely.
+    - `min_pixel`: mm; the smallest pixels of cameras.
+    - `thousand`: the ratios of two lengths of one object that are taken for 1000; one of both is a
+      start value, or the extent of other points.
+    """
+
+    max_radius: float = 10.0
+    fields: tuple[float, float] = (0.02, 5.0)
+    coarse_pixel: float = 0.1
+    fine_pixel: float = 1e-4
+    narrow_radius: float = 1e-3
+    narrow_field: float = 0.02
+    usual_fields: tuple[float, float] = (0.05, 1.0)
+    min_pixels: float = 300.0
+    half_of_points: float = 1 / 3
+    far: float = 1000.0
+    steep: float = 3.0
+    sigma0: tuple[float, float] = (0.1, 10.0)
+    agreement: float = 4.0
+    min_sigma: float = 0.005
+    min_pixel: float = 1e-3
+    thousand: tuple[float, float] = (300.0, 3000.0)
+
+
+LIMITS = UnitLimits()
 
 
 def check_units(network: Network) -> Network:
@@ -88,7 +113,7 @@ def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray,
     )
 
 
-def _check_field(camera: Camera, xy) -> str:
+def _check_field(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
     """A warning for a pixel size in metres; refuses a principal distance too short for anything."""
     model = get_model(camera.model)
     values = [camera.parameters[name] for name in model.principal_distance]
@@ -96,7 +121,7 @@ def _check_field(camera: Camera, xy) -> str:
     point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
     usual = float(np.median(np.hypot(*(xy - point).T)))
     size = camera.pixel_size
-    if usual > LARGEST_RADIUS * c:
+    if usual > LIMITS.max_radius * c:
         raise InputError(
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
             f"more than {usual:.4g} {model.unit} from the principal point, "
@@ -104,7 +129,7 @@ def _check_field(camera: Camera, xy) -> str:
             "view. "
             f"{_remedy(camera, model.unit, name, c, usual)}"
         )
-    if size is not None and max(size) < FINE and usual < NARROW * c:
+    if size is not None and max(size) < LIMITS.fine_pixel and usual < LIMITS.narrow_radius * c:
         return (
             f"camera {camera.id!r}: pixel_size is {max(size):g} mm, and half of its image points "
             f"lie within {usual / c:.2g} of {name} about the axis; is it in metres? It is expected "
@@ -129,7 +154,7 @@ def name_degrees(points: Points) -> str:
     swapped = largest[0] <= 90 and largest[1] <= 180
     if not (largest[0] <= 180 and largest[1] <= 90 or swapped):
         return ""
-    if not (largest[:2].max() > FAR * extent and high[2] - low[2] > STEEP * extent):
+    if not (largest[:2].max() > LIMITS.far * extent and high[2] - low[2] > LIMITS.steep * extent):
         return ""
     return (
         f"X and Y of the {count(int(known.sum()), 'known point')} look like longitude and latitude "
@@ -144,7 +169,7 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
     nobody stated them, σ0 is not far from 1, or no unit does."""
     if network.observations.sigma_origin != STATED:
         return ""
-    if SIGMA0_RANGE[0] < sigma0 < SIGMA0_RANGE[1] or not sigma0 > 0:
+    if LIMITS.sigma0[0] < sigma0 < LIMITS.sigma0[1] or not sigma0 > 0:
         return ""
     camera, sigma = network.cameras[0], float(np.median(network.observations.sigma))
     unit, pitch = get_model(camera.model).unit, camera.pixel_size and abs(camera.pixel_size[0])
@@ -152,11 +177,11 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
         unit, sigma = "px", sigma / pitch
     if unit == "mm":
         meant = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
-        if sigma < FINEST_PIXELS * (pitch or SMALL_PITCH):
+        if sigma < LIMITS.min_sigma * (pitch or LIMITS.min_pixel):
             meant["m"] = 1e3
     else:
-        meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < FINEST_PIXELS else {}
-    near = {u: f for u, f in meant.items() if 1 / AGREEING < sigma0 / f < AGREEING}
+        meant = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < LIMITS.min_sigma else {}
+    near = {u: f for u, f in meant.items() if 1 / LIMITS.agreement < sigma0 / f < LIMITS.agreement}
     if not near:
         return ""
     other = min(near, key=lambda u: abs(np.log(sigma0 / near[u])))
@@ -180,19 +205,19 @@ def name_pixels(network: Network) -> str:
     return first + (f"; so with {count(len(more), 'other camera')}" if more else "")
 
 
-def _in_pixels(camera: Camera, xy) -> str:
+def _in_pixels(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
     model = get_model(camera.model)
     name, c = model.principal_distance[0], float(camera.parameters[model.principal_distance[0]])
     spread = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
-    if model.unit != "mm" or c < LEAST_PIXELS or not 0 < spread < NARROW_FIELD * c:
+    if model.unit != "mm" or c < LIMITS.min_pixels or not 0 < spread < LIMITS.narrow_field * c:
         return ""
     expected = "multiplied by the size of a pixel"
     pixels = None
     if camera.pixel_size is not None:
         pixels, expected = spread / max(camera.pixel_size), f"{c * max(camera.pixel_size):.4g}"
     elif camera.image_size is not None:
-        pixels = HALF_OF_POINTS * max(camera.image_size)
-    if pixels is not None and not USUAL_FIELDS[0] < pixels / c < USUAL_FIELDS[1]:
+        pixels = LIMITS.half_of_points * max(camera.image_size)
+    if pixels is not None and not LIMITS.usual_fields[0] < pixels / c < LIMITS.usual_fields[1]:
         return ""
     return (
         f"camera {camera.id!r}: {name} is {c:g} mm and half of its image points lie within "
@@ -205,12 +230,12 @@ def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str
     if unit != "mm":
         return f"Is {name} in mm? It is expected in {unit}: divided by the size of a pixel"
     causes = []
-    if camera.pixel_size is not None and max(camera.pixel_size) > COARSE:
+    if camera.pixel_size is not None and max(camera.pixel_size) > LIMITS.coarse_pixel:
         return (
             f"Is pixel_size {max(camera.pixel_size):g} in µm? It is expected in mm "
             f"({max(camera.pixel_size) / 1000:g})"
         )
-    if FIELDS[0] < usual / (1000 * c) < FIELDS[1]:
+    if LIMITS.fields[0] < usual / (1000 * c) < LIMITS.fields[1]:
         causes.append(f"Is {name} in metres? It is expected in mm ({1000 * c:g})")
     causes.append(
         'Are the image coordinates pixels? Set image_unit = "px" and give the camera its '
@@ -261,4 +286,4 @@ def _distances_against_control(network: Network) -> str:
 def _thousand(a: float, b: float) -> bool:
     if not min(a, b) > 0:
         return False
-    return MILLIMETRE_RATIOS[0] < max(a / b, b / a) < MILLIMETRE_RATIOS[1]
+    return LIMITS.thousand[0] < max(a / b, b / a) < LIMITS.thousand[1]

@@ -46,15 +46,25 @@ def pixel_from_image(
     return _to_px(xy, *_grid(image_size, pixel_size))
 
 
-def _to_mm(uv, centre, pitch):
+def _to_mm(
+    uv: Float[np.ndarray, "*n 2"],
+    centre: Float[np.ndarray, "*n 2"],
+    pitch: Float[np.ndarray, "*n 2"],
+) -> Float[np.ndarray, "*n 2"]:
     return (uv - centre) * pitch
 
 
-def _to_px(xy, centre, pitch):
+def _to_px(
+    xy: Float[np.ndarray, "*n 2"],
+    centre: Float[np.ndarray, "*n 2"],
+    pitch: Float[np.ndarray, "*n 2"],
+) -> Float[np.ndarray, "*n 2"]:
     return xy / pitch + centre
 
 
-def _grid(image_size, pixel_size):
+def _grid(
+    image_size: Sequence[float], pixel_size: Sequence[float]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The image centre (pixels) and the pixel size (mm, negative where v runs down)."""
     centre, per_mm = pixel_frame(get_model("brown"), image_size, pixel_size)
     return centre, 1 / per_mm
@@ -85,14 +95,22 @@ def to_image_unit(
     return _convert(cameras, camera, xy, sigma, _units(cameras), [image_unit] * len(cameras))
 
 
-def _units(cameras):
+def _units(cameras: Sequence[Camera]) -> list[str]:
     return [get_model(camera.model).unit for camera in cameras]
 
 
-def _convert(cameras, camera, xy, sigma, given, wanted):
+def _convert(
+    cameras: Sequence[Camera],
+    camera: Int[np.ndarray, " n"],
+    xy: Float[np.ndarray, "n 2"],
+    sigma: Float[np.ndarray, "n 2"],
+    given: Sequence[str],
+    wanted: Sequence[str],
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Per camera: nothing, pixels to mm, or mm to pixels."""
     if list(given) == list(wanted):
         return xy, sigma
+    # Only cameras whose unit differs need sizes: the others must not be refused for lacking them.
     centre, pitch = np.zeros((len(cameras), 2)), np.ones((len(cameras), 2))
     for c in np.unique(camera):
         if given[c] != wanted[c]:
@@ -106,7 +124,7 @@ def _convert(cameras, camera, xy, sigma, given, wanted):
     return xy, np.where(to_mm, sigma * size, np.where(to_px, sigma / size, sigma))
 
 
-def _pixel_grid(camera: Camera):
+def _pixel_grid(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The image centre (pixels) and the pixel size (mm; negative where v runs down)."""
     model = get_model(camera.model)
     centred = (model.unit, model.axes) == ("px", "up")
@@ -119,7 +137,7 @@ def _pixel_grid(camera: Camera):
     return _grid(camera.image_size, camera.pixel_size)
 
 
-def _require_size(camera, name, meaning):
+def _require_size(camera: Camera, name: str, meaning: str) -> InputError:
     return InputError(
         f"camera {camera.id!r}: {name} is needed to convert between pixels and mm; "
         f"give {name} = {meaning}"

@@ -25,7 +25,7 @@ from jaxbundle.orientation.intersection import Intersection as Intersection
 from jaxbundle.orientation.intersection import intersection as intersection
 from jaxbundle.orientation.planar import PlanarOrientations as PlanarOrientations
 from jaxbundle.orientation.planar import planar_orientations as planar_orientations
-from jaxbundle.orientation.pose import Pose as Pose
+from jaxbundle.orientation.pose import CameraPose as CameraPose
 from jaxbundle.orientation.pose import image_of as image_of
 from jaxbundle.orientation.pose import ray_of as ray_of
 from jaxbundle.orientation.relative import RelativeOrientation as RelativeOrientation

@@ -32,7 +32,7 @@ from jaxbundle.orientation.linear import (
     null_vector,
     ones_unless,
 )
-from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
+from jaxbundle.orientation.pose import CameraPose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
@@ -42,7 +42,7 @@ class CameraWithPose(eqx.Module):
 
     interior: Float[AnyArray, "5"]
     radial: Float[AnyArray, " k"]
-    pose: Pose
+    pose: CameraPose
 
 
 class RefinedCamera(eqx.Module):
@@ -109,7 +109,9 @@ def decompose(P: Float[AnyArray, "3 4"]) -> tuple[CameraWithPose, Int[Array, ""]
     fx = jnp.linalg.norm(rest)
     M = jnp.stack([-rest / fx, m2, m3])
     X0 = -jnp.linalg.solve(A[:, :3], A[:, 3])
-    camera = CameraWithPose(jnp.stack([fx, fy, skew, x0, y0]), jnp.zeros(0, P.dtype), Pose(X0, M))
+    camera = CameraWithPose(
+        jnp.stack([fx, fy, skew, x0, y0]), jnp.zeros(0, P.dtype), CameraPose(X0, M)
+    )
     return camera, first_of((mirrored, Status.BEHIND_THE_CAMERA))
 
 

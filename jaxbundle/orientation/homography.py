@@ -27,7 +27,7 @@ from jaxbundle.orientation.linear import (
     null_vector,
     ones_unless,
 )
-from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
@@ -103,7 +103,7 @@ def interior_from_homographies(
     return size * jnp.stack([fx, fy, s, x0, y0]), first_of((bad, Status.PARALLEL_PLANES))
 
 
-def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5"]) -> Pose:
+def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5"]) -> CameraPose:
     """The pose of an image of the plane Z = 0, in the unit of the plane.
 
     `H` with w > 0 at the points, as `homography` gives it; `interior`: (fx, fy, s, x0, y0). The
@@ -121,7 +121,7 @@ def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5
     p, q = unit(first + second), unit(first - second)
     first, second = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
     M = jnp.stack([first, second, jnp.cross(first, second)], 1)
-    return Pose(-M.T @ A[:, 2] * 2 / jnp.sum(length), M)
+    return CameraPose(-M.T @ A[:, 2] * 2 / jnp.sum(length), M)
 
 
 def _similarity(scale: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "3 3"]:

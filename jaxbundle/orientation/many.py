@@ -25,7 +25,7 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares.iterations.small import minimise
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.orientation.intersection import intersection, misclosure
-from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
 from jaxbundle.orientation.status import Status
@@ -210,7 +210,7 @@ def _refine(
     X: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
 ) -> tuple[Array, Array]:
-    found = refine_resection(Pose(X0, M), xy, X, weights).pose
+    found = refine_resection(CameraPose(X0, M), xy, X, weights).pose
     good = jnp.all(jnp.isfinite(found.X0)) & jnp.all(jnp.isfinite(found.M))
     return jnp.where(good, found.X0, X0), jnp.where(good, found.M, M)
 

@@ -18,19 +18,19 @@ from jaxbundle.types import AnyArray
 _ideal, _ = perspective((0,), up=True)
 
 
-class Pose(eqx.Module):
+class CameraPose(eqx.Module):
     """Exterior orientation: X0 in the object unit, M from object to camera."""
 
     X0: Float[AnyArray, "*batch 3"]
     M: Float[AnyArray, "*batch 3 3"]
 
 
-def to_camera(pose: Pose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "3"]:
+def to_camera(pose: CameraPose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "3"]:
     """[r, s, q] of a point, in the object unit; q < 0 in front of the camera."""
     return pose.M @ (X - pose.X0)
 
 
-def image_of(pose: Pose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "2"]:
+def image_of(pose: CameraPose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "2"]:
     """(x, y) of a point by the collinearity equations (Kraus, 2007, section 4.1), c = 1."""
     return jnp.stack(_ideal((1.0,), *to_camera(pose, X)))
 
@@ -40,6 +40,6 @@ def ray_of(xy: Float[AnyArray, "2"]) -> Float[AnyArray, "3"]:
     return jnp.concatenate([xy, -jnp.ones_like(xy[:1])])
 
 
-def retract_pose(pose: Pose, delta: Float[AnyArray, "6"]) -> Pose:
+def retract_pose(pose: CameraPose, delta: Float[AnyArray, "6"]) -> CameraPose:
     """X0 + δX0 (object unit), exp([δθ]×)·M (radians, camera frame)."""
-    return Pose(pose.X0 + delta[:3], matrix_from_rotation_vector(delta[3:]) @ pose.M)
+    return CameraPose(pose.X0 + delta[:3], matrix_from_rotation_vector(delta[3:]) @ pose.M)

@@ -29,7 +29,7 @@ from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.essential import eight_points, five_solutions, orientations
 from jaxbundle.orientation.homography import apply_homography, homography
 from jaxbundle.orientation.linear import ones_unless
-from jaxbundle.orientation.pose import Pose, image_of, ray_of
+from jaxbundle.orientation.pose import CameraPose, image_of, ray_of
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray, Scalar
 
@@ -230,7 +230,7 @@ def _find_simpler(
     variance = vtpv / jnp.where(redundancy > 0, redundancy, 1)
     unit = lambda a: a / jnp.linalg.norm(a)
     rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))
-    rotation = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
+    rotation = CameraPose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
     by_rotation = jax.vmap(image_of, (None, 0))(rotation, rays1)
     H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)

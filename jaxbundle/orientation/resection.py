@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbundle.arguments import without_masks
 from jaxbundle.leastsquares.iterations.small import finish, minimise
 from jaxbundle.orientation.linear import are_collinear, normalisation, ones_unless
-from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
+from jaxbundle.orientation.pose import CameraPose, image_of, ray_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray
@@ -27,7 +27,7 @@ from jaxbundle.types import AnyArray
 class Resection(eqx.Module):
     """Pose, vᵀPv, and cofactors of (δX0 in the object unit, δθ in radians in the camera frame)."""
 
-    pose: Pose
+    pose: CameraPose
     vtpv: Float[AnyArray, ""]
     cofactor: Float[AnyArray, "6 6"]
     status: Int[AnyArray, ""]
@@ -73,7 +73,7 @@ def resection(
 
 
 def refine_resection(
-    pose: Pose,
+    pose: CameraPose,
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
@@ -104,7 +104,7 @@ def wide_triangle(xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]) ->
 
 
 def _misclosures(
-    pose: Pose,
+    pose: CameraPose,
     xy: Float[AnyArray, "n 2"],
     X: Float[AnyArray, "n 3"],
     sqrt_weight: Float[AnyArray, " n"],
@@ -113,5 +113,5 @@ def _misclosures(
     return (sqrt_weight[:, None] * (computed - xy)).ravel()
 
 
-def _behind(pose: Pose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
+def _behind(pose: CameraPose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
     return jax.vmap(to_camera, (None, 0))(pose, X)[:, 2] >= 0

@@ -28,7 +28,7 @@ from jaxbundle.orientation.essential import five_solutions, orientations
 from jaxbundle.orientation.homography import apply_homography, homography
 from jaxbundle.orientation.intersection import Intersection, intersection
 from jaxbundle.orientation.linear import ones_unless
-from jaxbundle.orientation.pose import Pose, image_of, ray_of, to_camera
+from jaxbundle.orientation.pose import CameraPose, image_of, ray_of, to_camera
 from jaxbundle.orientation.relative import (
     RelativeOrientation,
     distances_along_rays,
@@ -132,7 +132,7 @@ def robust_resection(
     p = ones_unless(weights, xy)
 
     def errors(
-        pose: Pose, xy: Float[AnyArray, "n 2"], X: Float[AnyArray, "n 3"]
+        pose: CameraPose, xy: Float[AnyArray, "n 2"], X: Float[AnyArray, "n 3"]
     ) -> Float[Array, " n"]:
         e = jnp.linalg.norm(jax.vmap(image_of, (None, 0))(pose, X) - xy, axis=1)
         q = jax.vmap(to_camera, (None, 0))(pose, X)[:, 2]
@@ -142,7 +142,7 @@ def robust_resection(
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
     pose, good = found.model, found.inliers
 
-    def adjust(pose: Pose, good: Bool[AnyArray, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
+    def adjust(pose: CameraPose, good: Bool[AnyArray, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
         found = refine_resection(pose, xy, X, p * good)
         return found, _are_good(errors(found.pose, xy, X), p > 0, 3, threshold)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.types import AnyArray
 
 SIDES = tuple(itertools.combinations(range(3), 2))
@@ -28,7 +28,7 @@ SIDES = tuple(itertools.combinations(range(3), 2))
 
 def three_points(
     rays: Float[AnyArray, "3 3"], X: Float[AnyArray, "3 3"]
-) -> tuple[Pose, Bool[Array, "4"]]:
+) -> tuple[CameraPose, Bool[Array, "4"]]:
     """The poses (four slots) from which three points X appear along three rays.
 
     **Arguments:** `rays`: directions in the camera frame, of any length, towards the points (z < 0
@@ -145,10 +145,10 @@ def _newton(
     return s
 
 
-def _pose(Y: Float[Array, "3 3"], X: Float[AnyArray, "3 3"]) -> Pose:
+def _pose(Y: Float[Array, "3 3"], X: Float[AnyArray, "3 3"]) -> CameraPose:
     """The pose that takes the triangle X to the same triangle Y in the camera frame."""
     M = _triad(Y).T @ _triad(X)
-    return Pose(jnp.mean(X, 0) - M.T @ jnp.mean(Y, 0), M)
+    return CameraPose(jnp.mean(X, 0) - M.T @ jnp.mean(Y, 0), M)
 
 
 def _triad(P: Float[AnyArray, "3 3"]) -> Float[Array, "3 3"]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, PyTree
 from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
-from jaxbundle.leastsquares.declarations import Kind, Observations, Table
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import evaluate, scalars
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.network.declare import declare
@@ -103,7 +103,7 @@ def _shift(network: Network, truth: Network, shift: Float[np.ndarray, "rays 2"])
 
 
 def _residuals(
-    tables: Sequence[Table], seen: Observations, values: Mapping[str, PyTree]
+    tables: Sequence[Table], seen: ObservationSet, values: Mapping[str, PyTree]
 ) -> Float[np.ndarray, "n *residuals"]:
     """Computed minus measured of all observations of a set."""
     spaces = [next(t.space for t in tables if t.name == name) for name in seen.kind.of]

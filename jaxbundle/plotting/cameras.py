@@ -28,7 +28,7 @@ from jaxbundle.plotting.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def distortion_curve(adjustment: "Adjustment", camera: str, ax: "Axes | None" = None) -> "Axes":

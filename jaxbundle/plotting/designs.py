@@ -11,7 +11,6 @@ from jaxbundle.cameras.convert_fit import rays_of
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
-from jaxbundle.network_design.result import Design
 from jaxbundle.plotting.frame import pyramid_lines
 from jaxbundle.plotting.style import (
     BLUE,
@@ -33,9 +32,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from mpl_toolkits.mplot3d import Axes3D
 
+    from jaxbundle.network_design.result import Design
+
 
 def network_view(
-    designed: Design, ax: "Axes3D | None" = None, after: bool = True, camera_size: float = 0.12
+    designed: "Design", ax: "Axes3D | None" = None, after: bool = True, camera_size: float = 0.12
 ) -> "Axes3D":
     """The stations in perspective, before or after the design, with their paths.
 
@@ -95,7 +96,7 @@ def camera_lines(network: Network, size: float) -> np.ndarray:
     return pyramid_lines(places)
 
 
-def aim_path(designed: Design, ax: "Axes | None" = None) -> "Axes":
+def aim_path(designed: "Design", ax: "Axes | None" = None) -> "Axes":
     """The aim by iteration; conditions become sharper in every round.
 
     **Returns:** matplotlib `Axes`."""
@@ -119,7 +120,7 @@ def aim_path(designed: Design, ax: "Axes | None" = None) -> "Axes":
     return ax
 
 
-def places_tried(designed: Design, ax: "Axes | None" = None) -> "Axes":
+def places_tried(designed: "Design", ax: "Axes | None" = None) -> "Axes":
     """Trial positions of a further photograph, from above, coloured by the aim; and the chosen
     positions.
 

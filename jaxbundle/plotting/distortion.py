@@ -21,12 +21,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.validity import measured_centre
 from jaxbundle.display import print_in_one_screen
-from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 from jaxbundle.system.programs import compile_once
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 @print_in_one_screen
@@ -67,8 +67,7 @@ def distortion_profile(
 
 def farthest_measurement(adjustment: "Adjustment", camera: str) -> float:
     """The largest distance of a measurement of a camera from its principal point."""
-    found = farthest_measurements(adjustment.problem, adjustment.values)
-    return float(found[camera_index(adjustment, camera)])
+    return float(adjustment.farthest_measurements[camera_index(adjustment, camera)])
 
 
 def principal_point(adjustment: "Adjustment", camera: str) -> Float[np.ndarray, "2"]:

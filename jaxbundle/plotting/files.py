@@ -21,7 +21,7 @@ from jaxbundle.plotting.views import network_perspective, network_plan
 from jaxbundle.types import Progress
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 DRAWING = "drawing"
 """The stage of figures in reports of progress."""

@@ -9,7 +9,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import camera_index
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def image_frame(

@@ -28,7 +28,7 @@ from jaxbundle.plotting.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def residual_vectors(

@@ -24,7 +24,7 @@ from jaxbundle.plotting.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
 """Colour and line of a pair that a relative orientation, a plane, a rotation explains."""

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Bbox
     from mpl_toolkits.mplot3d import Axes3D
 
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 LARGEST_ELLIPSES, SAMPLED_ELLIPSES = 20, 280
 """Of more points than these together, the largest error ellipses are drawn, and as many others at

@@ -36,7 +36,7 @@ from jaxbundle.pushbroom.noise import Noise, add_errors
 from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.project import (
     Projected,
-    Status,
+    ProjectionStatus,
     make_search,
     project_from,
     project_near,
@@ -75,7 +75,7 @@ __all__ = [
     "RpcStatus",
     "RpcTable",
     "SearchSettings",
-    "Status",
+    "ProjectionStatus",
     "Terrain",
     "Trajectory",
     "accuracy_table",

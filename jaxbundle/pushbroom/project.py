@@ -42,7 +42,7 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 
-class Status(IntEnum):
+class ProjectionStatus(IntEnum):
     """Whether a point is in the image, and if not, why."""
 
     SEEN = 0
@@ -59,19 +59,19 @@ class Status(IntEnum):
 
 
 _MEANING = {
-    Status.SEEN: "in the image",
-    Status.BEFORE: "behind the first line",
-    Status.AFTER: "ahead of the last line",
-    Status.BESIDE: "beside the line of detectors",
-    Status.HIDDEN: "on the other side of the Earth, or behind the camera",
-    Status.NOT_CONVERGED: "no place found: the trajectory is too rough",
+    ProjectionStatus.SEEN: "in the image",
+    ProjectionStatus.BEFORE: "behind the first line",
+    ProjectionStatus.AFTER: "ahead of the last line",
+    ProjectionStatus.BESIDE: "beside the line of detectors",
+    ProjectionStatus.HIDDEN: "on the other side of the Earth, or behind the camera",
+    ProjectionStatus.NOT_CONVERGED: "no place found: the trajectory is too rough",
 }
 
 
 class Projected(eqx.Module):
     """Lines and pixels that see the points, in order of time; NaN for unused places.
 
-    `count`: their number. `status`: the `Status` of the point.
+    `count`: their number. `status`: the `ProjectionStatus` of the point.
     """
 
     line: Float[AnyArray, "most n"]
@@ -283,15 +283,15 @@ def _search(
         [
             jnp.asarray(int(s))
             for s in (
-                Status.SEEN,
-                Status.HIDDEN,
-                Status.NOT_CONVERGED,
-                Status.BESIDE,
-                Status.AFTER,
-                Status.BEFORE,
+                ProjectionStatus.SEEN,
+                ProjectionStatus.HIDDEN,
+                ProjectionStatus.NOT_CONVERGED,
+                ProjectionStatus.BESIDE,
+                ProjectionStatus.AFTER,
+                ProjectionStatus.BEFORE,
             )
         ],
-        int(Status.HIDDEN),
+        int(ProjectionStatus.HIDDEN),
     )
     return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
@@ -310,7 +310,7 @@ def _redundancy(
     """v/σ of the rays, NaN of excluded ones, and their redundancy numbers."""
     reliability, problem = result.reliability, result.problem
     w, r = (problem.image_points(x) for x in (reliability.residual, reliability.redundancy))
-    return np.where(problem.image_weights > 0, w, np.nan), r
+    return np.where(problem.used_coordinates, w, np.nan), r
 
 
 def _factors(

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.kinds import Ties
 from jaxbundle.network.sightings import keep_images, keep_points

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit

@@ -11,8 +11,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.bundle.far_points import angle_of_rays
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.far_points import angle_of_rays
+from jaxbundle.adjustment.result import Adjustment
 
 
 @dataclasses.dataclass(frozen=True)

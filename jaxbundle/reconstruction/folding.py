@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera, Network

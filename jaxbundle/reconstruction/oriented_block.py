@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import coordinates
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import derivative
 from jaxbundle.network.tables import Network, Points

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.columns import count
 from jaxbundle.reconstruction.adjusting import WRONG_MISFIT

@@ -8,12 +8,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.reconstruction.adjusting import WeightingSettings
 from jaxbundle.reconstruction.folding import SuperpositionSettings
 from jaxbundle.reconstruction.oriented_block import ControlSettings
-from jaxbundle.reconstruction.starting import StartValueSettings
+from jaxbundle.reconstruction.starting import BlockStartSettings
 from jaxbundle.tiepoints.camera_starts import CameraStartSettings
 from jaxbundle.tiepoints.duplicates import DuplicateSettings
 from jaxbundle.tiepoints.features import Detection
 from jaxbundle.tiepoints.loops import LoopSettings
-from jaxbundle.tiepoints.matching import MatchingSettings
+from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
 from jaxbundle.tiepoints.still import MarkSettings
 from jaxbundle.tiepoints.track_measurement import TrackMatchingSettings
@@ -46,7 +46,7 @@ class ReconstructionSettings:
     """Share of pairs that contradict others in triplets above which a warning calls the result
     doubtful. In the set `building`, which is right, 23 of 66 do."""
     candidates: CandidateSettings = CandidateSettings()
-    matching: MatchingSettings = MatchingSettings()
+    matching: FeatureMatchingSettings = FeatureMatchingSettings()
     duplicates: DuplicateSettings = DuplicateSettings()
     marks: MarkSettings = MarkSettings()
     camera_starts: CameraStartSettings = CameraStartSettings()
@@ -54,7 +54,7 @@ class ReconstructionSettings:
     loops: LoopSettings = LoopSettings()
     tracks: TrackSettings = TrackSettings()
     track_matching: TrackMatchingSettings = TrackMatchingSettings()
-    start_values: StartValueSettings = StartValueSettings()
+    start_values: BlockStartSettings = BlockStartSettings()
     weighting: WeightingSettings = WeightingSettings()
     superposition: SuperpositionSettings = SuperpositionSettings()
     control: ControlSettings = ControlSettings()

@@ -15,8 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbundle.bundle.orient import orient
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.orient import orient
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Network
@@ -28,7 +28,7 @@ from jaxbundle.tiepoints.search import present_size
 
 
 @dataclasses.dataclass(frozen=True)
-class StartValueSettings:
+class BlockStartSettings:
     """Settings of the start values of a part."""
 
     tolerance: float = 0.01
@@ -65,7 +65,7 @@ def start_values(
     network: Network,
     guessed: Sequence[str],
     pairs: NamedPairs,
-    settings: StartValueSettings = StartValueSettings(),
+    settings: BlockStartSettings = BlockStartSettings(),
 ) -> Iterator[Oriented]:
     """The network with start values, by one method after another.
 
@@ -102,7 +102,7 @@ def start_values(
 
 
 def _orient(
-    network: Network, tolerance: float, pairs: NamedPairs, settings: StartValueSettings
+    network: Network, tolerance: float, pairs: NamedPairs, settings: BlockStartSettings
 ) -> Oriented:
     """Start values, without photographs that contradict their pairs, or are weakly connected to the
     others."""
@@ -136,7 +136,7 @@ def _without(network: Network, images: Bool[np.ndarray, " images"]) -> Network:
 
 
 def _try_other_distances(
-    network: Network, guessed: Sequence[str], settings: StartValueSettings
+    network: Network, guessed: Sequence[str], settings: BlockStartSettings
 ) -> Iterator[Network]:
     cameras = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
     for factor in settings.other_distances if cameras else ():
@@ -164,7 +164,7 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
     return with_observed(network, dataclasses.replace(observed, value=value, sigma=sigma))
 
 
-def is_plausible(result: Adjustment, settings: StartValueSettings = StartValueSettings()) -> bool:
+def is_plausible(result: Adjustment, settings: BlockStartSettings = BlockStartSettings()) -> bool:
     """Whether an adjustment converged to plausible principal distances."""
     low, high = settings.min_distance, settings.max_distance
     return bool(result.converged) and all(
@@ -179,7 +179,7 @@ def start_again(
     oriented: Oriented,
     result: Adjustment,
     pairs: NamedPairs,
-    settings: StartValueSettings = StartValueSettings(),
+    settings: BlockStartSettings = BlockStartSettings(),
 ) -> Oriented | None:
     """Start values with the adjusted cameras, if these orient more photographs."""
     if not oriented.images:

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.declarations import Observations as ObservationSet
-from jaxbundle.leastsquares.declarations import Table
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
 from jaxbundle.network.declare import declare as declare_network

@@ -14,13 +14,12 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import Problem, with_data
-from jaxbundle.leastsquares.quality.snooping import Removed as EngineRemoved
-from jaxbundle.leastsquares.quality.snooping import snoop
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import Space
+from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.refinement.declare import DeclaredRefinement
 from jaxbundle.refinement.weakness import weaknesses
-from jaxbundle.statistics.blunders import Removed
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
@@ -62,7 +61,7 @@ class RefinementInspection:
         declared: DeclaredRefinement,
         solution: Solution,
         steps: int,
-        removed: Sequence[EngineRemoved] = (),
+        removed: Sequence[RemovedRow] = (),
     ):
         self.declared, self.solution, self.steps = declared, solution, steps
         self.removed = tuple(_describe_removed(declared, blunder) for blunder in removed)
@@ -192,7 +191,7 @@ def _require_solved(
     )
 
 
-def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> Removed:
+def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Removed:
     """Observations removed by snooping, in words; rows of image points as in
     `Refinement.image_points`, others as in their sets (three per control point)."""
     inputs, chosen = declared.inputs, declared.rays.points
@@ -208,10 +207,8 @@ def _describe_removed(declared: DeclaredRefinement, blunder: EngineRemoved) -> R
             f"point {points.id[chosen[part.point[r]]]} in image {inputs.ids[part.image[r]]}"
             for r in blunder.rows
         ]
-        # observations of a point that cannot be told apart were removed together
-        name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
         rows = [int(place[before + r]) for r in blunder.rows]
-        return Removed("image", rows[0], name, blunder.test, tuple(rows[1:]))
+        return Removed("image", rows[0], either_of(told), blunder.test, tuple(rows[1:]))
     if set.kind.name == "control points":
         p, axis = int(declared.control[blunder.row]), present(blunder.residual)
         name = f"{points.axis_names[axis]} of control point {points.id[chosen[p]]}"

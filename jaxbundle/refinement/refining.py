@@ -13,6 +13,9 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
+from jaxbundle.leastsquares.quality.correlation import correlation_matrix
+from jaxbundle.leastsquares.quality.global_test import chi_squared_test
+from jaxbundle.network.blunders import Removed
 from jaxbundle.network.tables import STATED, Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
@@ -23,9 +26,6 @@ from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
-from jaxbundle.statistics.blunders import Removed
-from jaxbundle.statistics.correlation import correlation_matrix
-from jaxbundle.statistics.global_test import chi_squared_test
 
 TESTS = ("none", "baarda", "pope")
 UNIT_OF_WEIGHT = "1 line or pixel"
@@ -86,8 +86,8 @@ class Refinement:
         return self.inspection.redundancy
 
     def global_test(self) -> dict:
-        """χ² test of vᵀPv (`statistics.global_test`); `passed` is None where nobody stated σ of
-        line and pixel, or of the image coordinates of photographs."""
+        """χ² test of vᵀPv (`leastsquares.quality.global_test`); `passed` is None where
+        nobody stated σ of line and pixel, or of the image coordinates of photographs."""
         inputs, r = self.inspection.declared.inputs, self.redundancy
         frames = [] if inputs.frames is None else [inputs.frames.observations]
         sets = [inputs.observations, *frames]

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
 from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement
-from jaxbundle.statistics.global_test import describe_test
 from jaxbundle.types import present
 
 

@@ -20,8 +20,8 @@ from jaxbundle.report.verdict import Verdict as Verdict
 from jaxbundle.report.verdict import conclude as conclude
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
-    from jaxbundle.bundle.sensitivity import Budget
+    from jaxbundle.adjustment.result import Adjustment
+    from jaxbundle.adjustment.sensitivity import Budget
 
 
 def text(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
+from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ESTIMATED, ROLES, STATED, UNIT
@@ -24,12 +25,10 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
-from jaxbundle.statistics.global_test import describe_test
-from jaxbundle.statistics.weakness import ADVICE_FOR
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.report.verdict import Verdict
 
 METHODS = {
@@ -59,6 +58,14 @@ ADVICE = {
     NOT_FINITE: "Give better start values: some points are behind their cameras or in their "
     "plane, or outside the range of the distortion.",
 }
+
+ADVICE_FOR = {
+    "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
+    "images, x0 and y0 need images rolled about their axis.",
+    "image": "An image needs three or more well spread points whose coordinates are determined.",
+    "point": "A point needs rays from two directions or more.",
+}
+"""What determines the unknowns of each table."""
 
 
 def title(adjustment: "Adjustment", date: str | None) -> list[str]:

@@ -31,7 +31,7 @@ from jaxbundle.report.layout import (
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 TESTS = {"pope": "tau", "baarda": "w"}
 SYMBOLS = {"pope": "τ", "baarda": "w"}

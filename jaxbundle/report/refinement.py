@@ -7,6 +7,7 @@ from jaxbundle.leastsquares.quality.distributions import (
     normal_quantile,
     tau_quantile,
 )
+from jaxbundle.leastsquares.quality.global_test import describe_test, is_tested
 from jaxbundle.refinement import UNIT_OF_WEIGHT, Refinement
 from jaxbundle.refinement.check_points import RefinementCheckPoints
 from jaxbundle.report.layout import significant
@@ -20,7 +21,6 @@ from jaxbundle.report.verdict import (
     judge_check_points,
     judge_fit,
 )
-from jaxbundle.statistics.global_test import describe_test, is_tested
 
 
 def conclude_refinement(result: Refinement) -> Verdict:

@@ -25,7 +25,7 @@ from jaxbundle.report.layout import (
 )
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def one_line(adjustment: "Adjustment") -> str:

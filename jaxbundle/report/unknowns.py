@@ -27,7 +27,7 @@ from jaxbundle.report.layout import (
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
 ROLE_WORDS = {"tie": "tie", "control": "ctrl", "fixed": "fix", "check": "check"}

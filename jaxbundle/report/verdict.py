@@ -13,22 +13,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.quality.distributions import level_of_one
+from jaxbundle.leastsquares.quality.global_test import contradicts
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import ESTIMATED
 from jaxbundle.report.head import chi_squared, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
-from jaxbundle.statistics.misfit import LARGEST_REMOVED, contradicts
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 GOOD, NOTED, DOUBTFUL, BAD = "met", "noted", "doubtful", "not met"
 LEVEL = 0.001
 """Probability that a good result fails a test of the verdict: the level at which data snooping is
 done by convention (Baarda, 1968: α₀ = 0.1 %), so that the verdict and the removal of blunders
 agree."""
+LARGEST_REMOVED = 0.05
+"""A larger fraction of removed image points, beyond chance, is reported."""
 
 
 class Finding(NamedTuple):
@@ -107,9 +109,9 @@ def _fit(adjustment: "Adjustment") -> Finding:
 def judge_fit(
     found: dict, words: str, sigma0: float, weights_matter: bool, redundancy: float
 ) -> Finding:
-    """The finding of a χ² test (`statistics.global_test`). Observations better than their a priori
-    σ, or than a unit of weight, only concern these σ, since those of the result are a posteriori;
-    but where there are observations of other kinds, `weights_matter`."""
+    """The finding of a χ² test (`leastsquares.quality.global_test`). Observations better than
+    their a priori σ, or than a unit of weight, only concern these σ, since those of the result are
+    a posteriori; but where there are observations of other kinds, `weights_matter`."""
     fit = _judge_fit(found, words, sigma0)
     unsuited = weights_matter and fit.state == NOTED and contradicts(sigma0, int(redundancy))
     unsuited &= found["sigma_origin"] != ESTIMATED

@@ -34,7 +34,8 @@ def read_views(
     """
     network = read_oriented(path)
     images = network.images
-    known = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+    values = np.concatenate([images.position, images.angles], 1)
+    known = np.asarray(np.isfinite(values).all(1))
     messages = []
     if not known.all():
         left = [images.id[k] for k in np.flatnonzero(~known)]

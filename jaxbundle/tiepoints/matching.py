@@ -32,7 +32,7 @@ SIFT_LENGTH = 4 * 4 * 8
 
 
 @dataclasses.dataclass(frozen=True)
-class MatchingSettings:
+class FeatureMatchingSettings:
     """Settings of the matching of features."""
 
     max_ratio: float = 0.8
@@ -63,7 +63,7 @@ class FeatureMatches(NamedTuple):
 def match_features(
     one: Features,
     other: Features,
-    settings: MatchingSettings = MatchingSettings(),
+    settings: FeatureMatchingSettings = FeatureMatchingSettings(),
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]] | None = None,
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Rows of matching features, the most distinct first, and the ratio of their distances to those
@@ -93,7 +93,7 @@ def match_features(
 def single_matches(
     rows: Int[np.ndarray, "n 2"],
     within: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
-    settings: MatchingSettings = MatchingSettings(),
+    settings: FeatureMatchingSettings = FeatureMatchingSettings(),
 ) -> Bool[np.ndarray, " n"]:
     """Which matches have no similar feature in either photograph."""
     nearest = np.minimum(within[0][rows[:, 0]], within[1][rows[:, 1]])

@@ -17,7 +17,7 @@ from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.loops import LoopSettings, split_contradicted
 from jaxbundle.tiepoints.matching import (
     FeatureMatches,
-    MatchingSettings,
+    FeatureMatchingSettings,
     distances_within,
     match_features,
     single_matches,
@@ -66,7 +66,7 @@ def match(
     store: Store,
     workers: int,
     tell: Progress,
-    settings: MatchingSettings,
+    settings: FeatureMatchingSettings,
     candidates: CandidateSettings,
 ) -> list[FeatureMatches]:
     """The matches of candidate pairs, stored ones if available."""

@@ -17,7 +17,7 @@ from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE
 from jaxbundle.io.writing.replacing import unwritable
 from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
-from jaxbundle.tiepoints.matching import MatchingSettings
+from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 
 RULES = "6"
 """Version of features and matches: files of others are not used. To be raised with every change of
@@ -28,7 +28,7 @@ class Store:
     """Files of features and matches in a folder; without a folder nothing is stored. `settings`:
     all that features and matches depend on, beside the photographs."""
 
-    def __init__(self, folder: Path | None, *settings: Detection | MatchingSettings):
+    def __init__(self, folder: Path | None, *settings: Detection | FeatureMatchingSettings):
         self.folder, self.settings = folder, "\n".join(map(repr, settings))
         self.used: set[str] = set()
         if folder is not None:

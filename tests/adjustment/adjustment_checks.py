@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares.datum.conditions import datum_directions
 from jaxbundle.leastsquares.equations.normal import zero_tangent
@@ -28,7 +29,6 @@ from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retr
 from jaxbundle.leastsquares.problem import pad_data, pad_values, with_data
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network import Camera, Distances, Images, Network, Observations, Points
-from jaxbundle.statistics.inspection import Inspection
 
 CAMERAS = {
     "brown": dict(c=20.0, x0=0.11, y0=-0.07, K1=2e-4, K2=-1e-6, K3=4e-9, P1=3e-5, P2=-2e-5,

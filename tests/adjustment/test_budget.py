@@ -10,8 +10,8 @@ import pytest
 from adjustment_checks import make, solved, synthetic
 
 import jaxbundle
+from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.bundle.adjust import adjust
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.problem import with_data

@@ -18,6 +18,7 @@ from adjustment_checks import (
 )
 
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.solve import solve
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import (
@@ -27,7 +28,6 @@ from jaxbundle.geometry import (
     omega_phi_kappa_from_matrix,
 )
 from jaxbundle.leastsquares.iterations.stopping import SETTLED
-from jaxbundle.statistics.inspection import Inspection
 
 SHARED = "cameras of two models"
 

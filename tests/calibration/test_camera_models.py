@@ -11,6 +11,7 @@ import pytest
 import render
 from test_calibrate import normalised
 
+from jaxbundle.adjustment.quality.projection_uncertainty import interior_covariance_of_images
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.calibration import (
     Board,
@@ -26,7 +27,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera
 from jaxbundle.planning.stations import stations_looking_at
-from jaxbundle.statistics.projection import interior_covariance_of_images
 
 NOISE = 0.1
 EXAMPLES = Path(__file__).parents[2] / "examples"

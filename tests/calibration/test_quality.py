@@ -14,6 +14,8 @@ from test_calibrate import NOISE, simulated
 
 import jaxbundle
 from jaxbundle import cli
+from jaxbundle.adjustment.quality.calibration_difference import expected_difference
+from jaxbundle.adjustment.quality.projection_uncertainty import images_through_scene
 from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.batch.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
@@ -28,8 +30,6 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io import read_cameras, read_network, read_opencv
 from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
-from jaxbundle.statistics.difference import expected_difference
-from jaxbundle.statistics.projection import images_through_scene
 
 DRAWS = 416
 GRID = (3, 3)

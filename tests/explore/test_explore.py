@@ -28,13 +28,14 @@ from numpy.testing import assert_allclose
 from page_reader import decode
 
 import jaxbundle
+from jaxbundle.adjustment.quality.expected_precision import expected_precision
 from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.explore import server as server_module
 from jaxbundle.explore.camera import CameraView
 from jaxbundle.explore.network import NetworkView
 from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
-from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, ScannerView
+from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, FlightView
 from jaxbundle.explore.server import MOST_BYTES, Server, page_file
 from jaxbundle.explore.tracks import ORBIT, STRAIGHT, USUAL, choose_track
 from jaxbundle.explore.view import File, check_keys, number
@@ -48,7 +49,6 @@ from jaxbundle.pushbroom.simulate import measured_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.report.page import UNKNOWN, Section
 from jaxbundle.report.page.scene import describe_network
-from jaxbundle.statistics.expected import expected_precision
 
 ROOT = Path(__file__).parents[2]
 FLIGHT = """
@@ -433,7 +433,7 @@ def flight(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scanner(flight):
-    return ScannerView("aircraft", flight.flight, flight.earth)
+    return FlightView("aircraft", flight.flight, flight.earth)
 
 
 def rms_of_cells(errors):
@@ -445,7 +445,7 @@ def test_errors_between_the_records_are_not_missed():
     """Attitude records every 100 lines, on which regular lines can fall. The RMS of all 4000 lines
     is 0.143 m (0.144 in the published study)."""
     read = read_flight(ROOT / "examples/lapan_a3/flight.toml")
-    view = ScannerView("lapan_a3", read.flight, read.earth)
+    view = FlightView("lapan_a3", read.flight, read.earth)
     every = np.repeat(np.arange(read.flight.lines), 3)
     pixels = np.tile([0.0, 700.0, 1999.0], read.flight.lines)
     exact = ground_errors(view.image, view.truth, Ground(read.earth), 1.0 * every, pixels)
@@ -516,7 +516,7 @@ def test_a_flight_has_an_orbit_and_a_straight_track(scanner, flight):
 
 
 def test_an_image_that_was_read_is_its_own_reference(flight):
-    view = ScannerView("aircraft", measured_image(flight.flight), None)
+    view = FlightView("aircraft", measured_image(flight.flight), None)
     assert view.answer({})["rms"] == 0
     keys = {control.key for control in view.controls}
     assert "attitude_rate" not in keys and "aberration" not in keys  # no Earth

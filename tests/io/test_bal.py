@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, matrix_from_rotation_vector
-from jaxbundle.statistics.inspection import Inspection
 
 CAMERAS = np.array([
     [0.1, -0.2, 0.3, 0.5, 0.1, -9.0, 500.0, -0.1, 0.02],

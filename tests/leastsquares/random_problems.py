@@ -121,7 +121,7 @@ def _draw(rng, values) -> Random:
     return Random(tables, observations, options, floats)
 
 
-def _observe(rng, values, name, touched, size, floats, n, meet, orders) -> ls.Observations:
+def _observe(rng, values, name, touched, size, floats, n, meet, orders) -> ls.ObservationSet:
     """Observations of up to five rows; values follow from the present rows and noise. `meet`: the
     first two slots have the same row."""
     residuals = int(rng.integers(1, 4))
@@ -169,7 +169,7 @@ def _covariances(rng, n, residuals):
     return root @ root.mT + 0.5 * np.eye(residuals)
 
 
-def _prior(rng, table) -> ls.Observations:
+def _prior(rng, table) -> ls.ObservationSet:
     w, n = table.space.width, table.rows
     value = table.value if np.ndim(table.value) == 2 else table.value[:, None]
     c = [np.broadcast_to(np.eye(w), (n, w, w))]

@@ -9,7 +9,7 @@ import pytest
 import jaxbundle
 from jaxbundle import leastsquares
 from jaxbundle.leastsquares.quality.robust import Reweighted, robust_scale
-from jaxbundle.leastsquares.quality.snooping import Removed, _without_passing, snoop
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, _without_passing, snoop
 
 
 @pytest.mark.parametrize("passing, rows", [
@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.quality.snooping import Removed, _without_passing, s
 def test_of_inseparable_observations_those_that_pass_come_back(passing, rows):
     """If each passes without the others, they contradict each other: which one is wrong remains
     unknown, and all stay removed. A single one that passes comes back."""
-    together, single = Removed("ray", 3, None, 9.0, (4, 5)), Removed("height", 3, None, 5.0)
+    together, single = RemovedRow("ray", 3, None, 9.0, (4, 5)), RemovedRow("height", 3, None, 5.0)
     passed = {("ray", row, None) for row in passing}
     (left, other) = _without_passing([together, single], passed)
     assert left.rows == rows and other == single

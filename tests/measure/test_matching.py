@@ -17,7 +17,7 @@ from jaxbundle.measure import (
     image_point,
     image_to_image,
 )
-from jaxbundle.orientation import Pose
+from jaxbundle.orientation import CameraPose
 
 HEIGHT = 0.013
 """The plane that is photographed is Z = 0; matching is told that it lies here."""
@@ -25,7 +25,7 @@ HEIGHT = 0.013
 
 def view(M, X0):
     parameters = np.array(render.LENS.parameters)
-    return View(get_model("opencv"), parameters, Pose(X0 + [0, 0, HEIGHT], M))
+    return View(get_model("opencv"), parameters, CameraPose(X0 + [0, 0, HEIGHT], M))
 
 
 POSES = (render.pose(5, -8, 10, (0.1, 0.08), 0.6), render.pose(-12, 14, -25, (0.12, 0.07), 0.5))

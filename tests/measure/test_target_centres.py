@@ -17,7 +17,7 @@ from jaxbundle.measure import (
     fit_ellipse,
 )
 from jaxbundle.measure.spots import noise_of, otsu
-from jaxbundle.orientation import Pose
+from jaxbundle.orientation import CameraPose
 
 SPACING = 0.06
 PLACES = np.array([[i * SPACING, j * SPACING, 0.0] for i in range(5) for j in range(4)])
@@ -34,7 +34,7 @@ def scene(radius, bright, tilt, blur, seed=0):
     pattern = render.discs(PLACES[:, :2], radius, bright, margin=0.03)
     picture = render.photograph(render.LENS, M, X0, pattern, blur, seed=seed)
     shift = shift_of_all(
-        get_model("opencv"), render.LENS.parameters, Pose(X0, M), PLACES, UP, radius
+        get_model("opencv"), render.LENS.parameters, CameraPose(X0, M), PLACES, UP, radius
     )
     return picture, render.LENS.image_of(M, X0, PLACES) + np.asarray(shift)
 
@@ -154,6 +154,7 @@ def test_eccentricity_is_that_of_the_projected_rim():
         return np.stack([0.2 - 35 * r / q, -0.1 - 35 * s / q], -1)
 
     centre = jax.jit(fit_ellipse)(image(rim), np.ones(32)).centre
-    shift = jax.jit(circle_centre_shift, static_argnums=0)(model, p, Pose(X0, M), X, normal, 0.3)
+    pose = CameraPose(X0, M)
+    shift = jax.jit(circle_centre_shift, static_argnums=0)(model, p, pose, X, normal, 0.3)
     np.testing.assert_allclose(shift, centre - image(X), atol=1e-5)
     assert np.abs(shift).max() > 0.1

@@ -8,9 +8,9 @@ from further_checks import check_jacobians
 from test_ties import network as ties_network
 
 import jaxbundle
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import make_further
-from jaxbundle.statistics.inspection import Inspection
 
 
 def observed(*rows):

@@ -10,17 +10,17 @@ import pytest
 from network.further_checks import sample
 
 import jaxbundle
+from jaxbundle.adjustment.far_points import at_infinity, minimise_with_infinity
+from jaxbundle.adjustment.minimum import inspect_solution
 from jaxbundle.adjustment.problem import coordinates
-from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
-from jaxbundle.bundle.minimum import inspect_solution
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.points_at_any_distance import find_far_points
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, AnyDistance, derivative
 from jaxbundle.leastsquares.indexing.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.problem import pad_data, pad_values
 from jaxbundle.leastsquares.spaces import Vector
-from jaxbundle.statistics.far_points import find_far_points
-from jaxbundle.statistics.inspection import Inspection
 
 NEAR, FAR = 24, 8
 LENGTHS = np.repeat([0.0, 2.0], [NEAR, FAR])

@@ -10,6 +10,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, InputError, cameras
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.planning.simulate import simulate, simulate_with_truth
 from jaxbundle.planning.stations import (
@@ -20,7 +21,6 @@ from jaxbundle.planning.stations import (
     ring_of_stations,
     stations_looking_at,
 )
-from jaxbundle.statistics.inspection import Inspection
 
 CAMERAS = {
     "brown": ({"c": 20.0, "x0": 0.11, "y0": -0.07, "K1": 2e-4, "K2": -1e-6, "P1": 3e-5,

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.build import make_further
-from jaxbundle.statistics.inspection import Inspection
 
 FREE = ("fx", "fy", "cx", "cy", "k1")
 SIZE = {"image_size": (1000, 800), "pixel_size": (0.01, 0.01)}

@@ -9,9 +9,9 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
+from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.orient import orient
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.bundle.orient import orient
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network

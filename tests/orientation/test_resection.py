@@ -7,7 +7,7 @@ from orientation_scenes import batch, image_points, images, mahalanobis
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxbundle.orientation import Pose, Status, image_of, resection, three_points
+from jaxbundle.orientation import CameraPose, Status, image_of, resection, three_points
 
 N, n = 300, 8
 resect = batch(resection)
@@ -99,5 +99,5 @@ def test_derivatives_are_those_of_the_solution():
 
 def test_image_of_a_pose_is_the_collinearity_equation():
     xy, X, M, X0 = images(2, n, seed=7)
-    pose = Pose(jnp.asarray(X0[0]), jnp.asarray(M[0]))
+    pose = CameraPose(jnp.asarray(X0[0]), jnp.asarray(M[0]))
     np.testing.assert_allclose(image_of(pose, X[0, 0]), xy[0, 0], atol=1e-13)

@@ -11,7 +11,7 @@ import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, image_point
-from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.pose import CameraPose
 from jaxbundle.planning.render import Scene, Sensor, render, visible
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
@@ -50,7 +50,7 @@ def test_points_lie_on_the_surface_in_the_middle_of_their_pixels(hills):
     np.testing.assert_allclose(X[:, 2], ridge(X[:, 0], X[:, 1]), atol=1e-6)
     model = get_model("opencv")
     p = [CAMERA.parameters.get(name, 0.0) for name in model.parameters]
-    view = View(model, jnp.array(p), Pose(jnp.array(position), jnp.array(M)))
+    view = View(model, jnp.array(p), CameraPose(jnp.array(position), jnp.array(M)))
     v, u = np.nonzero(seen)
     for k in range(0, len(X), len(X) // 10):
         np.testing.assert_allclose(image_point(view, jnp.array(X[k])), [u[k], v[k]], atol=1e-6)

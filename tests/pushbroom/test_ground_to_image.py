@@ -23,7 +23,7 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.project import (
-    Status,
+    ProjectionStatus,
     make_search,
     project_from,
     project_near,
@@ -105,7 +105,7 @@ def test_project_undoes_locate(name, points):
     times = X.shape[1] // lines.size
     np.testing.assert_allclose(found.line[0], np.tile(lines, times), atol=1e-6)
     np.testing.assert_allclose(found.pixel[0], np.tile(pixels, times), atol=1e-6)
-    assert (found.count == 1).all() and (found.status == Status.SEEN).all()
+    assert (found.count == 1).all() and (found.status == ProjectionStatus.SEEN).all()
 
 
 def test_project_from_a_place_near_by():
@@ -145,11 +145,11 @@ def test_where_a_point_is_that_is_not_in_the_image():
     ]).T  # fmt: skip
     found = placed(image, X, None, most=3)
     assert list(found.status) == [
-        Status.SEEN, Status.BEFORE, Status.AFTER, Status.BESIDE, Status.HIDDEN
+        getattr(ProjectionStatus, name) for name in ("SEEN", "BEFORE", "AFTER", "BESIDE", "HIDDEN")
     ]  # fmt: skip
     np.testing.assert_allclose(found.line[0, 0], (100 - 2.5) / 0.5)
     assert np.isnan(found.line[:, 1:]).all() and list(found.count) == [1, 0, 0, 0, 0]
-    assert all(status.meaning for status in Status)
+    assert all(status.meaning for status in ProjectionStatus)
 
 
 def test_the_other_side_of_the_earth():
@@ -159,7 +159,7 @@ def test_the_other_side_of_the_earth():
     d = (seen - o) / np.linalg.norm(seen - o)
     behind = o + 1.29e7 * d
     found = placed(image, np.stack([seen, behind], 1))
-    assert list(found.status) == [Status.SEEN, Status.HIDDEN]
+    assert list(found.status) == [ProjectionStatus.SEEN, ProjectionStatus.HIDDEN]
 
 
 def test_all_lines_that_see_a_point():

@@ -154,7 +154,7 @@ def test_points_of_two_rays_at_different_columns_do_not_distort_the_others(share
 
 def test_start_values_that_leave_out_the_fewest_photographs_come_first(monkeypatch):
     """With a narrow tolerance three are left out, with the wide one only one."""
-    left_out = {starting.StartValueSettings().tolerance: "abc", starting.TOLERANCE: "d"}
+    left_out = {starting.BlockStartSettings().tolerance: "abc", starting.TOLERANCE: "d"}
     assert len(left_out) == 2
     orient = lambda network, tolerance, *_: SimpleNamespace(images=left_out[tolerance])
     monkeypatch.setattr(starting, "_orient", orient)

@@ -8,7 +8,7 @@ from rendered_photographs import CAMERA, scene, stations
 
 from jaxbundle.planning.render import Sensor, render
 from jaxbundle.tiepoints.features import Detection, find_features
-from jaxbundle.tiepoints.matching import MatchingSettings
+from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings
 from jaxbundle.tiepoints.search import match, verify
 from jaxbundle.tiepoints.store import Store
@@ -30,7 +30,7 @@ def test_faint_photographs_are_oriented_relatively():
         for k, view in enumerate(views)
     ]
     nothing = lambda *_: None
-    store, settings = Store(None, Detection()), (MatchingSettings(), CandidateSettings())
+    store, settings = Store(None, Detection()), (FeatureMatchingSettings(), CandidateSettings())
     found = match(features, list("abc"), "all", None, store, 1, nothing, *settings)
     verified = verify([CAMERA], [0] * 3, features, found, nothing, VerificationSettings())
     pairs = {p.images: p for p in verified}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from drone_block import CONTROL, NAMES, OFFSET, SATELLITE, drone_block, swapped
 
-from jaxbundle.bundle.result import Adjustment
+from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.cli.reconstruct_files import write_reconstruction
 from jaxbundle.errors import InputError

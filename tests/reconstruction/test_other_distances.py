@@ -11,7 +11,7 @@ from jaxbundle.reconstruction import starting
 def test_other_distances_of_cameras_that_files_do_not_tell(monkeypatch):
     """Relative to the longer side, for all guessed cameras at once; not the present one again."""
     monkeypatch.setattr(starting, "_with_distances", lambda network, distances: distances)
-    settings = starting.StartValueSettings(other_distances=(0.8, 1.2, 2.0), distinct_ratio=1.1)
+    settings = starting.BlockStartSettings(other_distances=(0.8, 1.2, 2.0), distinct_ratio=1.1)
     camera = lambda id, f, size: Camera(id, "opencv", {"fx": f, "fy": f}, image_size=size)
     network = SimpleNamespace(cameras=[
         camera("a", 1200.0, (1000, 700)), camera("b", 2400.0, (1400, 2000)),

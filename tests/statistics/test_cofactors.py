@@ -17,6 +17,8 @@ from adjustment_checks import (
 )
 
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.projection_uncertainty import images_through_scene
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import quaternion_difference
 from jaxbundle.leastsquares.datum.conditions import move_to_datum
@@ -25,8 +27,6 @@ from jaxbundle.leastsquares.iterations.stopping import SETTLED
 from jaxbundle.leastsquares.problem import make_solver, pad_data
 from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.statistics.inspection import Inspection
-from jaxbundle.statistics.projection import images_through_scene
 
 NAMES = ("cameras of two models", "everything given", "free", "minimal")
 

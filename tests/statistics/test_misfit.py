@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
+from jaxbundle.adjustment.quality.misfit import (
+    contradicts,
+    doubt_of_baarda,
+    doubt_of_fit,
+    doubt_of_robust,
+)
 from jaxbundle.leastsquares.quality.distributions import critical_length
-from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda, doubt_of_fit, doubt_of_robust
 
 
 def test_chance_and_small_factors_are_no_contradiction():

@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.leastsquares import Result, adjust
 from jaxbundle.leastsquares.datum.motions import similarity
-from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
 from jaxbundle.leastsquares.problem import Problem
-from jaxbundle.leastsquares.quality.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.declare import CameraTable, camera_tables
@@ -90,7 +90,7 @@ class Rig:
         return found
 
 
-def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
+def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     """The tables of unknowns and the observations of a rig."""
     # Free points that no camera sees keep their coordinates.
     seen = np.isin(np.arange(len(rig.points)), rig.point)
@@ -151,7 +151,7 @@ def leave_out(
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
     removed = [
-        Removed(table.image_set, row, None, 0.0)
+        RemovedRow(table.image_set, row, None, 0.0)
         for table, of_set in rig.sets
         for row in np.flatnonzero(rays[of_set]).tolist()
     ]

@@ -8,7 +8,8 @@ A point Y at the distance d from camera k is fixed in the frame
     "camera"    of camera k itself, the interior orientation alone
     "rotation"  of camera k, without the rotation that moves the images least
 
-with the covariance of the common adjustment, as `jaxbundle.statistics.projection` for one camera.
+with the covariance of the common adjustment, as
+`jaxbundle.adjustment.quality.projection_uncertainty` for one camera.
 """
 
 from functools import partial
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.adjustment.quality.projection_uncertainty import interior_covariance_of_images
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
 from jaxbundle.cameras import CameraModel, get_model, image_ray, project
@@ -26,7 +28,6 @@ from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.statistics.projection import interior_covariance_of_images
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar, present
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbundle import plotting
-from jaxbundle.bundle import tables as result_tables
+from jaxbundle.adjustment import result_tables
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
@@ -24,9 +24,9 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Pose, PoseValue, Result
+from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.kinds.exterior_orientation import exterior
 from jaxbundle.network.tables import Camera, Network, units_of
-from jaxbundle.statistics.blunders import Removed, either_of
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -138,30 +138,28 @@ class RigCalibration:
         photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
         rows = rig.in_order
         parts = [
-            result_tables.residual_rows(
-                self,
+            result_tables.KindRows(
                 "image",
                 np.array(photographs, dtype=object),
                 ids[rig.point],
                 ("x", "y"),
                 rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
-                *(rows(getattr(found, name)) for name in result_tables.TESTED),
+                tuple(rows(getattr(found, name)) for name in result_tables.TESTED),
             )
         ]
         if rig.point_sigma is not None:
             blank = np.full(len(ids), "", dtype=object)
             parts.append(
-                result_tables.residual_rows(
-                    self,
+                result_tables.KindRows(
                     "control",
                     blank,
                     ids,
                     tuple("XYZ"),
                     weight("control"),
-                    *(getattr(found, name)["control"] for name in result_tables.TESTED),
+                    tuple(getattr(found, name)["control"] for name in result_tables.TESTED),
                 )
             )
-        return result_tables.concatenate(parts)
+        return result_tables.concatenate([result_tables.residual_rows(self, p) for p in parts])
 
     def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """τ = w/σ0."""

@@ -24,7 +24,7 @@ def project(
     from jaxbundle.cli.pushbroom.ground_points import points_of, with_points
     from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, warn, write_rows
     from jaxbundle.io.text.csv_tables import read_csv
-    from jaxbundle.pushbroom.project import Status, make_search, project_points
+    from jaxbundle.pushbroom.project import ProjectionStatus, make_search, project_points
 
     keep_inputs([scanner, points], csv=csv, json=json)
     file = open_scanner(scanner)
@@ -35,16 +35,17 @@ def project(
     found = project_points(file.image, make_search(file.image, file.earth), X, most=most)
     line, pixel = np.asarray(found.line), np.asarray(found.pixel)
     status, count = np.asarray(found.status), np.asarray(found.count)
-    if (status != Status.SEEN).all():
+    if (status != ProjectionStatus.SEEN).all():
         raise InputError(
             f"{table.source(0)}: no point is in the image; this one is "
-            f"{Status(int(status[0])).meaning}: check coordinates, frame and units"
+            f"{ProjectionStatus(int(status[0])).meaning}: check coordinates, frame and units"
         )
-    unseen = np.flatnonzero(status != Status.SEEN)
+    unseen = np.flatnonzero(status != ProjectionStatus.SEEN)
     if len(unseen):
         first = unseen[0]
         warn(
-            f"{table.source(first)}: not in the image but {Status(int(status[first])).meaning} "
+            f"{table.source(first)}: not in the image but "
+            f"{ProjectionStatus(int(status[first])).meaning} "
             f"({len(unseen)} of {len(status)} points)"
         )
     first = (np.arange(most) == 0)[:, None]
@@ -58,7 +59,7 @@ def project(
             "line": line[solution, point],
             "pixel": pixel[solution, point],
             "count": count[point],
-            "status": [Status(int(status[p])).meaning for p in point],
+            "status": [ProjectionStatus(int(status[p])).meaning for p in point],
         },
         csv,
         json,

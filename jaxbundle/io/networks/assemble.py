@@ -144,7 +144,7 @@ def rig_network(
     if not mounted:
         return network
     columns = {"rig": [RIG] * len(names), "epoch": [MOMENT] * len(names), "image": names}
-    return network.replace(further=(Rigs.of(Columns(columns, source), {}, 1.0),))
+    return network.replace(further=(Rigs.from_columns(Columns(columns, source), {}, 1.0),))
 
 
 def unique_labels(labels: Sequence[str], ids: Sequence) -> list[str]:

@@ -297,7 +297,9 @@ def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
         **dict(zip("XYZ", X0.T)),
         **{f"s{axis}": sigma for axis in "XYZ"},
     }
-    return (Antennas.of(Columns(columns, Source("shots", None, "gps_position")), {}, 1.0),)
+    return (
+        Antennas.from_columns(Columns(columns, Source("shots", None, "gps_position")), {}, 1.0),
+    )
 
 
 def _tracks(

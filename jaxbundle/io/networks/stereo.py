@@ -84,7 +84,7 @@ class Rectification(NamedTuple):
         )
 
 
-class Pair(NamedTuple):
+class StereoPair(NamedTuple):
     """Two cameras with X₂ = R·X₁ + T; `name` of its file, empty if there is no other pair."""
 
     cameras: tuple[Camera, Camera]
@@ -147,7 +147,7 @@ def _file_names(cameras: Sequence[Camera]) -> list[str]:
     return names
 
 
-def _pairs(network: Network, what: str) -> tuple[list[Pair], list[str]]:
+def _pairs(network: Network, what: str) -> tuple[list[StereoPair], list[str]]:
     """Every camera with the first, and what is lost.
 
     **Raises:** `InputError` for a single camera, and for cameras without mountings."""
@@ -165,7 +165,7 @@ def _pairs(network: Network, what: str) -> tuple[list[Pair], list[str]]:
     for camera, name, step in zip(cameras[1:], names[1:], mountings):
         T = step @ T  # from the first camera to this one
         own = f"{names[0]}_{name}" if len(cameras) > 2 else ""
-        pairs.append(Pair((cameras[0], camera), T[:3, :3], T[:3, 3], own))
+        pairs.append(StereoPair((cameras[0], camera), T[:3, :3], T[:3, 3], own))
     return pairs, lost
 
 
@@ -175,7 +175,7 @@ def opencv_stereo_files(network: Network, path: Path) -> tuple[Path, ...]:
     return tuple(_file_of(pair, path) for pair in pairs)
 
 
-def _file_of(pair: Pair, path: Path) -> Path:
+def _file_of(pair: StereoPair, path: Path) -> Path:
     return path.with_name(f"{path.stem}_{pair.name}{path.suffix}") if pair.name else path
 
 
@@ -204,7 +204,7 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
     return tuple(lost)
 
 
-def _stereo_entries(pair: Pair) -> dict[str, Any]:
+def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
     kinds = {str(camera.model) for camera in pair.cameras}
     if len(kinds) > 1:
         raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")

@@ -1,16 +1,18 @@
 """The result of a design as JSON (the fields are listed in docs/design.md)."""
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.network_design.proof import Proof
-from jaxbundle.network_design.result import Design, DesignState
+
+if TYPE_CHECKING:
+    from jaxbundle.network_design.proof import Proof
+    from jaxbundle.network_design.result import Design, DesignState
 
 
-def design_dict(designed: Design, proof: Proof | None = None) -> dict[str, Any]:
+def design_dict(designed: "Design", proof: "Proof | None" = None) -> dict[str, Any]:
     """A design as plain dicts and numbers."""
     network = designed.network
     images, unit = network.images, ANGLE_UNITS[network.angle_unit]
@@ -45,12 +47,12 @@ def design_dict(designed: Design, proof: Proof | None = None) -> dict[str, Any]:
     }
 
 
-def design_text(designed: Design, proof: Proof | None = None) -> str:
+def design_text(designed: "Design", proof: "Proof | None" = None) -> str:
     """A design as JSON text of one line; numbers that are not finite are null."""
     return json.dumps(without_nan(design_dict(designed, proof)), ensure_ascii=False) + "\n"
 
 
-def _state(state: DesignState) -> dict[str, Any]:
+def _state(state: "DesignState") -> dict[str, Any]:
     return {
         "aim": state.aim,
         "photographs": state.photographs,

@@ -20,7 +20,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.types import present
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.report.verdict import Verdict
 
 

@@ -14,7 +14,7 @@ from jaxbundle.network.tables import ESTIMATED, Images, Network, Points
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.problem import NetworkProblem
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def adjusted_network(adjustment: "Adjustment") -> Network:

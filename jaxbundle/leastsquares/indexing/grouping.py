@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.indices import as_column, as_index
 from jaxbundle.leastsquares.indexing.plan import Member, UnknownGroup
 from jaxbundle.leastsquares.indexing.settings import PlanningSettings
@@ -56,7 +56,7 @@ class Grouping:
     def __init__(
         self,
         tables: Sequence[Table],
-        observations: Sequence[Observations],
+        observations: Sequence[ObservationSet],
         eliminate: str | None,
         choose: Choices,
         settings: PlanningSettings,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxbundle.choices import REDUCTIONS
-from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.grouping import Choices, Grouping, ObservationSubset
 from jaxbundle.leastsquares.indexing.indices import Sizes, as_column, as_index, count
 from jaxbundle.leastsquares.indexing.layout import (
@@ -33,7 +33,7 @@ from jaxbundle.leastsquares.indexing.settings import PLANNING, PlanningSettings
 
 def make_plan(
     tables: Sequence[Table],
-    observations: Sequence[Observations],
+    observations: Sequence[ObservationSet],
     eliminate: str | None,
     choices: dict | None = None,
     ways: Sequence[str] = REDUCTIONS,

@@ -40,7 +40,8 @@ class Data(eqx.Module):
     """The data of a problem, all differentiable.
 
     `start`: the start values of the tables, including held values; `measured` and `weight` of every
-    set of observations (see `Observations`), by its name.
+    set of observations (see `ObservationSet`), by its name. `weight` is 1/σ, the root of the
+    textbook's weight p = 1/σ²; of correlated observations W with P = WᵀW; 0 is not used.
     """
 
     start: Values

@@ -30,7 +30,7 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, present
 
 
-class Precision(eqx.Module):
+class TablePrecision(eqx.Module):
     """Covariances of every row of every table (`own`, zero for held unknowns), in the directions of
     its space, and of the requested functions."""
 
@@ -44,14 +44,14 @@ def precision(
     of: Callable[[Values], Array] | None = None,
     *,
     sigma0: float | Float[Array, ""] = 1.0,
-) -> Precision:
+) -> TablePrecision:
     """The precision of a design, differentiable to any order.
 
     **Arguments:** `data`: numbers that replace `problem.data` (same shapes): the design in `start`,
     and weights; `of`: functions of the tables, `values -> [functions]`, for their covariance;
     `sigma0`: of the unit weight, 1: a priori.
 
-    **Returns:** a `Precision`; all NaN if the design leaves unknowns undetermined.
+    **Returns:** a `TablePrecision`; all NaN if the design leaves unknowns undetermined.
 
     **Raises:** `InputError` for data of other shapes, or if no factor fits into memory.
     """
@@ -71,7 +71,7 @@ def precision(
     else:
         rows = jax.jacrev(functions)(still)
     own, covariance = covariances(declared, plan, data, rows)
-    found = Precision(without_filling(problem, own), covariance)
+    found = TablePrecision(without_filling(problem, own), covariance)
     return jax.tree.map(lambda C: sigma0**2 * C, found)
 
 

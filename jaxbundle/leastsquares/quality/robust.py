@@ -74,7 +74,7 @@ _WEIGHT = {"huber": huber, "cauchy": cauchy, "tukey": tukey}
 
 
 @dataclasses.dataclass(frozen=True)
-class Suspect:
+class SuspectRow:
     """An observation whose residual exceeds the critical length: its set, row there, the length t
     of its residual in units of σ and scale, its weight factor."""
 
@@ -95,13 +95,13 @@ class Reweighted:
     rests: bool
     lengths: dict[str, Float[np.ndarray, " n"]]
 
-    def suspects(self, significance: float = 0.001) -> list[Suspect]:
+    def suspects(self, significance: float = 0.001) -> list[SuspectRow]:
         """Observations with residuals above the critical length, the worst first; `significance` is
         the probability of any in data without blunders."""
         used = {o: (self.found.problem.weights(o) > 0).any(1) for o in self.lengths}
         critical = critical_length(significance, sum(int(u.sum()) for u in used.values()))
         found = [
-            Suspect(o, row, float(t[row]), float(self.weights[o][row]))
+            SuspectRow(o, row, float(t[row]), float(self.weights[o][row]))
             for o, t in self.lengths.items()
             for row in np.flatnonzero(used[o] & (t > critical)).tolist()
         ]

@@ -49,7 +49,7 @@ Adjust = Callable[[Problem, Values], Solution]
 
 
 @dataclasses.dataclass(frozen=True)
-class Removed:
+class RemovedRow:
     """A removed observation: its set, row, residual (None: all) and test value. `others`: rows of
     inseparable observations, removed with it."""
 
@@ -94,8 +94,8 @@ def snoop(
     test: str = "pope",
     significance: float = 0.001,
     limit: int | None = None,
-    doubtful: Sequence[Removed] = (),
-) -> tuple[Solution, list[Removed]]:
+    doubtful: Sequence[RemovedRow] = (),
+) -> tuple[Solution, list[RemovedRow]]:
     """Remove blunders, the worst first.
 
     **Arguments:**
@@ -151,7 +151,7 @@ def snoop(
 
 def _solve(
     whole: Problem,
-    removed: Sequence[Removed],
+    removed: Sequence[RemovedRow],
     excluded: set[int],
     values: Values,
     adjust_from: Adjust,
@@ -201,14 +201,14 @@ class _Touched:
 
 def _worst(
     found: Solution, touched: _Touched, unit: float, critical: float, apart: float
-) -> list[Removed]:
+) -> list[RemovedRow]:
     """The observations to remove now, the worst first; tests in `unit`.
 
     Observations of a row are separable if the test of the suspect exceeds `apart` without the
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [
-        Removed(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
+        RemovedRow(o, *divmod(int(t.argmax()), t.shape[1]), float(t.max()))
         for o, t in ((o, tests[o]) for o in touched.single)
         if t.size
     ]
@@ -216,7 +216,7 @@ def _worst(
     for o in filter(lambda o: len(tests[o]), touched.whole):
         of_one = tests[o].max(1, initial=0.0)
         lonely = np.where(touched.own[o] < 0, of_one, 0.0)
-        alone.append(Removed(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
+        alone.append(RemovedRow(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
         together.append(np.where(touched.own[o] < 0, 0.0, of_one))
         of.append(np.full(len(of_one), o, dtype=object))
         row.append(np.arange(len(of_one)))
@@ -247,7 +247,7 @@ def _worst(
     # Those beyond doubt first: without them, some of the others may become separable.
     certain = [k for k in others if not others[k]]
     return [
-        Removed(str(of[k]), int(row[k]), None, float(together[k]), others[k])
+        RemovedRow(str(of[k]), int(row[k]), None, float(together[k]), others[k])
         for k in certain or others
     ]
 
@@ -293,7 +293,11 @@ class _Neighbours:
 
 
 def _passing(
-    whole: Problem, found: Solution, touched: _Touched, removed: Sequence[Removed], critical: float
+    whole: Problem,
+    found: Solution,
+    touched: _Touched,
+    removed: Sequence[RemovedRow],
+    critical: float,
 ) -> set[tuple[str, int, int | None]]:
     """Sets, rows and residuals of removed observations that agree with the adjustment without
     them."""
@@ -310,21 +314,23 @@ def _passing(
     }
 
 
-def _with_tests(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
+def _with_tests(
+    whole: Problem, found: Solution, removed: Sequence[RemovedRow]
+) -> Iterable[RemovedRow]:
     """What was removed, with the tests of initially doubtful observations."""
     for r, tests in _test_removed(whole, found, removed):
         yield r if np.isfinite(r.test) else dataclasses.replace(r, test=tests[0])
 
 
 def _test_removed(
-    whole: Problem, found: Solution, removed: Sequence[Removed]
-) -> Iterable[tuple[Removed, list[float]]]:
+    whole: Problem, found: Solution, removed: Sequence[RemovedRow]
+) -> Iterable[tuple[RemovedRow, list[float]]]:
     """Each of the removed with the test of its rows against what remains.
 
     Two residuals removed from one correlated observation are tested in separate passes, each
     without the other, which would predict it."""
     correlated = lambda r: r.residual is not None and whole.data.weight[r.set].ndim == 3
-    together: dict[tuple[str, int], list[Removed]] = {}
+    together: dict[tuple[str, int], list[RemovedRow]] = {}
     for r in filter(correlated, removed):
         together.setdefault((r.set, r.row), []).append(r)
     others = lambda r: [x for x in together[r.set, r.row] if x is not r] if correlated(r) else []
@@ -339,7 +345,7 @@ def _test_removed(
             yield r, [float(np.max(tests[r.set][row, residual])) for row in r.rows]
 
 
-def _remove(weight: Float[np.ndarray, "n ..."], removed: Removed) -> None:
+def _remove(weight: Float[np.ndarray, "n ..."], removed: RemovedRow) -> None:
     """Take the weight of what is removed."""
     rows = list(removed.rows)
     if removed.residual is None:
@@ -351,8 +357,8 @@ def _remove(weight: Float[np.ndarray, "n ..."], removed: Removed) -> None:
 
 
 def _without_passing(
-    removed: Sequence[Removed], passing: set[tuple[str, int, int | None]]
-) -> Iterable[Removed]:
+    removed: Sequence[RemovedRow], passing: set[tuple[str, int, int | None]]
+) -> Iterable[RemovedRow]:
     """The observations that stay removed. If all inseparable ones pass individually, they still
     contradict each other and all stay removed."""
     for r in removed:
@@ -369,7 +375,9 @@ def _finite(tests: Float[AnyArray, "..."]) -> Float[np.ndarray, "..."]:
     return np.where(np.isfinite(tests), tests, 0.0)
 
 
-def without(problem: Problem, removed: Sequence[Removed], excluded: Iterable[int] = ()) -> Problem:
+def without(
+    problem: Problem, removed: Sequence[RemovedRow], excluded: Iterable[int] = ()
+) -> Problem:
     """The problem with the weights of removed observations set to zero, without `excluded`
     eliminated rows and those left with too few residuals."""
     weight = {o: np.array(w) for o, w in problem.data.weight.items()}

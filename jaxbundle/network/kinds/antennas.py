@@ -21,18 +21,19 @@ Section: `lever_arm = [ax, ay, az]` (0 if not given), or by camera `{ left = [..
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.leastsquares.spaces import Change, Posed, Triple, Vector
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
-    Declared,
+    Contribution,
     Further,
     Parameters,
     check_settings,
@@ -40,16 +41,20 @@ from jaxbundle.network.kinds.base import (
     rows_of,
     three_by_camera,
 )
+from jaxbundle.network.tables import Network
+from jaxbundle.types import Scalar
 
 ARM = ("ax", "ay", "az")
+PAIRS = tuple(itertools.combinations(range(3), 2))
 SHIFTS = ("shift_X", "shift_Y", "shift_Z")
 FREE = (*ARM, "shift", *SHIFTS, "drift", "time_offset")
 AXES = ("X", "Y", "Z")
-PAIRS = ((0, 1), (0, 2), (1, 2))
 SECTION = "antenna"
 
 
-def antenna(pose, arm, strip, clock, given):
+def antenna(
+    pose: Posed, arm: Triple, strip: Change, clock: Change, given: tuple[Triple, Scalar, Triple]
+) -> Triple:
     """The position of an antenna minus the measured one; `given`: the measured one, the time since
     the mean of the strip, the velocity."""
     measured, since, velocity = given
@@ -83,16 +88,19 @@ class Antennas(Further):
     MEASURED = "position"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Antennas":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "Antennas":
         sigmas, pairs = [f"s{a}" for a in AXES], [f"r{AXES[i]}{AXES[j]}" for i, j in PAIRS]
         table.check_names(("image", *AXES, *sigmas), (*pairs, "strip", "t"))
         check_settings(SECTION, settings, ("lever_arm", "free", "sigma"))
-        chosen = Parameters.of(SECTION, settings, FREE)
+        chosen = Parameters.from_settings(SECTION, settings, FREE)
         position = np.stack([table.numbers(a, required=True) for a in AXES], 1)
         sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
         R = np.tile(np.eye(3), (len(table), 1, 1))
         for (i, j), name in zip(PAIRS, pairs):
             R[:, i, j] = R[:, j, i] = np.nan_to_num(table.numbers(name))
+        # Three correlations that are each below 1 may still be no covariance together.
         for row in np.flatnonzero(~(np.linalg.eigvalsh(R).min(1) > 1e-12))[:1]:
             raise InputError(
                 f"{table.source(row)}: the correlations {', '.join(pairs)} are impossible together"
@@ -125,7 +133,7 @@ class Antennas(Further):
             | ({} if np.isnan(self.time).any() else {"t": self.time})
         )
 
-    def begin(self, network):
+    def begin(self, network: Network) -> Network:
         """Antenna positions serve as start values of projection centres."""
         images = network.images
         row = {id: k for k, id in enumerate(self.image)}
@@ -138,12 +146,12 @@ class Antennas(Further):
     def number_of_equations(self) -> int:
         return 3
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images = network.images
         image = rows_of(self.image, images)
         camera, of_camera = np.unique(images.camera[image], return_inverse=True)
         strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
-        parameters = _by_axis(Parameters.of(SECTION, self.settings, FREE))
+        parameters = _by_axis(Parameters.from_settings(SECTION, self.settings, FREE))
         cameras = [network.cameras[c].id for c in camera]
         given = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
@@ -155,9 +163,13 @@ class Antennas(Further):
             ARM,
             "lever arm of camera",
         )
+        # Velocities are numbers, not unknowns: their errors times the offset of a clock
+        # (milliseconds) are far below the σ of a position.
         since, velocity = _track(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
             raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
+        # One row a strip of shift and drift: a drift is that about the mean time, or it would be
+        # correlated with the shift.
         groups = [*SHIFTS, *["drift"] * 3]
         names = ("shift X", "shift Y", "shift Z", "drift X", "drift Y", "drift Z")
         shift = Table(
@@ -186,7 +198,7 @@ class Antennas(Further):
             *parameters.priors(shift, groups),
             *parameters.priors(clock, ["time_offset"]),
         )
-        return Declared((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))
+        return Contribution((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))
 
 
 def _by_axis(given: Parameters) -> Parameters:
@@ -197,12 +209,16 @@ def _by_axis(given: Parameters) -> Parameters:
     return Parameters(FREE, free, sigma)
 
 
-def _shift_back(motion, strip):
+def _shift_back(motion: Float[Array, "7"], strip: Float[Array, "6"]) -> Float[Array, "6"]:
     """The shifts of strips that compensate a shift of object space: if all are free, it is open."""
     return strip.at[:3].add(-motion[:3])
 
 
-def _track(position, strip, time):
+def _track(
+    position: Float[np.ndarray, "rows 3"],
+    strip: Int[np.ndarray, " rows"],
+    time: Float[np.ndarray, " rows"],
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 3"]]:
     """The time of every position since the mean of its strip, and the velocity there (0 if a strip
     has fewer than three)."""
     since, velocity = np.zeros(len(time)), np.zeros_like(position)
@@ -211,6 +227,7 @@ def _track(position, strip, time):
     for s in range(strip.max() + 1 if len(strip) else 0):
         rows = np.flatnonzero(strip == s)
         since[rows] = time[rows] - time[rows].mean()
+        # Central differences need two neighbours; equal times have none.
         if len(np.unique(time[rows])) == len(rows) >= 3:
             order = rows[np.argsort(time[rows])]
             velocity[order] = np.gradient(position[order], time[order], axis=0)

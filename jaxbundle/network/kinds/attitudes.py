@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
@@ -23,10 +23,10 @@ from jaxbundle.geometry import (
     quaternion_from_matrix,
 )
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Rotation
+from jaxbundle.leastsquares.spaces import Posed, Rotation, Turned
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.kinds.base import (
-    Declared,
+    Contribution,
     Further,
     Parameters,
     check_settings,
@@ -34,19 +34,21 @@ from jaxbundle.network.kinds.base import (
     rows_of,
     three_by_camera,
 )
+from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
 ANGLES = ("omega", "phi", "kappa")
 SECTION = "attitude"
 
 
-def attitude(pose, boresight, measured):
+def attitude(pose: Posed, boresight: Turned, measured: Float[Array, "3"]) -> Float[Array, "3"]:
     """ω, φ, κ of ΔMᵀ·M, nearest to the measured ones, minus these."""
+    # Angles and not a rotation vector: their σ are those of the instrument, about its axes.
     M = boresight.matrix().T @ pose.rotation.matrix()
     return omega_phi_kappa_near(M, measured) - measured
 
 
-def boresight_misclosure(boresight, given):
+def boresight_misclosure(boresight: Turned, given: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The rotation vector of a boresight relative to the given one [3, 3], for small
     differences."""
     R = boresight.matrix() @ given.T
@@ -69,11 +71,13 @@ class Attitudes(Further):
     MEASURED = "angles"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Attitudes":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "Attitudes":
         sigmas = [f"s{a}" for a in ANGLES]
         table.check_names(("image", *ANGLES, *sigmas))
         check_settings(SECTION, settings, ("boresight", "free", "sigma"))
-        Parameters.of(SECTION, settings, ("boresight",))
+        Parameters.from_settings(SECTION, settings, ("boresight",))
         angles = np.stack([table.numbers(a, required=True) for a in ANGLES], 1)
         sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
         return cls(
@@ -92,13 +96,13 @@ class Attitudes(Further):
     def number_of_equations(self) -> int:
         return 3
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images = network.images
         image = rows_of(self.image, images)
         camera, of_camera = np.unique(images.camera[image], return_inverse=True)
         cameras = [network.cameras[c].id for c in camera]
         radians = ANGLE_UNITS[network.angle_unit]
-        parameters = Parameters.of(SECTION, self.settings, ("boresight",))
+        parameters = Parameters.from_settings(SECTION, self.settings, ("boresight",))
         given = self.settings.get("boresight", [0.0, 0.0, 0.0])
         M = np.stack(
             [
@@ -119,4 +123,4 @@ class Attitudes(Further):
         if "boresight" in parameters.sigma:
             sigma = radians * parameters.sigma["boresight"]
             found.append(PRIOR((np.arange(len(M)),), M, sigma=sigma))
-        return Declared((boresight,), found)
+        return Contribution((boresight,), found)

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.declarations import Kind, Observations, Table
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.tables import Images, Points, Source
+from jaxbundle.network.tables import Images, Network, Points, Rows, Source, row_indices
 
 LENGTHS = frozenset(
     (
@@ -33,12 +33,13 @@ ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
 distance and with a radian."""
 
 
-class Declared(NamedTuple):
-    """For the engine: tables of unknowns, sets of observations (object coordinates relative to the
-    origin), and how a similarity of object space moves the tables, (name, function) each."""
+class Contribution(NamedTuple):
+    """What a kind contributes to the problem of the engine: tables of unknowns, sets of
+    observations (object coordinates relative to the origin), and how a similarity of object space
+    moves the tables, (name, function) each."""
 
     tables: Sequence[Table] = ()
-    observations: Sequence[Observations] = ()
+    observations: Sequence[ObservationSet] = ()
     actions: Sequence[tuple[str, Callable]] = ()
 
 
@@ -63,33 +64,34 @@ class Further(abc.ABC):
 
     @classmethod
     @abc.abstractmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
         """Rows from the columns of a table; `radians` per angle unit."""
 
     @abc.abstractmethod
     def columns(self, radians: float) -> dict[str, Sequence[Any]]:
-        """The columns of the table, in the form of `of`."""
+        """The columns of the table, in the form of `from_columns`."""
 
     @abc.abstractmethod
-    def declare(self, network, origin: Float[np.ndarray, "3"]) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         """The tables and observations for a network that contains all rows (`among`)."""
 
     def __len__(self) -> int:
         return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
 
-    def take(self, rows) -> Self:
+    def take(self, rows: Rows) -> Self:
         """The chosen rows (a mask or indices)."""
-        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        rows = row_indices(rows)
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("settings", "source")]
         cut = lambda x: x[rows] if isinstance(x, np.ndarray) else tuple(x[row] for row in rows)
         chosen = {name: cut(getattr(self, name)) for name in names}
         return dataclasses.replace(self, source=self.source.take(rows), **chosen)
 
-    def among(self, network) -> Self:
+    def among(self, network: Network) -> Self:
         """The rows whose images and points are all in the network."""
         return self.take(self._present(network))
 
-    def _present(self, network) -> np.ndarray:
+    def _present(self, network: Network) -> np.ndarray:
+        # Rows about objects that were left out go with them, without an error.
         keep = np.ones(len(self), bool)
         for fields, known in ((self.IMAGES, network.images.id), (self.POINTS, network.points.id)):
             known = set(known)
@@ -97,7 +99,7 @@ class Further(abc.ABC):
                 keep &= np.array([id in known for id in getattr(self, field)], bool)
         return keep
 
-    def check(self, network) -> None:
+    def check(self, network: Network) -> None:
         """Refuse rows about unknown images and points.
 
         **Raises:** `InputError`."""
@@ -114,12 +116,12 @@ class Further(abc.ABC):
                             f"{table.source.name}{did_you_mean(id, known, listing=False)}"
                         )
 
-    def begin(self, network):
+    def begin(self, network: Network) -> Network:
         """The network with missing start values taken from these rows."""
         return network
 
     @property
-    def has_size(self) -> bool:
+    def needs_scale(self) -> bool:
         """Whether a σ is a length that does not define the scale: the residuals shrink with the
         network, so its scale must be known."""
         return False
@@ -135,7 +137,7 @@ def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]
     return np.array([row[id] for id in ids], int)
 
 
-def among(network) -> list[Further]:
+def among(network: Network) -> list[Further]:
     """The observations of further kinds of a network whose images and points are all included."""
     present = (one.among(network) for one in network.further)
     return [one for one in present if len(one)]
@@ -198,7 +200,9 @@ class Parameters:
     sigma: Mapping[str, float]
 
     @staticmethod
-    def of(section: str, settings: Mapping[str, Any], names: tuple[str, ...]) -> "Parameters":
+    def from_settings(
+        section: str, settings: Mapping[str, Any], names: tuple[str, ...]
+    ) -> "Parameters":
         """From the keys `free` and `sigma` of a section.
 
         **Raises:** `InputError`."""
@@ -222,16 +226,19 @@ class Parameters:
         """Which of these are free, in every row."""
         return np.array([[name in self.free for name in names]])
 
-    def priors(self, table: Table, names: Sequence[str]) -> list[Observations]:
+    def priors(self, table: Table, names: Sequence[str]) -> list[ObservationSet]:
         """Pseudo-observations of the start values of a table of vectors with these columns."""
+        # An infinite σ is no prior: a column without one is a row without weight.
         sigma = np.array([self.sigma.get(name, np.inf) for name in names])
         if not np.isfinite(sigma).any():
             return []
-        kind = Kind(f"prior of {table.title}", less, (table.name,), tuple(names), snooped="")
+        kind = Kind(
+            f"prior of {table.title}", computed_minus_given, (table.name,), tuple(names), snooped=""
+        )
         sigma = np.tile(sigma, (table.rows, 1))
         return [kind((np.arange(table.rows),), table.value, sigma=sigma)]
 
 
-def less(value, given):
+def computed_minus_given(value: Any, given: Any) -> Any:
     """Computed minus given."""
     return value - given

@@ -15,9 +15,12 @@ from jaxtyping import Bool, Float
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.spaces import Change
 from jaxbundle.network.camera_tables import camera_tables
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Declared, Further, positive_sigma
+from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma
+from jaxbundle.network.tables import Network
+from jaxbundle.types import Scalar
 
 RATIO = "/"
 
@@ -30,7 +33,7 @@ class ObservedParameter:
     column: int
     divisor: int | None = None
 
-    def __call__(self, camera, observed):
+    def __call__(self, camera: Change, observed: Scalar) -> Scalar:
         value = camera[self.column]
         return (value if self.divisor is None else value / camera[self.divisor]) - observed
 
@@ -48,7 +51,9 @@ class CameraParameters(Further):
     TABLE = "camera_parameters"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "CameraParameters":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "CameraParameters":
         table.check_names(("camera", "parameter", "value", "sigma"))
         return cls(
             camera=table.ids("camera"),
@@ -69,11 +74,11 @@ class CameraParameters(Further):
     def __len__(self) -> int:
         return len(self.camera)
 
-    def _present(self, network) -> Bool[np.ndarray, " n"]:
+    def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
         known = {camera.id for camera in network.cameras}
         return np.array([id in known for id in self.camera], bool)
 
-    def check(self, network) -> None:
+    def check(self, network: Network) -> None:
         cameras = {camera.id: camera for camera in network.cameras}
         for row, (id, parameter) in enumerate(zip(self.camera, self.parameter)):
             if id not in cameras:
@@ -94,6 +99,7 @@ class CameraParameters(Further):
                         f"{did_you_mean(name, known)}"
                     )
             groups = {name: group for group in camera.tie for name in group}
+            # A ratio of two tied parameters is a constant, and a held parameter no unknown.
             one = len(names) == 2 and groups.get(names[0], {*names}) == groups.get(names[1])
             if one or not {*camera.free} & {m for n in names for m in groups.get(n, (n,))}:
                 raise InputError(
@@ -101,7 +107,7 @@ class CameraParameters(Further):
                     f"{' or '.join(names)} to be free" + (" and not tied" if one else "")
                 )
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         index = {camera.id: c for c, camera in enumerate(network.cameras)}
         place = {
             int(c): (table, k)
@@ -117,7 +123,7 @@ class CameraParameters(Further):
         kind = lambda table, parameter, residual: Kind(
             "camera parameters", residual, (table,), (parameter,), snooped="", invariant=True
         )
-        return Declared(
+        return Contribution(
             (),
             tuple(
                 kind(*of)(

@@ -5,23 +5,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.leastsquares.declarations import Kind, Observations
-from jaxbundle.network.kinds.base import less
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet
+from jaxbundle.network.kinds.base import computed_minus_given
 
 if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
-CONTROL_POINTS = Kind("control points", less, ("point",), ("X", "Y", "Z"), snooped="single")
+CONTROL_POINTS = Kind(
+    "control points", computed_minus_given, ("point",), ("X", "Y", "Z"), snooped="single"
+)
 
 
 def declare_control_points(
     network: "Network", origin: Float[np.ndarray, "3"]
-) -> list[Observations]:
+) -> list[ObservationSet]:
     """The set "control", one row a control point, if there are any."""
     points = network.points
     rows = np.flatnonzero(points.has_role("control"))
     if not len(rows):
         return []
+    # An axis that is not controlled has an infinite σ: a row without weight keeps the table
+    # regular.
     measured, sigma = points.position[rows] - origin, points.sigma[rows]
     return [CONTROL_POINTS((rows,), measured, sigma=infinite_where_none(sigma), name="control")]
 

@@ -11,23 +11,29 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.tables import Network
 
 AXES = ("dX", "dY", "dZ")
 
 
-def difference(a, b, measured):
+def difference(
+    a: Float[Array, "3"], b: Float[Array, "3"], measured: Float[Array, "3"]
+) -> Float[Array, "3"]:
     """b − a minus the measured difference."""
     return b - a - measured
 
 
-def angle(a, at, b, measured):
+def angle(
+    a: Float[Array, "3"], at: Float[Array, "3"], b: Float[Array, "3"], measured: Float[Array, ""]
+) -> Float[Array, ""]:
     """The angle at a point between two others minus the measured one, radians."""
+    # The tangent is exact at every angle; the arc cosine has no derivative at 0 and 180°.
     u, v = a - at, b - at
     sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
     return jnp.arctan2(sine, u @ v) - measured
@@ -49,7 +55,9 @@ class Differences(Further):
     TABLE, POINTS, MEASURED = "differences", ("start", "to"), "value"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Differences":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "Differences":
         table.check_names(("from", "to"), (*AXES, *(f"s{a}" for a in AXES)))
         value = np.stack([table.numbers(a) for a in AXES], 1)
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
@@ -74,9 +82,9 @@ class Differences(Further):
         columns |= {a: value[:, k] for k, a in enumerate(AXES)}
         return columns | {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.to))
-        return Declared((), (DIFFERENCE(ends, self.value, sigma=self.sigma),))
+        return Contribution((), (DIFFERENCE(ends, self.value, sigma=self.sigma),))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,7 +100,7 @@ class Angles(Further):
     TABLE, POINTS, MEASURED = "angles", ("start", "at", "to"), "value"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Angles":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Angles":
         table.check_names(("from", "at", "to", "value", "sigma"))
         value = radians * table.numbers("value", required=True)
         for row in np.flatnonzero(~((value > 0) & (value < np.pi)))[:1]:
@@ -122,6 +130,6 @@ class Angles(Further):
             "sigma": self.sigma / radians,
         }
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.at, self.to))
-        return Declared((), (ANGLE(ends, self.value, sigma=self.sigma),))
+        return Contribution((), (ANGLE(ends, self.value, sigma=self.sigma),))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.declarations import Kind, Observations
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.types import Scalar
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ def distance(a: Float[Array, "3"], b: Float[Array, "3"], given: Scalar) -> Scala
 DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), snooped="single")
 
 
-def declare_distances(network: "Network") -> list[Observations]:
+def declare_distances(network: "Network") -> list[ObservationSet]:
     """The set "distance", one row a distance, if there are any."""
     given = network.distances
     if not len(given):

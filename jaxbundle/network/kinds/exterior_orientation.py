@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_near
-from jaxbundle.leastsquares.declarations import Kind, Observations
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet
+from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
 from jaxbundle.network.kinds.control_points import infinite_where_none
 from jaxbundle.network.tables import EXTERIOR
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 
-def exterior(pose, given):
+def exterior(pose: Posed, given: Float[Array, "6"]) -> Float[Array, "6"]:
     """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
     [6]."""
     angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
@@ -39,9 +40,10 @@ EXTERIOR_ORIENTATION = Kind("exterior orientation", exterior, ("image",), EXTERI
 
 def declare_exterior_orientation(
     network: "Network", origin: Float[np.ndarray, "3"]
-) -> list[Observations]:
+) -> list[ObservationSet]:
     """The set "exterior", one row an image with a σ, if there are any."""
     images = network.images
+    # σ = 0 holds a value exactly: its column is not free (`declare`), and it is no observation.
     sigma = infinite_where_none(images.sigma)
     rows = np.flatnonzero(np.isfinite(sigma).any(1))
     if not len(rows):
@@ -61,7 +63,9 @@ class ExteriorPriors(Further):
     TABLE, IMAGES, MEASURED = "exterior_priors", ("image",), "value"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "ExteriorPriors":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "ExteriorPriors":
         sigmas = [f"s{name}" for name in EXTERIOR]
         table.check_names(("image", *EXTERIOR, *sigmas))
         unit = np.array([1, 1, 1, radians, radians, radians])
@@ -89,10 +93,10 @@ class ExteriorPriors(Further):
     def number_of_equations(self) -> int:
         return int(np.isfinite(self.sigma).sum(1).min(initial=len(EXTERIOR)))
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: "Network", origin: Float[np.ndarray, "3"]) -> Contribution:
         shift = np.concatenate([origin, np.zeros(3)])
         value = np.where(np.isfinite(self.sigma), self.value - shift, 0.0)
-        return Declared(
+        return Contribution(
             (),
             (
                 EXTERIOR_ORIENTATION(

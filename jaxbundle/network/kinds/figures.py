@@ -25,58 +25,63 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.arguments import show
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares.datum.motions import move_pose
-from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Frame, PoseValue
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
+from jaxbundle.leastsquares.spaces import Frame, Posed, PoseValue, Triple
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
 from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
+from jaxbundle.network.tables import Network
+from jaxbundle.types import Scalar
 
 EXACT_SIGMA = 1e-3
 """The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with
 its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
 conditioned."""
-SHIFTS, TILTS = (0, 1, 2), (3, 4)
 MOVES = {
-    "plane": (2, *TILTS),
-    "line": (0, 1, *TILTS),
-    "circle": (*SHIFTS, *TILTS),
-    "sphere": SHIFTS,
-    "cylinder": (0, 1, *TILTS),
+    "plane": (2, 3, 4),
+    "line": (0, 1, 3, 4),
+    "circle": (0, 1, 2, 3, 4),
+    "sphere": (0, 1, 2),
+    "cylinder": (0, 1, 3, 4),
 }
+"""The `DIRECTIONS` in which a figure changes; along the others it moves in itself: they would be
+undetermined."""
 DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
 ROUND = ("circle", "sphere", "cylinder")
 
 
-def on_plane(frame, point, given):
+def on_plane(frame: Posed, point: Triple, given: Scalar) -> Scalar:
     return frame.ray(point)[2] - given
 
 
-def on_line(frame, point, given):
+def on_line(frame: Posed, point: Triple, given: Float[Array, "2"]) -> Float[Array, "2"]:
     return jnp.stack(frame.ray(point)[:2]) - given
 
 
-def on_circle(frame, radius, point, given):
+def on_circle(
+    frame: Posed, radius: Scalar, point: Triple, given: Float[Array, "2"]
+) -> Float[Array, "2"]:
     x, y, z = frame.ray(point)
     return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - given
 
 
-def on_sphere(frame, radius, point, given):
+def on_sphere(frame: Posed, radius: Scalar, point: Triple, given: Scalar) -> Scalar:
     return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - given
 
 
-def on_cylinder(frame, radius, point, given):
+def on_cylinder(frame: Posed, radius: Scalar, point: Triple, given: Scalar) -> Scalar:
     x, y, _ = frame.ray(point)
     return jnp.sqrt(x * x + y * y) - radius - given
 
 
-def in_shape(frame, point, given):
+def in_shape(frame: Posed, point: Triple, given: Float[Array, "3"]) -> Float[Array, "3"]:
     """A point in the frame of a shape of known coordinates."""
     return jnp.stack(frame.ray(point)) - given
 
@@ -90,7 +95,7 @@ RESIDUALS = {
 }
 
 
-def _move_radius(motion, radius):
+def _move_radius(motion: Float[Array, "7"], radius: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.exp(motion[6]) * radius
 
 
@@ -107,7 +112,7 @@ class Figures(Further):
     TABLE, POINTS = "figures", ("point",)
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
         table.check_names(("figure", "type", "point"), ("sigma", "radius"))
         made = cls(
             figure=table.ids("figure"),
@@ -135,7 +140,7 @@ class Figures(Further):
         return made
 
     @property
-    def has_size(self) -> bool:
+    def needs_scale(self) -> bool:
         return bool((self.sigma > 0).any())
 
     def columns(self, radians: float) -> dict:
@@ -148,26 +153,32 @@ class Figures(Further):
             "radius": self.radius,
         }
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         point = rows_of(self.point, network.points)
         place = network.points.position - origin
         exact = EXACT_SIGMA * across_rays(network)
         declared = [self._of_type(type, point, place, exact) for type in TYPES if type in self.type]
-        return Declared(*(sum(parts, ()) for parts in zip(*declared)))
+        return Contribution(*(sum(parts, ()) for parts in zip(*declared)))
 
-    def _of_type(self, type, point, place, exact) -> Declared:
+    def _of_type(
+        self,
+        type: str,
+        point: Int[np.ndarray, " rows"],
+        place: Float[np.ndarray, "points 3"],
+        exact: float,
+    ) -> Contribution:
         rows = np.flatnonzero(np.array(self.type, dtype=object) == type)
         names, figure = np.unique(np.array(self.figure, dtype=object)[rows], return_inverse=True)
-        fitted = []
-        for k, name in enumerate(names):
-            own = rows[figure == k]
+        members = [rows[figure == k] for k in range(len(names))]
+        for name, own in zip(names, members):
             if len(np.unique(point[own])) < FEWEST[type]:
                 raise InputError(
                     f"{self.source(own[0])}: {type} {name!r} has {len(own)} usable points; "
                     f"at least {FEWEST[type]} are needed"
                 )
-            fitted.append(fit(type, place[point[own]]))
-        centre, M, radius = (np.array(x) for x in zip(*fitted))
+        centre, M, radius = (
+            np.array(x) for x in zip(*(fit(type, place[point[own]]) for own in members))
+        )
         q = np.array([np.asarray(quaternion_from_matrix(m)) for m in M])
         columns = MOVES[type]
         frame = Table(
@@ -178,12 +189,12 @@ class Figures(Further):
             parameters=tuple(DIRECTIONS[c] for c in columns),
         )
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
+        # Figures of a known and of an unknown radius are two sets: with a radius their scale is
+        # known, without one a figure only has the shape of its points.
         if type not in ROUND:
             seen = self._observe_points(type, (type,), (figure,), point[rows], sigma)
-            return Declared((frame,), (seen,), ((type, move_pose),))
-        known = np.array(
-            [np.nanmax([*self.radius[rows[figure == k]], -1.0]) for k in range(len(names))]
-        )
+            return Contribution((frame,), (seen,), ((type, move_pose),))
+        known = np.array([np.nanmax([*self.radius[own], -1.0]) for own in members])
         size = Table(
             f"radius of {type}",
             np.where(known > 0, known, radius),
@@ -195,22 +206,21 @@ class Figures(Further):
         for given in (False, True):
             those = np.flatnonzero((known > 0)[figure] == given)
             if len(those):
-                touched = (figure[those],) * 2
-                seen.append(
-                    self._observe_points(
-                        type,
-                        (type, size.name),
-                        touched,
-                        point[rows[those]],
-                        sigma[those],
-                        not given,
-                    )
-                )
+                tables, touched = (type, size.name), (figure[those],) * 2
+                of, own_sigma = point[rows[those]], sigma[those]
+                seen.append(self._observe_points(type, tables, touched, of, own_sigma, not given))
         actions = (type, move_pose), (size.name, _move_radius)
-        return Declared((frame, size), tuple(seen), actions)
+        return Contribution((frame, size), tuple(seen), actions)
 
     @staticmethod
-    def _observe_points(type, tables, figure, point, sigma, invariant=True):
+    def _observe_points(
+        type: str,
+        tables: tuple[str, ...],
+        figure: tuple[Int[np.ndarray, " rows"], ...],
+        point: Int[np.ndarray, " rows"],
+        sigma: Float[np.ndarray, " rows"],
+        invariant: bool = True,
+    ) -> ObservationSet:
         """The conditions of points on figures. A figure of unknown size moves with its points;
         residuals of points not yet on it must not count as observations of scale or rotation
         (`invariant`)."""
@@ -232,7 +242,7 @@ class Shapes(Further):
     TABLE, POINTS = "shapes", ("point",)
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Shapes":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Shapes":
         table.check_names(("shape", "point", "x", "y", "z"), ("sigma",))
         place = np.stack([table.numbers(a, required=True) for a in "xyz"], 1)
         return cls(
@@ -251,7 +261,7 @@ class Shapes(Further):
     def number_of_equations(self) -> int:
         return 3
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         point = rows_of(self.point, network.points)
         names, shape = np.unique(np.array(self.shape, dtype=object), return_inverse=True)
         places = network.points.position - origin
@@ -276,24 +286,28 @@ class Shapes(Further):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
-        return Declared((frame,), (seen,), (("shape", move_pose),))
+        return Contribution((frame,), (seen,), (("shape", move_pose),))
 
 
-def _place(x, X):
+def _place(
+    x: Float[np.ndarray, "n 3"], X: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """X0 and M of x = M·(X − X0), by Kabsch (1976)."""
+    # The determinant keeps a mirrored fit, which plane shapes have, from being a rotation.
     a, b = x.mean(0), X.mean(0)
     U, _, Vt = np.linalg.svd((x - a).T @ (X - b))
     M = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     return b - M.T @ a, M
 
 
-def across_rays(network) -> float:
+def across_rays(network: Network) -> float:
     """The σ of a point across a ray, σ·s/c, median of all rays."""
     rays, images = network.observations, network.images
     shortest = []
     for camera in network.cameras:
         model = get_model(camera.model)
         shortest.append(min(abs(camera.parameters.get(p, 0.0)) for p in model.principal_distance))
+    # σ·s/c: an image point's σ projected to the distance of the object point.
     away = network.points.position[rays.point] - images.position[rays.image]
     c = np.array(shortest)[images.camera[rays.image]]
     return float(np.median(np.linalg.norm(away, axis=1) * rays.sigma.min(1) / c))

@@ -5,8 +5,6 @@ from jaxtyping import Float
 
 TYPES = ("plane", "line", "circle", "sphere", "cylinder")
 FEWEST = {"plane": 3, "line": 2, "circle": 3, "sphere": 4, "cylinder": 5}
-DIRECTIONS = 400
-"""Axes tried for a cylinder."""
 
 
 def fit(type: str, X: Float[np.ndarray, "n 3"]):
@@ -23,20 +21,26 @@ def fit(type: str, X: Float[np.ndarray, "n 3"]):
         return middle + centre, np.eye(3), radius
     if type == "circle":
         return _about(Vt[2], X)[:3]
-    every = (*Vt, *_hemisphere(DIRECTIONS))
+    # The axis of a cylinder has no closed form: the best of 400 directions, 7° apart, from which an
+    # adjustment converges; and of the principal axes, which long and short cylinders have.
+    every = (*Vt, *_hemisphere(400))
     axis = min(every, key=lambda n: _about(n, X)[3])
     return _about(axis, X)[:3]
 
 
-def _about(axis, X):
+def _about(
+    axis: Float[np.ndarray, "3"], X: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float, float]:
     """The circle of points projected along an axis: origin, M, radius, RMS of its distances."""
     middle, M = X.mean(0), _frame(axis)
     centre, radius, rms = _circle(((X - middle) @ M.T)[:, :2])
     return middle + M[:2].T @ centre, M, radius, rms
 
 
-def _circle(x):
+def _circle(x: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], float, float]:
     """Centre, radius of a circle or a sphere (Kåsa 1976), and the RMS of the distances from it."""
+    # |x − m|² = r² is linear in m and r² − m²: 2x·m + (r² − m²) = x². Biased for short arcs, but
+    # start values need no more.
     A = np.concatenate([2 * x, np.ones((len(x), 1))], 1)
     *centre, rest = np.linalg.lstsq(A, (x**2).sum(1), rcond=None)[0]
     centre = np.array(centre)
@@ -45,7 +49,7 @@ def _circle(x):
     return centre, radius, float(np.sqrt((away**2).mean()))
 
 
-def _frame(z):
+def _frame(z: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """A rotation whose last row is this direction."""
     x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
     x = x / np.linalg.norm(x)

@@ -6,16 +6,17 @@ the unknowns. Measurements in rows of lines exposed one after the other have the
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle import cameras
-from jaxbundle.leastsquares.declarations import Kind, Local, Observations
-from jaxbundle.leastsquares.spaces import Posed, turn_by
+from jaxbundle.leastsquares.declarations import Kind, Local, ObservationSet
+from jaxbundle.leastsquares.spaces import Change, Posed, Triple, turn_by
 from jaxbundle.network.kinds.rolling_shutter import READ_OUT, VELOCITIES, RollingShutter
-from jaxbundle.types import present
+from jaxbundle.types import Scalar, present
 
 if TYPE_CHECKING:
     from jaxbundle.network.camera_tables import CameraTable
@@ -31,7 +32,7 @@ class ImagePoint:
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, *touched):
+    def __call__(self, *touched: Any) -> Change:
         *poses, interior, ray, xy = touched
         for pose in poses:
             ray = pose.ray(ray)
@@ -44,7 +45,7 @@ class ColumnsOfImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *touched):
+    def __call__(self, *touched: Any) -> Change:
         *poses, p, ray, _ = touched
         model = cameras.get_model(self.model)
         return present(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
@@ -56,7 +57,7 @@ class LocalImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *touched):
+    def __call__(self, *touched: Any) -> Change:
         *poses, p, ray, columns, values, xy = touched
         model = cameras.get_model(self.model)
         at = model.ideal(p, *_transform_ray(poses, ray))
@@ -64,7 +65,7 @@ class LocalImagePoint:
         return x - xy[0], y - xy[1]
 
 
-def _transform_ray(poses, ray):
+def _transform_ray(poses: Sequence[Posed], ray: Triple) -> Triple:
     for pose in poses:
         ray = pose.ray(ray)
     return ray
@@ -74,8 +75,18 @@ def _transform_ray(poses, ray):
 class MovingImagePoint(ImagePoint):
     """The residuals of an image point of a moving camera with a rolling shutter."""
 
-    def __call__(self, pose, velocity, read_out, interior, point, measured):
+    def __call__(
+        self,
+        pose: Posed,
+        velocity: Change,
+        read_out: Change,
+        interior: Change,
+        point: Triple,
+        measured: tuple[tuple[Scalar, Scalar], Scalar],
+    ) -> Change:
         xy, line = measured
+        # The pose at the time of the line: the centre moves, and the camera turns by a small
+        # rotation after the ray has been turned into its frame, M(t) = exp([w·t]×)·M.
         time = read_out[0] * line
         centre = tuple(c + v * time for c, v in zip(pose.centre, velocity[:3]))
         ray = Posed(pose.rotation, centre).ray(point)
@@ -98,6 +109,8 @@ def image_points(
     only = camera == "camera"
     name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
     residual = (MovingImagePoint if moving else ImagePoint)(model, domain)
+    # A spline of hundreds of parameters: an image point depends on a few of them, and only those
+    # get derivatives and blocks (`leastsquares.equations.local`).
     formula, local = cameras.get_model(model).local, None
     if formula is not None and domain == "measured" and not moving:
         local = Local(
@@ -108,7 +121,7 @@ def image_points(
 
 def declare_image_points(
     network: "Network", tables: "tuple[CameraTable, ...]"
-) -> tuple[list[Observations], dict[str, Int[np.ndarray, " rows"]]]:
+) -> tuple[list[ObservationSet], dict[str, Int[np.ndarray, " rows"]]]:
     """A set of image points for every table of cameras, and by its name the rows of the network's
     observations that are in it."""
     images, rays = network.images, network.observations

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbundle.leastsquares.declarations import Kind, Observations
-from jaxbundle.network.kinds.base import less
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet
+from jaxbundle.network.kinds.base import computed_minus_given
 
 if TYPE_CHECKING:
     from jaxbundle.network.camera_tables import CameraTable
@@ -14,12 +14,19 @@ if TYPE_CHECKING:
 
 def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
     """Priors of the parameters of the cameras of a table."""
-    return Kind("interior orientation", less, (camera,), parameters, snooped="", invariant=True)
+    return Kind(
+        "interior orientation",
+        computed_minus_given,
+        (camera,),
+        parameters,
+        snooped="",
+        invariant=True,
+    )
 
 
 def declare_interior_orientation(
     network: "Network", tables: "tuple[CameraTable, ...]"
-) -> list[Observations]:
+) -> list[ObservationSet]:
     """A set for every table of cameras of which one has a σ, one row a camera that has."""
     found = []
     for table in tables:

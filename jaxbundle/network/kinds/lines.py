@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle import cameras
 from jaxbundle.errors import InputError
@@ -27,15 +27,14 @@ from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.datum.motions import move_pose
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Frame, PoseValue, cross
+from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, cross
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Declared, Further, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import Contribution, Further, positive_sigma, rows_of
+from jaxbundle.network.tables import Network
 from jaxbundle.network.units import from_image_unit
 
 LINE = "object line"
-LEAST_ANGLE = 1e-3
-"""Smallest angle between the planes of a line from two images, radians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +43,11 @@ class OnLine:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, pose, interior, line, xy):
+    def __call__(self, pose: Posed, interior: Change, line: Posed, xy: Change) -> Change:
         model = cameras.get_model(self.model)
+        # The plane through the projection centre and the line has the normal n = (P − X0) ×
+        # direction; a ray r in it has n·r = 0. Divided by its length across, and at the distance c,
+        # this is the distance of the image point from the image of the line.
         along = pose.rotation.apply(line.rotation.apply_inverse((0.0, 0.0, 1.0)))
         n = cross(pose.ray(line.centre), along)
         r = cameras.image_ray(model, interior, *xy)
@@ -67,7 +69,7 @@ class Edges(Further):
     TABLE, IMAGES = "edges", ("image",)
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Edges":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Edges":
         table.check_names(("line", "image", "x", "y"), ("sigma",))
         xy = np.stack([table.numbers(name, required=True) for name in "xy"], 1)
         return cls(
@@ -87,7 +89,7 @@ class Edges(Further):
             "sigma": self.sigma,
         }
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images = network.images
         image = rows_of(self.image, images)
         camera = images.camera[image]
@@ -105,7 +107,7 @@ class Edges(Further):
         lines = Table(
             LINE,
             PoseValue(centre, rotation),
-            Frame((0, 1, 3, 4)),
+            Frame((0, 1, 3, 4)),  # neither along the line nor about it, which moves no point of it
             labels=list(names),
             parameters=("shift x", "shift y", "turn x", "turn y"),
             title="line",
@@ -126,14 +128,24 @@ class Edges(Further):
                 invariant=True,
             )
             observed.append(kind((image[rows], of_camera, line[rows]), xy[rows], sigma=sigma[rows]))
-        return Declared((lines,), observed, ((LINE, move_pose),))
+        return Contribution((lines,), observed, ((LINE, move_pose),))
 
-    def _start(self, network, origin, rows, image, xy):
+    def _start(
+        self,
+        network: Network,
+        origin: Float[np.ndarray, "3"],
+        rows: Int[np.ndarray, " k"],
+        image: Int[np.ndarray, " n"],
+        xy: Float[np.ndarray, "n 2"],
+        min_angle: float = 1e-3,
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
         """The intersection of the planes of the images: a point, and a rotation whose last row is
-        the direction."""
+        the direction. `min_angle` between the planes, radians: closer ones intersect in a line
+        whose direction is mostly noise."""
         normals, through = [], []
         for i in np.unique(image[rows]):
             own = rows[image[rows] == i]
+            # Two points of the line in an image give a plane; one point only helps the adjustment.
             if len(own) < 2:
                 continue
             c = network.images.camera[i]
@@ -151,11 +163,11 @@ class Edges(Further):
             through.append(normals[-1] @ (network.images.position[i] - origin))
         n = np.array(normals).reshape(-1, 3)
         _, size, Vt = np.linalg.svd(n if len(n) else np.zeros((1, 3)))
-        if len(n) < 2 or size[1] < LEAST_ANGLE:
+        if len(n) < 2 or size[1] < min_angle:
             raise InputError(
                 f"{self.source(rows[0])}: line {self.line[rows[0]]!r} needs two points in each of "
                 "two images that do not see it in one plane"
             )
-        A = np.linalg.lstsq(n, np.array(through), rcond=LEAST_ANGLE)[0]
+        A = np.linalg.lstsq(n, np.array(through), rcond=min_angle)[0]
         y = np.cross(Vt[2], Vt[0])
         return A, np.asarray(quaternion_from_matrix(np.stack([Vt[0], y, Vt[2]])))

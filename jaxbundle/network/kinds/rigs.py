@@ -13,35 +13,45 @@ reference, several images are tied to the first by both mountings; a single one 
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Pose, PoseValue
+from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.kinds.base import Declared, Further, check_settings
+from jaxbundle.network.kinds.base import Contribution, Further, check_settings
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
 from jaxbundle.network.rules import check_unique
+from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
 SECTION, MOUNTING = "rig", "mounting"
 AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
 
 
-def mounting_misclosure(one, other, mounting_of_one, mounting_of_other, given):
+def mounting_misclosure(
+    one: Posed,
+    other: Posed,
+    mounting_of_one: Posed,
+    mounting_of_other: Posed,
+    given: Float[Array, "6"],
+) -> Float[Array, "6"]:
     """Difference of position and rotation of the reference camera derived from two cameras, in the
     frame of the first; the rotation as a vector. The reference has no mounting.
     """
     R1, R2 = mounting_of_one.rotation.matrix(), mounting_of_other.rotation.matrix()
     M1, M2 = one.rotation.matrix(), other.rotation.matrix()
-    base1, base2 = R1.T @ M1, R2.T @ M2  # of the reference camera
+    # Both cameras give the rotation of the reference camera, M_ref = Rᵀ·M, and its place. The
+    # difference is symmetric in them and needs no image of the reference at this epoch.
+    base1, base2 = R1.T @ M1, R2.T @ M2
     apart = jnp.stack(other.centre) - jnp.stack(one.centre)
     t1, t2 = jnp.stack(mounting_of_one.centre), jnp.stack(mounting_of_other.centre)
     shift = base1 @ apart - (t2 - t1)
@@ -67,7 +77,7 @@ class Rigs(Further):
     TABLE, SECTION, IMAGES = "rigs", SECTION, ("image",)
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Rigs":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Rigs":
         table.check_names(("rig", "epoch", "image"))
         check_settings(SECTION, settings, ("reference", "sigma_position", "sigma_angle"))
         for name in ("sigma_position", "sigma_angle"):
@@ -85,13 +95,13 @@ class Rigs(Further):
         return {"rig": self.rig, "epoch": self.epoch, "image": self.image}
 
     @property
-    def has_size(self) -> bool:
+    def needs_scale(self) -> bool:
         return "sigma_position" in self.settings
 
     def number_of_equations(self) -> int:
         return 6
 
-    def check(self, network) -> None:
+    def check(self, network: Network) -> None:
         super().check(network)
         check_unique(self.image, self.source, "image")
         images = network.images
@@ -104,15 +114,17 @@ class Rigs(Further):
                     f"rig {key[0]!r}; the other is in {self.source(seen[key])}"
                 )
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, radians = network.images, ANGLE_UNITS[network.angle_unit]
         row = {id: i for i, id in enumerate(images.id)}
         M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
         labels, places, turns, held, pairs = [], [], [], [], []
         for rig in dict.fromkeys(self.rig):
             epochs = self._epochs(rig, row, images.camera)
-            reference = self._reference(rig, epochs, network)
+            reference = self._reference(epochs, network)
             first = len(labels)
+            # The reference first; its mounting is the identity and held, so that all others are
+            # relative to it.
             cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
             at = {c: first + k for k, c in enumerate(cameras)}
             for c in cameras:
@@ -136,6 +148,8 @@ class Rigs(Further):
             AXES,
             "mounting of",
         )
+        # Exact: a thousandth of what image points give, as a length and as an angle at the median
+        # distance, so that the normal equations stay well conditioned.
         across = across_rays(network)
         length = self.settings.get("sigma_position", EXACT_SIGMA * across)
         depth = np.median(
@@ -148,9 +162,11 @@ class Rigs(Further):
         angle = self.settings.get("sigma_angle", EXACT_SIGMA * across / depth / radians) * radians
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
         seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
-        return Declared((mounting,), (seen,), ((MOUNTING, _move_mounting),))
+        return Contribution((mounting,), (seen,), ((MOUNTING, _move_mounting),))
 
-    def _epochs(self, rig, row, camera):
+    def _epochs(
+        self, rig: str, row: Mapping[str, int], camera: Int[np.ndarray, " images"]
+    ) -> list[dict[int, int]]:
         """By epoch, camera → image."""
         epochs: dict[str, dict[int, int]] = {}
         for name, epoch, id in zip(self.rig, self.epoch, self.image):
@@ -158,7 +174,7 @@ class Rigs(Further):
                 epochs.setdefault(epoch, {})[int(camera[row[id]])] = row[id]
         return [epoch for epoch in epochs.values() if len(epoch) > 1]
 
-    def _reference(self, rig, epochs, network) -> int:
+    def _reference(self, epochs: Sequence[Mapping[int, int]], network: Network) -> int:
         ids = [camera.id for camera in network.cameras]
         cameras = Counter(c for epoch in epochs for c in epoch)
         named = self.settings.get("reference")
@@ -169,7 +185,13 @@ class Rigs(Further):
         return max(sorted(cameras), key=cameras.__getitem__, default=0)
 
 
-def _mounting(epochs, reference, camera, position, M):
+def _mounting(
+    epochs: Sequence[Mapping[int, int]],
+    reference: int,
+    camera: int,
+    position: Float[np.ndarray, "images 3"],
+    M: Float[np.ndarray, "images 3 3"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Start values: those of the epoch with the median position."""
     found = [
         (
@@ -181,11 +203,13 @@ def _mounting(epochs, reference, camera, position, M):
     ]
     if camera == reference or not found:
         return np.zeros(3), np.eye(3)
+    # Of a whole epoch, not a mean of all: position and rotation of one epoch belong together, and a
+    # mean of rotations from poor start values is none of them.
     t = np.array([t for t, _ in found])
     k = np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()
     return found[k]
 
 
-def _move_mounting(motion, value: PoseValue) -> PoseValue:
+def _move_mounting(motion: Float[Array, "7"], value: PoseValue) -> PoseValue:
     """Only the scale of object space affects it."""
     return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)

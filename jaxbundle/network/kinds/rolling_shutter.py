@@ -27,24 +27,25 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.arguments import positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from_matrix
-from jaxbundle.leastsquares.declarations import Kind, Table
-from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
+from jaxbundle.leastsquares.spaces import Posed, Vector
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import (
-    Declared,
+    Contribution,
     Further,
     Parameters,
     check_settings,
-    less,
+    computed_minus_given,
     positive_sigma,
     rows_of,
 )
 from jaxbundle.network.rules import check_unique
+from jaxbundle.network.tables import Network
 from jaxbundle.network.units import to_image_unit
 
 VELOCITY = ("vX", "vY", "vZ", "wx", "wy", "wz")
@@ -67,12 +68,14 @@ class RollingShutter(Further):
     TABLE, SECTION, IMAGES = "velocities", SECTION, ("image",)
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "RollingShutter":
+    def from_columns(
+        cls, table: Columns, settings: Mapping[str, Any], radians: float
+    ) -> "RollingShutter":
         sigmas = tuple(f"s{name}" for name in VELOCITY)
         table.check_names(("image",), (*VELOCITY, *sigmas, "t", "strip"))
         check_settings(SECTION, settings, ("line_time", "free", "sigma", "neighbours"))
         _check_neighbours(settings.get("neighbours", {}), table)
-        Parameters.of(SECTION, settings, FREE)
+        Parameters.from_settings(SECTION, settings, FREE)
         if "line_time" not in settings:
             raise InputError(f"[{SECTION}]: line_time is missing, seconds from a line to the next")
         sigma = [positive_sigma(table, name, required=False) for name in sigmas]
@@ -96,7 +99,7 @@ class RollingShutter(Further):
     def number_of_equations(self) -> int:
         return 0
 
-    def check(self, network) -> None:
+    def check(self, network: Network) -> None:
         super().check(network)
         check_unique(self.image, self.source, "image")
         given, ids = self.settings["line_time"], [camera.id for camera in network.cameras]
@@ -106,19 +109,20 @@ class RollingShutter(Further):
                     f"[{SECTION}]: line_time names no camera {id!r}{did_you_mean(id, ids)}"
                 )
 
-    def line_times(self, network) -> Float[np.ndarray, " cameras"]:
+    def line_times(self, network: Network) -> Float[np.ndarray, " cameras"]:
         """Seconds per line of every camera, 0 for a global shutter."""
         given = self.settings["line_time"]
         ids = [camera.id for camera in network.cameras]
-        by_camera = given if isinstance(given, Mapping) else dict.fromkeys(ids, given)
+        by_camera = given if isinstance(given, Mapping) else {id: given for id in ids}
         for value in by_camera.values():
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise InputError(f"[{SECTION}]: line_time is {show(value)}; a number is expected")
         return np.array([float(by_camera.get(id, 0.0)) for id in ids])
 
-    def lines(self, network) -> Float[np.ndarray, " rays"]:
+    def lines(self, network: Network) -> Float[np.ndarray, " rays"]:
         """The line of every image point relative to the middle one."""
         rays, of = network.observations, network.images.camera[network.observations.image]
+        # Relative to the middle line, so that the pose of an image is that of its middle exposure.
         moving = self.line_times(network)[of] != 0
         lines = np.zeros(len(rays))
         for c in np.unique(of[moving]):
@@ -132,14 +136,16 @@ class RollingShutter(Further):
             lines[own] = uv[:, 1] - (camera.image_size[1] - 1) / 2
         return lines
 
-    def declare(self, network, origin) -> Declared:
-        images, parameters = network.images, Parameters.of(SECTION, self.settings, FREE)
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
+        images, parameters = network.images, Parameters.from_settings(SECTION, self.settings, FREE)
         times = self.line_times(network)
         velocity, sigma = np.zeros((len(images), 6)), np.full((len(images), 6), np.nan)
         given = rows_of(self.image, images)
         velocity[given], sigma[given] = self.velocity, self.sigma
         common = np.array([parameters.sigma.get(name, np.inf) for name in VELOCITY])
         sigma = np.where(np.isnan(sigma), common, sigma)
+        # A camera with a global shutter is in the same tables with a read-out of 0: held, it has no
+        # unknowns, and all image points have one formula.
         free = parameters.mask(VELOCITY) & (times != 0)[images.camera][:, None]
         moves = Table(
             VELOCITIES, velocity, Vector(6), free, images.id, VELOCITY, "velocity of image"
@@ -160,14 +166,17 @@ class RollingShutter(Further):
             sigma = np.where(free > 0, sigma, np.inf)[weighted]
             priors.append(PRIOR((weighted,), velocity[weighted], sigma=sigma))
         priors += self._from_neighbours(network, free)
-        return Declared((moves, read_out), priors, ((VELOCITIES, _move_velocity),))
+        return Contribution((moves, read_out), priors, ((VELOCITIES, _move_velocity),))
 
-    def _from_neighbours(self, network, free):
+    def _from_neighbours(
+        self, network: Network, free: Bool[np.ndarray, "images 6"]
+    ) -> list[ObservationSet]:
         """Velocities between the preceding and following images, as observations."""
         given = self.settings.get("neighbours", {})
         sigma = np.repeat([given.get("v", np.inf), given.get("w", np.inf)], 3)
         image, rows = rows_of(self.image, network.images), []
         camera = network.images.camera[image]
+        # Within a strip of one camera: between strips the platform turns.
         for one in sorted({*zip(camera.tolist(), self.strip)} if given else ()):
             own = np.array([pair == one for pair in zip(camera.tolist(), self.strip)])
             order = np.flatnonzero(own)[np.argsort(self.time[own], kind="stable")]
@@ -177,6 +186,7 @@ class RollingShutter(Further):
         if not rows:
             return []
         this, before, after = np.concatenate(rows, 1)
+        # Equal times (bursts written to the second) give no velocity.
         moves = free[image[this]].any(1) & (self.time[after] > self.time[before])
         this, before, after = this[moves], before[moves], after[moves]
         sigma = np.where(free[image[this]] > 0, sigma, np.inf)
@@ -184,7 +194,9 @@ class RollingShutter(Further):
         return [NEIGHBOURS((image[this], image[before], image[after]), time, sigma=sigma)]
 
 
-def between_neighbours(velocity, before, after, time):
+def between_neighbours(
+    velocity: Float[Array, "6"], before: Posed, after: Posed, time: Float[Array, ""]
+) -> Float[Array, "6"]:
     """A velocity minus that from the preceding to the following pose."""
     shift = jnp.stack([b - a for a, b in zip(before.centre, after.centre)])
     turn = rotation_vector_from_matrix(after.rotation.matrix() @ before.rotation.matrix().T)
@@ -214,10 +226,10 @@ NEIGHBOURS = Kind(
     VELOCITY,
     snooped="",
 )
-PRIOR = Kind("velocities", less, (VELOCITIES,), VELOCITY, snooped="")
+PRIOR = Kind("velocities", computed_minus_given, (VELOCITIES,), VELOCITY, snooped="")
 
 
-def _move_velocity(motion, value):
+def _move_velocity(motion: Float[Array, "7"], value: Float[Array, "6"]) -> Float[Array, "6"]:
     """Velocities in object space rotate and scale with it; those in the camera frame do not."""
     V = jnp.exp(motion[6]) * matrix_from_rotation_vector(motion[3:6]) @ value[:3]
     return jnp.concatenate([V, value[3:]])

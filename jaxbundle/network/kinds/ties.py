@@ -13,19 +13,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxbundle.cameras import get_model, image_ray, project
+from jaxbundle.cameras import CameraModel, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.spaces import Change
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Declared, Further
+from jaxbundle.network.kinds.base import Contribution, Further
 from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_or_exact
+from jaxbundle.network.tables import Network
 from jaxbundle.system.programs import compile_once
-
-SAMPLED_RAYS = 256
-"""Number of rays used for the effect of a parameter on image points."""
+from jaxbundle.types import AnyArray, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SameParameter:
     one: int
     other: int
 
-    def __call__(self, a, b, given):
+    def __call__(self, a: Change, b: Change, given: Scalar) -> Scalar:
         return b[self.other] - a[self.one] - given
 
 
@@ -51,7 +51,7 @@ class Ties(Further):
     TABLE = "ties"
 
     @classmethod
-    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Ties":
+    def from_columns(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Ties":
         table.check_names(("camera", "other", "parameter"), ("sigma",))
         return cls(
             camera=table.ids("camera"),
@@ -73,11 +73,11 @@ class Ties(Further):
     def __len__(self) -> int:
         return len(self.camera)
 
-    def _present(self, network) -> Bool[np.ndarray, " n"]:
+    def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
         known = {camera.id for camera in network.cameras}
         return np.array([{*ids} <= known for ids in zip(self.camera, self.other)], bool)
 
-    def check(self, network) -> None:
+    def check(self, network: Network) -> None:
         cameras = {camera.id: camera for camera in network.cameras}
         for row, (*ids, name) in enumerate(zip(self.camera, self.other, self.parameter)):
             for id in ids:
@@ -105,7 +105,7 @@ class Ties(Further):
                     "there is nothing to tie"
                 )
 
-    def declare(self, network, origin) -> Declared:
+    def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         index = {camera.id: c for c, camera in enumerate(network.cameras)}
         place = {
             int(c): (t, k) for t in camera_tables(network.cameras) for k, c in enumerate(t.cameras)
@@ -116,10 +116,13 @@ class Ties(Further):
             (one, k), (other, m) = place[index[a]], place[index[b]]
             residual = SameParameter(one.parameters.index(name), other.parameters.index(name))
             sets.setdefault((one.name, other.name, name, residual), []).append((k, m, sigma[row]))
-        return Declared(
+        kind = lambda one, other, name, residual: Kind(
+            "same parameters", residual, (one, other), (name,), snooped="", invariant=True
+        )
+        return Contribution(
             (),
             tuple(
-                _kind(one, other, name, residual)(
+                kind(one, other, name, residual)(
                     (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
                     np.zeros(len(rows)),
                     sigma=np.array([r[2] for r in rows]),
@@ -128,7 +131,7 @@ class Ties(Further):
             ),
         )
 
-    def _from_rays(self, network, index) -> Float[np.ndarray, " n"]:
+    def _from_rays(self, network: Network, index: Mapping[str, int]) -> Float[np.ndarray, " n"]:
         """σ of the parameters from the rays of their cameras, all else given; the smaller of the
         two."""
         used = {index[id] for id in (*self.camera, *self.other)}
@@ -141,29 +144,31 @@ class Ties(Further):
         )
 
 
-def _kind(one: str, other: str, name: str, residual: SameParameter) -> Kind:
-    return Kind("same parameters", residual, (one, other), (name,), snooped="", invariant=True)
-
-
-def parameter_sigmas(network, c: int) -> dict[str, float]:
+def parameter_sigmas(network: Network, c: int) -> dict[str, float]:
     """By parameter of a camera, its σ from all its image points, all else given."""
     camera, rays = network.cameras[c], network.observations
     model = get_model(camera.model)
     own = np.flatnonzero(network.images.camera[rays.image] == c)
-    sample = own[np.linspace(0, len(own) - 1, SAMPLED_RAYS).astype(int)]
+    # A mean over the image, for a σ that only has to have the right size: 256 rays, evenly chosen,
+    # give it to 1/√256 of its scatter.
+    rays_of_sample = 256
+    sample = own[np.linspace(0, len(own) - 1, rays_of_sample).astype(int)]
+    # σ of one parameter with all else given: 1/√(Σ(∂x/∂p)²/σ²), the scale of an exact condition.
     slope = np.asarray(_slopes(model, np.array(start_of(camera)), rays.xy[sample]))
     weight = np.nan_to_num(slope / rays.sigma[sample, :, None])
-    information = (weight**2).sum((0, 1)) * len(own) / SAMPLED_RAYS
+    information = (weight**2).sum((0, 1)) * len(own) / rays_of_sample
     sigma = 1 / np.sqrt(np.maximum(information, np.finfo(float).tiny))
     return dict(zip(model.parameters, sigma.tolist()))
 
 
 @partial(compile_once, static=0)
-def _slopes(model, p, xy):
+def _slopes(
+    model: CameraModel, p: Float[AnyArray, " parameters"], xy: Float[AnyArray, "n 2"]
+) -> Float[Array, "n 2 parameters"]:
     """∂(x, y)/∂p of the rays of image points [n, 2, parameters]."""
 
-    def one(xy):
+    def slope(xy: Float[AnyArray, "2"]):
         ray = image_ray(model, tuple(p), xy[0], xy[1])
         return jax.jacfwd(lambda p: jnp.stack(project(model, tuple(p), *ray)))(p)
 
-    return jax.vmap(one)(xy)
+    return jax.vmap(slope)(xy)

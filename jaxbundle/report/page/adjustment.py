@@ -17,7 +17,7 @@ from jaxbundle.report.summary import summary
 from jaxbundle.report.verdict import Finding, Verdict, conclude
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 SIGMA_NOTE = (
     "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "

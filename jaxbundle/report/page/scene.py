@@ -19,7 +19,7 @@ from jaxbundle.report.layout import clean
 from jaxbundle.report.page.columns import encode_values
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def describe_network(adjustment: "Adjustment") -> dict[str, Any]:

@@ -19,7 +19,7 @@ from jaxbundle.report.page.markup import figure, grid, items, paragraph
 from jaxbundle.report.unknowns import validity
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 
 def collect(adjustment: "Adjustment") -> Iterator[Section]:

@@ -12,7 +12,7 @@ from jaxbundle.report.page.columns import Column, estimates, numbers
 from jaxbundle.report.page.document import Listing
 
 if TYPE_CHECKING:
-    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.adjustment.result import Adjustment
 
 MAX_OBSERVATIONS = 500_000
 """Largest number of embedded observations: a page with a million takes too long to open."""
@@ -175,7 +175,7 @@ def measured_coordinates(adjustment: "Adjustment") -> np.ndarray:
     problem, kind = adjustment.problem, adjustment.residuals["kind"]
     # the table has rows of other kinds, too
     measured = np.full(len(kind), np.nan)
-    used = problem.image_weights > 0
+    used = problem.used_coordinates
     measured[kind == "image"] = problem.image_coordinates()[used]
     return measured
 

@@ -1,0 +1,594 @@
+"""`adjust`: from a network to an `Adjustment`."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.adjustment.exclusions import (
+    Undetermined,
+    carry,
+    find_undetermined,
+    may_be_undetermined,
+    take_back,
+)
+from jaxbundle.adjustment.far_points import (
+    join_legs,
+    minimise_at_any_distance,
+    minimise_with_infinity,
+    noise_of_rays,
+)
+from jaxbundle.adjustment.minimum import (
+    adjusted_cameras,
+    inspect_solution,
+    is_misjudged,
+    name_inseparable,
+    names_of_defects,
+    start_with,
+    weakness_without_solution,
+)
+from jaxbundle.adjustment.mirror_image import name_mirrored, name_other_side
+from jaxbundle.adjustment.orient import orient, orient_again, screen
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
+from jaxbundle.adjustment.quality.blunder_names import name_suspect
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.misfit import contradicts, doubt_of_robust
+from jaxbundle.adjustment.readjust import (
+    Minimise,
+    adjust_robustly,
+    eliminate_parameters,
+    snoop_network,
+    with_components,
+)
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
+from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.declarations import ObservationSet, Table
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.search import SEARCHES
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.iterations.stopping import converged
+from jaxbundle.leastsquares.problem import with_factor
+from jaxbundle.leastsquares.quality.snooping import check_test
+from jaxbundle.leastsquares.solution import find_minimum
+from jaxbundle.network.check import check_network
+from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.sightings import split_check_points
+from jaxbundle.network.tables import UNIT, Network, Observations, Points, require_network
+from jaxbundle.network.unit_mistakes import (
+    name_lengths,
+    name_pixels,
+    name_sigma_unit,
+    name_unit_of_positions,
+)
+from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
+from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
+from jaxbundle.orientation.one_place import name_one_place
+from jaxbundle.types import AnyArray, Progress, present
+
+UNNAMED = ("a combination of unknowns that spreads over many of them",)
+"""Name of the undetermined if no single unknown dominates."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RoundSettings:
+    """When the rounds of an adjustment look for causes, exclude and bring back.
+
+    - `max_sigma0`: σ0 above which the fit is called bad, and the largest by which the a priori σ
+      of rays are multiplied where points are judged: what is beyond comes from blunders, a wrong
+      camera, unit or axis, not from the rays. Smaller: causes are named for networks that only
+      have optimistic σ; larger: a mirrored image of a nearly plane object, which fits almost as
+      well, is not looked for.
+    - `max_ray_misfit`: radians, RMS; takes the place of `max_sigma0` where σ are only units of
+      weight: a pixel of cameras with 1000 pixels in the principal distance. A search that finds
+      nothing costs time only.
+    - `max_start_misfit`: radians, RMS of the residuals of the start values: no start values in the
+      right convention predict image points so badly that an adjustment from them settles by
+      itself. 0.1 is 6°. Smaller: rough start values are suspected of another convention; larger:
+      a mirrored network that settles is not named.
+    - `evaluations_before_look`: evaluations before points that rays may not determine are looked
+      for: the images are then nearly where they end. More: such points drift away meanwhile and
+      slow the iterations; fewer: images that still move make points look weak that are not.
+    - `max_retries`: repeated adjustments with what start values excluded. Each brings back what
+      agrees with a better orientation, most of it the first; what is left after five is said in a
+      warning.
+    """
+
+    max_sigma0: float = 5.0
+    max_ray_misfit: float = 1e-3
+    max_start_misfit: float = 0.1
+    evaluations_before_look: int = 6
+    max_retries: int = 5
+
+
+ROUNDS = RoundSettings()
+
+
+def adjust(
+    network: Network,
+    *,
+    also: Sequence[Table | ObservationSet] = (),
+    method: str = "levenberg-marquardt",
+    reduction: str | None = None,
+    max_iterations: int = 100,
+    robust: str | None = None,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    doubtful: Iterable[tuple[str, str]] = (),
+    eliminate: bool = False,
+    critical_t: float = 2.0,
+    estimate_components: bool = False,
+    progress: Progress | None = None,
+) -> Adjustment:
+    """Adjust a network by least squares, with self-calibration of all free parameters.
+
+    **Arguments:**
+
+    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`.
+      Missing start values are computed first (`jaxbundle.orient`).
+    - `also`: observations of further kinds (`jaxbundle.leastsquares.Kind`), and tables of their
+      unknowns. They touch the network's tables "image", "camera" and "point" by id, receive object
+      coordinates unchanged, and have their own variance group, redundancy numbers and residuals
+      (docs/engine.md).
+    - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
+    - `reduction`: solver of the reduced system of images and cameras: `"dense"`, `"banded"` or
+      `"iterative"`; by default chosen by size and fill.
+    - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly are downweighted by
+      the a posteriori scale of the residuals (`leastsquares.quality.robust.robust_scale`, a MAD).
+      The result uses the last weights; its σ are a few per cent too small.
+    - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: for `"pope"`
+      the probability of removing anything from a network without blunders, for `"baarda"` that of
+      removing a single observation; also the probability that `robust` suspects anything. If
+      blunders prevent an initial solution, image points that grossly contradict the start values
+      are removed first (also with `robust`).
+    - `doubtful`: (image, point) by id of image points initially removed from data snooping; those
+      that pass its test are restored.
+    - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
+      first, adjusting again each time.
+    - `estimate_components`: scale the σ of each group of observations until its variance component
+      is 1; the factors are `Adjustment.sigma_factors`.
+    - `progress(stage, done, total)`: called for every evaluation, with vᵀPv and the damping in
+      the stage; up to 200 000 observations at the end of the iterations (`jaxbundle.show_progress`
+      shows bars).
+
+    **Returns:** an `Adjustment`; check `converged` first.
+
+    **Raises:** `InputError` if the network cannot be adjusted; `NotSolvedError` if it is not
+    determined, initially or after data snooping, elimination or variance components.
+    """
+    check_options(
+        method=method,
+        reduction=reduction,
+        max_iterations=max_iterations,
+        robust=robust,
+        snooping=snooping,
+        significance=significance,
+        eliminate=eliminate,
+        critical_t=critical_t,
+        estimate_components=estimate_components,
+        progress=progress,
+    )
+    given = without_placeholders(require_network(network))
+    options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
+    try_again = partial(_try_mirrored, reduction, options)
+    mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, _largest_sigma0(given))
+    oriented = None
+    if lacks_start_values(given):
+        try:
+            oriented = _place(orient(given))
+        except NotSolvedError as error:
+            if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
+                raise NotSolvedError(
+                    f"no start values found: {mirrored}", [*error.undetermined]
+                ) from None
+            raise
+    told = (
+        options
+        if progress is None
+        else options | {"progress": partial(_tell, progress, max_iterations)}
+    )
+    first = _FirstMinimum(reduction, also, oriented, told)
+    problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
+    again = partial(minimise_with_infinity, **told)
+    # The statistics need the factor of the normal matrix even where the iterations did without.
+    found = _AdjustmentState(
+        problem.network, with_factor(problem), minimum, method, problem.reduction
+    )
+    if robust:
+        found.weight_robustly(again, robust, significance)
+    if found.inspection:
+        if snooping:
+            found.remove_blunders(again, snooping, significance, doubtful)
+        if estimate_components:
+            found.estimate_components(again)
+        if eliminate:
+            found.eliminate_parameters(again, critical_t)
+    result = found.adjustment(check)
+    sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
+    if found.inspection:
+        result = result.with_changes(
+            findings=(*result.findings, *_compare_with_start(given, result))
+        )
+    misfit = sigma0 is None or sigma0 > _largest_sigma0(given)
+    # The causes named so far are guesses from the start values, which fit a mirrored network as
+    # well as a true one: only adjusting the mirror image shows it. It costs a second adjustment,
+    # so it is tried last, and only when nothing simpler explains the misfit.
+    if misfit and not also and not _name_conventions(problem, minimum, found.inspection):
+        if mirrored := mirror(sigma0):
+            result = result.with_changes(findings=(mirrored,))
+    return result
+
+
+def _compare_with_start(given: Network, result: Adjustment) -> tuple[str, ...]:
+    """What start values of images show about units and axes of a solution, in words."""
+    images = result.problem.network.images
+    known = np.isfinite(given.images.position).all(1) & np.isnan(given.images.sigma).all(1)
+    free = {given.images.id[k] for k in np.flatnonzero(known)}
+    found = {id: X for id, X in zip(images.id, result.image_values[:, :3]) if id in free}
+    return tuple(
+        filter(None, (name_unit_of_positions(given, found), name_other_side(given, found)))
+    )
+
+
+def _try_mirrored(
+    reduction: str | None, options: Mapping[str, Any], network: Network
+) -> float | None:
+    """σ0 of a network from computed start values; None without a solution."""
+    problem, minimum, _ = _FirstMinimum(reduction, (), _place(orient(network)), options).find(
+        network, outliers=False
+    )
+    solved = inspect_solution(with_factor(problem), minimum)
+    return _sigma0(problem, minimum) if solved else None
+
+
+@dataclasses.dataclass(frozen=True)
+class _FirstMinimum:
+    """How the first minimum is found; `oriented`: computed start values, if they were needed."""
+
+    reduction: str | None
+    also: Sequence[Table | ObservationSet]
+    oriented: Oriented | None
+    options: Mapping[str, Any]
+    settings: RoundSettings = ROUNDS
+
+    def find(self, given: Network, outliers: bool) -> tuple[NetworkProblem, Minimum, tuple]:
+        """Adjust from the start values of `given`, which may contain `outliers`, or those computed
+        for it: the problem, where its iterations ended, check points and their image points."""
+        network = given if self.oriented is None else self.oriented.network
+        found = self._minimise(network)
+        # Observations excluded because of a wrong principal distance may agree with the adjusted
+        # one: start values are computed again with it, as long as that uses more of them.
+        while len(network.observations) < len(given.observations) and is_misjudged(*found[:2]):
+            cameras, fewer = adjusted_cameras(found[0], found[1].values), network
+            network = orient_again(given, fewer, cameras)
+            if network is fewer:
+                break
+            found = self._minimise(network, partial(start_with, cameras=cameras))
+        # Blunders may keep the iterations from a solution that snooping could start from: those
+        # that contradict the start values by far are removed first.
+        if outliers and not inspect_solution(with_factor(found[0]), found[1]):
+            screened = screen(network)
+            if len(screened.observations) < len(network.observations):
+                found, network = self._minimise(screened), screened
+        left_out = network is not given and network.left_out[len(given.left_out) :]
+        return self._try_again(given, found) if left_out or found[3] else found[:3]
+
+    def _try_again(
+        self, given: Network, found: tuple[NetworkProblem, Minimum, tuple, Undetermined, Network]
+    ) -> tuple[NetworkProblem, Minimum, tuple]:
+        """Adjust again, with everything left out because of start values that agrees with the
+        adjusted orientation, until nothing more does."""
+        if self.oriented is not None:
+            given = given.note(f"start values found, {self.oriented.frame}")
+            given = given.warn(*filter(None, [self.oriented.finding]))
+        # Excluded because of start values is not excluded for good: a point that misses by three
+        # tolerances of a rough orientation may fit the adjusted one to its σ. What rays do not
+        # determine (`final`) stays out, or it would return and leave in every round.
+        rounds, final = 0, Undetermined()
+        while inspect_solution(with_factor(found[0]), found[1]):
+            problem, minimum, check, gone, current = found
+            # In the first round they may only be weak because others were still missing.
+            if rounds:
+                final += gone
+            part, factor = final.leave_out(given), _noise_factor(problem, minimum)
+            try:
+                whole = take_back(part, current, problem, minimum.values, factor)
+                whole = check_network(whole)
+                gained = len(whole.observations) - len(current.observations)
+                if gained <= 0 or rounds == self.settings.max_retries:
+                    if gained > 0:
+                        whole = whole.warn(
+                            f"{count(gained, 'image point')} left out because of start values "
+                            f"would still come back after {rounds} repeated adjustments"
+                        )
+                    network = problem.network.replace(
+                        warnings=whole.warnings, notes=whole.notes, left_out=whole.left_out
+                    )
+                    return dataclasses.replace(problem, network=network), minimum, check
+                carried = partial(carry, before=problem, values=minimum.values)
+                again = self._minimise(whole, carried, look=False)
+                solved = inspect_solution(with_factor(again[0]), again[1])
+            except (InputError, NotSolvedError):
+                solved = None
+            if not solved:
+                network = problem.network.warn(
+                    "what start values excluded was tried again with the adjusted orientation, "
+                    "but with it there is no solution"
+                )
+                return dataclasses.replace(problem, network=network), minimum, check
+            found, rounds = again, rounds + 1
+        return found[:3]
+
+    def _minimise(
+        self,
+        network: Network,
+        begin: Callable[[NetworkProblem], Values] | None = None,
+        look: bool = True,
+    ) -> tuple[NetworkProblem, Minimum, tuple, Undetermined, Network]:
+        """The minimum of a network without what its rays do not determine, the check points, what
+        was left out, and the network with its check points; `look`: also before the minimum."""
+        # Three looks at what rays do not determine: at the start values (cheap, but they may be
+        # poor), after a few evaluations (before such points slow the iterations down), and at the
+        # minimum. Each exclusion begins again from where the last iterations ended.
+        gone, factor = Undetermined(), None
+        while True:
+            current = check_network(gone.leave_out(network))
+            used, *check = split_check_points(current)
+            make = partial(make_problem, used, reduction=self.reduction, also=self.also)
+            try:
+                problem = make()
+            except InputError as error:
+                # Without the control points that were excluded the datum may be open; `orient`
+                # has said why they were.
+                finding = "" if self.oriented is None else self.oriented.finding
+                raise InputError(f"{error} {finding}".strip()) from None
+            start = problem.data.start if begin is None else begin(problem)
+            legs, left = [], self.options["max_steps"]
+            find = partial(self._find_more, network, gone)
+            more = find(problem, start, factor) if look else Undetermined()
+            if not more and look and may_be_undetermined(problem, start):
+                options = {
+                    **self.options,
+                    "max_steps": min(self.settings.evaluations_before_look, left),
+                }
+                legs, look = [find_minimum(problem, start, **options)], False
+                left -= int(legs[0].iterations)
+                factor, start = _noise_factor(problem, legs[0]), legs[0].values
+                more = find(problem, start, factor)
+                begin = partial(carry, before=problem, values=start)
+            if not more:
+                found = problem
+                if left > 0:
+                    options = {**self.options, "max_steps": left}
+                    found, last = minimise_at_any_distance(problem, start, make, **options)
+                    legs.append(last)
+                minimum = join_legs(legs)
+                factor = _noise_factor(found, minimum)
+                more = find(found, minimum.values, factor)
+                begin = partial(carry, before=found, values=minimum.values)
+                if not more:
+                    return found, minimum, tuple(check), gone, current
+            gone += more
+
+    @staticmethod
+    def _find_more(network: Network, gone: Undetermined, *where: Any) -> Undetermined:
+        more = find_undetermined(*where)
+        return more if (gone + more).spares_most_of(network) else Undetermined()
+
+
+@dataclasses.dataclass
+class _AdjustmentState:
+    """State of an adjustment; each step changes it."""
+
+    network: Network
+    problem: NetworkProblem
+    minimum: Minimum
+    method: str
+    reduction: str
+    said: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Arguments of the `Adjustment`."""
+    inspected: tuple[NetworkProblem, Minimum, Inspection | None] | None = None
+
+    @property
+    def inspection(self) -> Inspection | None:
+        """The solution, if there is one; evaluated once until a step changes it."""
+        seen = self.inspected
+        if seen is None or seen[0] is not self.problem or seen[1] is not self.minimum:
+            seen = self.problem, self.minimum, inspect_solution(self.problem, self.minimum)
+            self.inspected = seen
+        return seen[2]
+
+    def weight_robustly(self, again: Minimise, robust: str, significance: float) -> None:
+        found, self.minimum = adjust_robustly(self.problem, self.minimum, again, robust)
+        suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
+        self.problem = cast(NetworkProblem, found.found.problem)
+        doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
+        self.said |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
+        self.said["doubts"] = (doubt,) if doubt else ()
+
+    def remove_blunders(
+        self, again: Minimise, test: str, significance: float, doubtful: Iterable[tuple[str, str]]
+    ) -> None:
+        self.problem, self.minimum, removed, doubt = snoop_network(
+            present(self.inspection), self.minimum, again, test, significance, doubtful
+        )
+        self.said |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
+
+    def estimate_components(self, again: Minimise) -> None:
+        self.problem, self.minimum, factors = with_components(self.problem, self.minimum, again)
+        self.said["sigma_factors"] = factors
+
+    def eliminate_parameters(self, again: Minimise, critical_t: float) -> None:
+        self.problem, self.minimum, names = eliminate_parameters(
+            self.problem, self.minimum, again, critical_t
+        )
+        self.said["eliminated"] = tuple(names)
+
+    def adjustment(self, check: tuple[Points, Observations]) -> Adjustment:
+        """The result, or the reason why there is none."""
+        problem, minimum, inspection = self.problem, self.minimum, self.inspection
+        names = () if inspection else names_of_defects(problem, minimum)
+        if not inspection and converged(int(minimum.termination)):
+            names = names or UNNAMED
+        unnamed = not inspection and not names
+        return Adjustment(
+            self.network,
+            problem,
+            minimum,
+            undetermined=tuple(names),
+            check=check if len(check[0]) else None,
+            method=self.method,
+            reduction=self.reduction,
+            inspection=inspection,
+            weakness=weakness_without_solution(problem, minimum) if unnamed else None,
+            findings=_likely_causes(problem, minimum, inspection),
+            **self.said,
+        )
+
+
+def _tell(
+    progress: Progress,
+    total: int,
+    step: Int[AnyArray, ""],
+    cost: Float[AnyArray, ""],
+    damping: Float[AnyArray, ""],
+) -> None:
+    """An evaluation as `progress(stage, done, total)`."""
+    stage = f"adjusting: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}"
+    progress(stage, int(step), total)
+
+
+def check_options(
+    *,
+    method: str = "levenberg-marquardt",
+    reduction: str | None = None,
+    max_iterations: int = 100,
+    robust: str | None = None,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    eliminate: bool = False,
+    critical_t: float = 2.0,
+    estimate_components: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Refuse invalid options of `adjust`.
+
+    **Raises:** `InputError`, naming the option and what is expected."""
+    one_of("method", method, METHODS)
+    one_of("reduction", reduction, REDUCTIONS, none=True)
+    integer("max_iterations", max_iterations)
+    one_of("robust", robust, ESTIMATORS, none=True)
+    check_test(snooping, significance)
+    if robust and snooping:
+        raise InputError("robust estimation or data snooping, not both at once")
+    truth("eliminate", eliminate)
+    at_least_zero("critical_t", critical_t)
+    truth("estimate_components", estimate_components)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function, but is {show(progress)}")
+
+
+def _likely_causes(
+    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
+) -> tuple[str, ...]:
+    """Likely causes of a missing solution or a bad fit, in words."""
+    network = problem.network
+    tried = int(minimum.iterations)
+    accepted = np.asarray(minimum.history.accepted)[:tried]
+    vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
+    largest = _largest_sigma0(network)
+    if inspection and not (vtpv > largest**2 * problem.counts.redundancy).any():
+        # A good fit may still be wrong: settled far from its start it may be a mirror image, and
+        # σ in a larger unit fit everything.
+        start = np.sqrt(
+            2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
+        )
+        far = start * noise_of_rays(problem.network) > ROUNDS.max_start_misfit
+        sigma0 = _sigma0(problem, minimum)
+        poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
+        causes = (
+            name_image_convention(network) if far else "",
+            name_image_extent(network) if poor else "",
+            name_sigma_unit(network, sigma0),
+        )
+        return tuple(filter(None, causes))
+    told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
+    conventions = _name_conventions(problem, minimum, inspection)
+    causes = (
+        *conventions,
+        # Control fits no mirrored image, and its points would be blamed for it: conventions
+        # first.
+        "" if told or conventions else name_contradiction(network),
+        "" if inspection else name_one_place(network),
+        "" if inspection else name_inseparable(problem, minimum),
+    )
+    return tuple(filter(None, causes))
+
+
+def _name_conventions(
+    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
+) -> tuple[str, ...]:
+    """Units and conventions in which a badly fitting network would fit, in words."""
+    network = problem.network
+    causes = (
+        name_pixels(network),
+        name_angle_unit(network),
+        *name_lengths(network),
+        name_image_convention(network),
+        name_image_extent(network),
+        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
+    )
+    return tuple(filter(None, causes))
+
+
+def _largest_sigma0(network: Network) -> float:
+    """The largest σ0 of a network without mistakes; it depends on the unit of weight, if σ is no
+    more than that."""
+    if network.observations.sigma_origin != UNIT:
+        return ROUNDS.max_sigma0
+    return ROUNDS.max_ray_misfit / noise_of_rays(network)
+
+
+def _noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
+    """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
+    of the rays."""
+    return min(_sigma0(problem, minimum), _largest_sigma0(problem.network))
+
+
+def _sigma0(problem: NetworkProblem, minimum: Minimum) -> float:
+    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
+    cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
+    accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
+    vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy
+    known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
+    return float(np.sqrt(vtpv[0] / redundancy)) if known else 1.0
+
+
+def _place(found: Oriented) -> Oriented:
+    """Found start values; refused if half or more is excluded.
+
+    **Raises:** `NotSolvedError`."""
+    network = found.network
+    # A half that is placed may be the wrong half: with so little, what is excluded says more about
+    # the network than what is left.
+    for thing, reasons, left in (
+        ("image", found.images, len(network.images)),
+        ("point", found.points, len(network.points)),
+    ):
+        if len(reasons) >= left:
+            said = list_some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+            causes = filter(None, (name_pixels(network), name_image_extent(network)))
+            cause = "; ".join(causes)
+            raise NotSolvedError(
+                f"not solved: no start values for {len(reasons)} of "
+                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"
+                + (f"; {cause}" if cause else ""),
+                [f"{thing} {id}" for id in reasons],
+            )
+    return found

@@ -1,0 +1,574 @@
+r"""`compare`: the common unknowns of two adjustments, and those that differ significantly.
+
+The unknowns x of the same names are brought into one datum and subtracted,
+
+    d = S_b·x_b − S_a·T·x_a,        C_d = S_a·C_a·S_aᵀ + S_b·C_b·S_bᵀ
+
+T the similarity that takes the points of a to those of b, S = I − G·(G_hᵀG_h)⁻¹·G_hᵀ the
+S-transformation that refers coordinates to the points h in common (G the Helmert matrix); without a
+similarity T = S = I. The adjustments are independent of each other: where they share measurements,
+d has a smaller covariance than C_d, and nothing is tested. Of one unknown and of several together
+
+    t = d/σ_d  ~  t(ν),        F = dᵀ·C_d⁺·d/h  ~  F(h, ν)
+
+h the rank of C_d, ν of Welch and Satterthwaite, 1/ν = q²/r_a + (1 − q)²/r_b, with q the part of a
+in the variance (tr(C_d⁺C_a)/h for several) and r the redundancies.
+
+Source: Baarda (1973), S-transformations and criterion matrices; Pelzer (1971), Zur Analyse
+geodätischer Deformationsmessungen (the test of congruency); Welch (1947), Biometrika 34, 28–35.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxbundle.adjustment.problem import HELD, NetworkProblem, coordinates
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.adjustment.unknowns import angles_near
+from jaxbundle.arguments import number, show
+from jaxbundle.cameras import get_model
+from jaxbundle.display import print_anywhere
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import transform_point, transform_pose
+from jaxbundle.geometry.similarity import compose, helmert_point
+from jaxbundle.leastsquares.datum.motions import SEVEN
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
+from jaxbundle.network.columns import count, data_frame, list_some
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.orientation.absolute import absolute_orientation
+from jaxbundle.report.layout import fixed
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
+
+SCALE = SEVEN.index("scale")
+
+
+@print_anywhere
+@dataclasses.dataclass(frozen=True)
+class Congruency:
+    """A test that several differences are 0 together: F, its degrees of freedom `rank` and
+    `freedom` (ν), the probability of a larger one by chance."""
+
+    f: float
+    rank: int
+    freedom: float
+
+    @property
+    def probability(self) -> float:
+        return f_tail(self.f, self.rank, self.freedom)
+
+    def __str__(self) -> str:
+        return f"F = {self.f:.4g} ({self.rank}, {self.freedom:.0f}), p = {self.probability:.2g}"
+
+
+@print_anywhere
+@dataclasses.dataclass(frozen=True)
+class AdjustmentComparison:
+    """Two adjustments compared: one row an unknown that both have.
+
+    - `kind` (camera, image, point), `id`, `parameter` and `unit` of every row;
+    - `a` (after the similarity), `b`, `difference` b − a, `sigma` of the difference, `t`,
+      `probability` of a larger |t| by chance, `differs`: whether it is significant; NaN and False
+      where nothing is tested;
+    - `similarity`: τ = (t, ω, s) from a to b (`geometry.similarity`), None where there is none, and
+      `held_by`, the points it was found on;
+    - `tests`: of all coordinates together ("points"), and of the parameters of each camera;
+    - `shared`: image points that both have measured alike; if there are any nothing is tested;
+    - `significance`: of all rows together (Šidák).
+    """
+
+    kind: np.ndarray
+    id: np.ndarray
+    parameter: np.ndarray
+    unit: np.ndarray
+    a: Float[np.ndarray, " n"]
+    b: Float[np.ndarray, " n"]
+    difference: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    t: Float[np.ndarray, " n"]
+    probability: Float[np.ndarray, " n"]
+    differs: np.ndarray
+    similarity: Float[np.ndarray, "7"] | None
+    held_by: tuple[str, ...]
+    tests: dict[str, Congruency]
+    shared: int
+    significance: float
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns by name, one row an unknown."""
+        names = (
+            "kind",
+            "id",
+            "parameter",
+            "unit",
+            "a",
+            "b",
+            "difference",
+            "sigma",
+            "t",
+            "probability",
+            "differs",
+        )
+        return {name: getattr(self, name) for name in names}
+
+    def to_pandas(self):
+        """The table as a pandas data frame (extra `tables`)."""
+        return data_frame(self.table())
+
+    def __repr__(self) -> str:
+        return (
+            f"<AdjustmentComparison of {count(len(self), 'unknown')}, "
+            f"{int(self.differs.sum())} significantly different>"
+        )
+
+    def __str__(self) -> str:
+        """What was compared, the tests, and the largest differences in σ."""
+        number = lambda kind: len(set(self.id[self.kind == kind]))
+        things = {kind: number(kind) for kind in ("camera", "image", "point")}
+        said = ", ".join(count(n, kind) for kind, n in things.items() if n)
+        lines = [f"{said} in common, {count(len(self), 'unknown')}"]
+        if self.similarity is not None:
+            lines.append(
+                f"a was moved by a similarity found on {count(len(self.held_by), 'point')}"
+                f": scale {np.exp(self.similarity[6]):.8g}"
+            )
+        if self.shared:
+            lines.append(
+                f"{count(self.shared, 'image point')} of both are the same measurements: "
+                "the σ of differences are too large; nothing is tested"
+            )
+        lines += [f"{name}: {test}" for name, test in self.tests.items()]
+        if not self.shared:
+            lines.append(
+                f"{int(self.differs.sum())} of {len(self)} differ significantly "
+                f"({self.significance:g} for all together)"
+            )
+        sigma = np.where(self.sigma > 0, self.sigma, np.nan)
+        ratio = np.abs(self.difference / sigma)
+        rows = np.argsort(-ratio, kind="stable")[:12]  # half a screen; NaN (σ unknown) is last
+        lines.append(f"{'':24}{'a':>16}{'b':>16}{'b − a':>12}{'σ':>11}{'b − a in σ':>11}")
+        for k in rows:
+            name = f"{self.parameter[k]} of {self.kind[k]} {self.id[k]}"
+            in_sigma = fixed(float(ratio[k]), 2)
+            lines.append(
+                f"{name[:24]:24}{self.a[k]:16.8g}{self.b[k]:16.8g}{self.difference[k]:12.4g}"
+                f"{self.sigma[k]:11.3g}{in_sigma:>11}{' *' * bool(self.differs[k])}"
+            )
+        if len(self) > len(rows):
+            lines.append(
+                f"and {count(len(self) - len(rows), 'unknown')} that differ by less of their σ"
+            )
+        return "\n".join(lines)
+
+
+def compare(
+    a: Adjustment,
+    b: Adjustment,
+    *,
+    similarity: bool | None = None,
+    held_by: Sequence[str] = (),
+    significance: float = 0.05,
+) -> AdjustmentComparison:
+    """Compare two adjustments of cameras, images or points of the same names: two epochs of an
+    object, two calibrations with their networks, or one network adjusted in two ways.
+
+    **Arguments:**
+
+    - `similarity`: whether coordinates are compared after a similarity (of seven parameters, or six
+      if both networks have their own scale). Default: if the observations of one of them leave its
+      datum open.
+    - `held_by`: ids of the points it is found on, such as those known to be stable; default: all
+      common points.
+    - `significance`: the probability that any row is called different by chance.
+
+    **Raises:** `InputError` if they have nothing in common, different units, or too few points for
+    a similarity; `NotSolvedError` if one has no result.
+    """
+    for name, one in (("a", a), ("b", b)):
+        if not isinstance(one, Adjustment):
+            raise InputError(
+                f"{name} must be an Adjustment, but is {show(one)}: jaxbundle.adjust "
+                "or jaxbundle.load_adjustment gives one"
+            )
+    if similarity not in (None, True, False):
+        raise InputError(f"similarity must be True, False or None, but is {show(similarity)}")
+    significance = number("significance", significance, "between 0 and 1", lambda x: 0 < x < 1)
+    units = {
+        "object_unit": (a.network.object_unit, b.network.object_unit),
+        "image_unit": (a.image_unit, b.image_unit),
+    }
+    for name, (of_a, of_b) in units.items():
+        if of_a != of_b:
+            raise InputError(
+                f"a and b differ in their {name}: {of_a!r} and {of_b!r}; "
+                "compare networks in the same unit"
+            )
+    rows = _common_rows(a, b)
+    if similarity is None:
+        similarity = len(rows.points) > 0 and bool(a.counts.datum or b.counts.datum)
+    frames, tau, held = (None, None), None, ()
+    if similarity:
+        held = _held(rows.points, held_by)
+        frames, tau = _frames(a, b, held)
+    elif held_by:
+        raise InputError("held_by: no similarity is estimated, so no points hold one")
+    one, other = (_FramedAdjustment(r, f, r.problem, b.problem) for r, f in zip((a, b), frames))
+    return _compare(a, b, one, other, rows, tau, held, significance)
+
+
+@dataclasses.dataclass(frozen=True)
+class _CommonRows:
+    """Rows that two networks have in common: (camera, parameter) names; images; points."""
+
+    cameras: list[tuple[str, str]]
+    images: list[str]
+    points: list[str]
+
+
+def _common_rows(a: Adjustment, b: Adjustment) -> _CommonRows:
+    first, second = a.problem.network, b.problem.network
+    model = {c.id: str(c.model) for c in second.cameras}
+    cameras = []
+    for camera in first.cameras:
+        if model.get(camera.id) != str(camera.model):
+            continue
+        free = {*a.camera_cofactor(camera.id)[0], *b.camera_cofactor(camera.id)[0]}
+        names = get_model(camera.model).parameters
+        cameras += [(camera.id, name) for name in names if name in free]
+    there = lambda r: {
+        id for id, X in zip(r.problem.network.points.id, r.point_values) if np.isfinite(X).all()
+    }
+    images, points = set(second.images.id), there(a) & there(b)
+    found = _CommonRows(
+        cameras,
+        [id for id in first.images.id if id in images],
+        [id for id in first.points.id if id in points],
+    )
+    if not (found.cameras or found.images or found.points):
+        raise InputError("a and b have no camera, image or point of the same name")
+    return found
+
+
+def _held(points: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(wanted, str):
+        raise InputError("held_by must be a list of ids of points, but is a text")
+    missing = [id for id in map(str, wanted) if id not in set(points)]
+    if missing:
+        raise InputError(f"held_by: points {list_some(missing)} are not in both adjustments")
+    held = tuple(map(str, wanted)) or tuple(points)
+    if len(held) < 3:
+        raise InputError(
+            f"a similarity needs three points in common, but there are {len(held)}; "
+            "similarity=False compares coordinates as they are"
+        )
+    return held
+
+
+class _Frame(eqx.Module):
+    """How values are referred to points: by τ, then by the small similarity that takes the points
+    `held` to `reference` (its pseudo-inverse `projection` is that of their Helmert matrix)."""
+
+    tau: Float[Array, "7"]
+    held: Int[Array, " h"]
+    reference: Float[Array, "h 3"]
+    projection: Float[Array, "7 m"]
+
+    def small(self, points: Float[AnyArray, "points 3"]) -> Float[Array, "7"]:
+        there = jax.vmap(transform_point, (None, 0))(self.tau, points[self.held])
+        return self.projection @ (self.reference - there).ravel()
+
+
+def _frames(
+    a: Adjustment, b: Adjustment, held: Sequence[str]
+) -> tuple[tuple[_Frame, _Frame], Float[np.ndarray, "7"]]:
+    """The frames of both, and τ from a to b; coordinates are relative to the origin of b."""
+    found, origin = [], b.problem.origin
+    for r in (a, b):
+        place = {id: k for k, id in enumerate(r.problem.network.points.id)}
+        rows = np.array([place[id] for id in held])
+        found.append((rows, r.point_values[rows] - origin))
+    (rows_a, X), (rows_b, Y) = found
+    first = absolute_orientation(X, Y)
+    if int(first.status):
+        raise InputError("the points of the similarity are on one line, or at one place")
+    G = np.asarray(jax.vmap(helmert_point)(jnp.asarray(Y))).reshape(-1, 7).copy()
+    if not (_scale_is_open(a.problem) or _scale_is_open(b.problem)):
+        G[:, SCALE] = 0.0
+    projection = np.linalg.pinv(G)
+    tau = np.array(first.tau)
+    if not G[:, SCALE].any():
+        tau[SCALE] = 0.0
+    # The closed solution has a scale; without one it is off, and G is that of b, so that a step
+    # leaves a remainder of the size of the misfit times the step. Ten steps leave rounding.
+    for _ in range(10):
+        there = np.asarray(_move(tau, X))
+        tau = np.asarray(compose(projection @ (Y - there).ravel(), tau))
+    one = _Frame(*map(jnp.asarray, (tau, rows_a, Y, projection)))
+    # What is left of the points of a stays where it is: only changes are referred to the points.
+    one = dataclasses.replace(one, reference=jnp.asarray(_move(tau, X)))
+    other = _Frame(*map(jnp.asarray, (np.zeros(7), rows_b, Y, projection)))
+    return (one, other), tau
+
+
+_move = compile_once(jax.vmap(transform_point, (None, 0)), ())
+
+
+def _scale_is_open(problem: NetworkProblem) -> bool:
+    datum = problem.plan.datum
+    return datum is not None and np.abs(np.asarray(datum.gauge)[SCALE]).max() > HELD
+
+
+class _UnknownsInFrame(eqx.Module):
+    """Unknowns of a network as one vector, in a frame: the (row, column) pairs of every table of
+    cameras, and their `order` in the vector; images, points."""
+
+    cameras: dict[str, Int[Array, "k 2"]]
+    order: Int[Array, " parameters"]
+    images: Int[Array, " n"]
+    points: Int[Array, " m"]
+    angles: Float[Array, "n 3"]
+    shift: Float[Array, "3"]
+    frame: _Frame | None
+
+    def __call__(self, values: Values) -> Float[Array, " size"]:
+        position, turn = values["image"]
+        place, points = position + self.shift, coordinates(values) + self.shift
+        if self.frame is not None:
+            for tau in (self.frame.tau, self.frame.small(points)):
+                place, turn = jax.vmap(transform_pose, (None, 0, 0))(tau, place, turn)
+                points = jax.vmap(transform_point, (None, 0))(tau, points)
+        near = lambda q, given: angles_near(q, jnp.zeros(3), given)
+        angles = jax.vmap(near)(turn[self.images], self.angles)
+        poses = jnp.concatenate([place[self.images], angles], 1)
+        found = [values[table][at[:, 0], at[:, 1]] for table, at in sorted(self.cameras.items())]
+        cameras = jnp.concatenate([jnp.zeros(0), *found])[self.order]
+        return jnp.concatenate([cameras, poses.ravel(), points[self.points].ravel()])
+
+
+@dataclasses.dataclass(frozen=True)
+class _FramedAdjustment:
+    """One of the adjustments, in the common frame; relative to the origin of `like`."""
+
+    result: Adjustment
+    frame: _Frame | None
+    problem: NetworkProblem
+    like: NetworkProblem
+
+    def choose_rows(
+        self, rows: _CommonRows, angles: Float[np.ndarray, "images 3"]
+    ) -> _UnknownsInFrame:
+        network = self.problem.network
+        of = lambda ids, table: np.array(
+            [{id: k for k, id in enumerate(table)}[id] for id in ids], int
+        )
+        place = {c.id: self.problem.table_of_camera(k) for k, c in enumerate(network.cameras)}
+        pairs: dict[str, list[tuple[int, int, int]]] = {}
+        for k, (id, name) in enumerate(rows.cameras):
+            table, row = place[id]
+            pairs.setdefault(table.name, []).append((row, table.parameters.index(name), k))
+        order = np.array([k for _, at in sorted(pairs.items()) for *_, k in at], int)
+        return _UnknownsInFrame(
+            {table: jnp.asarray(np.array(at)[:, :2]) for table, at in pairs.items()},
+            jnp.asarray(np.argsort(order)),
+            jnp.asarray(of(rows.images, network.images.id)),
+            jnp.asarray(of(rows.points, network.points.id)),
+            jnp.asarray(angles),
+            jnp.asarray(self.problem.origin - self.like.origin),
+            self.frame,
+        )
+
+    def estimate(
+        self, rows: _CommonRows, angles: Float[np.ndarray, "images 3"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The unknowns and their covariance."""
+        chosen = self.choose_rows(rows, angles)
+        return np.asarray(_call(chosen, self.result.values)), self.result.covariance_of(chosen)
+
+
+@compile_once
+def _call(chosen: _UnknownsInFrame, values: Values) -> Float[Array, " n"]:
+    return chosen(values)
+
+
+def _compare(
+    a: Adjustment,
+    b: Adjustment,
+    one: _FramedAdjustment,
+    other: _FramedAdjustment,
+    rows: _CommonRows,
+    tau: Float[np.ndarray, "7"] | None,
+    held: tuple[str, ...],
+    significance: float,
+) -> AdjustmentComparison:
+    # ω, φ, κ of both near those of b, so that a difference is never a whole turn.
+    place = {id: k for k, id in enumerate(b.problem.network.images.id)}
+    near = b.image_values[[place[id] for id in rows.images], 3:].reshape(-1, 3)
+    found = []
+    for part in _portions(rows):
+        angles = near if part.images else np.zeros((0, 3))
+        found.append((one.estimate(part, angles), other.estimate(part, angles)))
+    x_a, x_b = (np.concatenate([pair[side][0] for pair in found]) for side in (0, 1))
+    v_a, v_b = (
+        np.clip(np.concatenate([np.diagonal(pair[side][1]) for pair in found]), 0, None)
+        for side in (0, 1)
+    )
+    shared = _count_shared(a, b)
+    table = _rows_of(b, rows, x_a, x_b, v_a, v_b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(table["sigma"] > 0, table["difference"] / table["sigma"], np.nan)
+        q = np.where(table["sigma"] > 0, v_a / (v_a + v_b), np.nan)
+    p, tests = np.full(len(t), np.nan), {}
+    if shared:
+        # With common measurements the differences are smaller than their σ: no test would fail.
+        t = np.full(len(t), np.nan)
+    else:
+        freedom = partial(_freedom, r=(a.redundancy, b.redundancy))
+        p = np.array(
+            [np.nan if np.isnan(x) else f_tail(x * x, 1, freedom(y)) for x, y in zip(t, q)]
+        )
+        C_a, C_b = (found[0][side][1] for side in (0, 1))
+        tests = _test_together(x_b - x_a, C_a, C_b, rows, len(found) == 1, one.frame, freedom)
+    tested = np.zeros(0) if shared else table["sigma"]
+    level = level_of_one(significance, int((tested > 0).sum()))
+    return AdjustmentComparison(
+        **table,
+        t=t,
+        probability=p,
+        differs=np.nan_to_num(p, nan=1.0) < level,
+        similarity=tau,
+        held_by=held,
+        tests=tests,
+        shared=shared,
+        significance=significance,
+    )
+
+
+def _test_together(
+    d: Float[np.ndarray, " n"],
+    C_a: Float[np.ndarray, "n n"],
+    C_b: Float[np.ndarray, "n n"],
+    rows: _CommonRows,
+    whole: bool,
+    frame: _Frame | None,
+    freedom: Callable[[float], float],
+) -> dict[str, Congruency]:
+    """The tests of each camera and of all points; of these only if all are in one portion, `whole`.
+    The similarity of the frame has taken its parameters out of the points' differences."""
+    tests = {}
+    for camera in dict.fromkeys(id for id, _ in rows.cameras):
+        at = np.array([k for k, (id, _) in enumerate(rows.cameras) if id == camera])
+        tests[f"camera {camera}"] = _congruency(d, C_a, C_b, at, freedom)
+    if whole and rows.points:
+        at = np.arange(len(rows.cameras) + 6 * len(rows.images), len(d))
+        lost = 0 if frame is None else int(np.asarray(frame.projection).any(1).sum())
+        tests["points"] = _congruency(d, C_a, C_b, at, freedom, lost)
+    return {name: test for name, test in tests.items() if test is not None}
+
+
+def _portions(rows: _CommonRows, most_together: int = 500) -> list[_CommonRows]:
+    """The rows whose covariance is formed together: cameras and images with points.
+
+    `most_together`: points. The covariance of their 1500 coordinates is 18 MB and grows with the
+    square of their number; points of several portions have no common test."""
+    step = most_together
+    parts = [rows.points[k : k + step] for k in range(0, len(rows.points), step)] or [[]]
+    return [
+        dataclasses.replace(rows, points=parts[0]),
+        *(_CommonRows([], [], part) for part in parts[1:]),
+    ]
+
+
+def _rows_of(
+    b: Adjustment,
+    rows: _CommonRows,
+    x_a: Float[np.ndarray, " n"],
+    x_b: Float[np.ndarray, " n"],
+    v_a: Float[np.ndarray, " n"],
+    v_b: Float[np.ndarray, " n"],
+) -> dict:
+    """Columns of the table: names, values in the units of b, σ of the differences."""
+    images, points = len(rows.images), len(rows.points)
+    kind = ["camera"] * len(rows.cameras) + ["image"] * 6 * images + ["point"] * 3 * points
+    id = [c for c, _ in rows.cameras] + np.repeat(rows.images, 6).tolist()
+    name = [p for _, p in rows.cameras] + [*EXTERIOR] * images + [*"XYZ"] * points
+    unit = [""] * len(rows.cameras)
+    length, angle = b.network.object_unit, b.network.angle_unit
+    unit += ([length] * 3 + [angle] * 3) * images + [length] * 3 * points
+    scale = np.ones(len(kind))
+    scale[np.isin(name, EXTERIOR[3:]) & (np.array(kind) == "image")] = b.angle_scale
+    origin = np.zeros(len(kind))
+    cameras = len(rows.cameras)
+    pose = np.concatenate([b.problem.origin, np.zeros(3)])
+    origin[cameras:] = np.concatenate([np.tile(pose, images), np.tile(b.problem.origin, points)])
+    column = lambda values: np.array(values, dtype=object)
+    return {
+        "kind": column(kind),
+        "id": column(id + np.repeat(rows.points, 3).tolist()),
+        "parameter": column(name),
+        "unit": column(unit),
+        "a": (x_a + origin) * scale,
+        "b": (x_b + origin) * scale,
+        "difference": (x_b - x_a) * scale,
+        "sigma": np.sqrt(v_a + v_b) * scale,
+    }
+
+
+def _congruency(
+    d: Float[np.ndarray, " n"],
+    C_a: Float[np.ndarray, "n n"],
+    C_b: Float[np.ndarray, "n n"],
+    at: Int[np.ndarray, " k"],
+    freedom: Callable[[float], float],
+    lost: int = 0,
+    null: float = 1e-9,
+) -> Congruency | None:
+    """The test that these differences are 0 together; None where nothing is free. `lost`: the rank
+    removed by a similarity; `null`: eigenvalues of the correlation matrix below this part of the
+    largest are 0. Rounding of propagated covariances is about 1e-12 of it, combinations that the
+    observations determine are far above."""
+    C_a, C_b = C_a[np.ix_(at, at)], C_b[np.ix_(at, at)]
+    diagonal = np.diagonal(C_a + C_b)
+    free = diagonal > 0
+    if not free.any():
+        return None
+    D = 1 / np.sqrt(diagonal[free])
+    scaled = lambda C: D[:, None] * C[np.ix_(free, free)] * D
+    values, vectors = np.linalg.eigh(scaled(C_a + C_b))
+    # The eigenvalues that belong to the similarity are the smallest, and 0 but for rounding; they
+    # are counted out by number, since rounding may exceed `null` in a large network.
+    there = (values > null * values[-1]) & (np.arange(len(values)) >= lost)
+    whitened = (vectors[:, there] / np.sqrt(values[there])).T
+    rank = int(there.sum())
+    f = float(((whitened @ (D * d[at][free])) ** 2).sum() / rank)
+    part = float(np.trace(whitened @ scaled(C_a) @ whitened.T) / rank)
+    return Congruency(f, rank, freedom(part))
+
+
+def _freedom(part: float, r: tuple[int, int]) -> float:
+    """Welch's degrees of freedom of a sum of two variances, the first of which is `part`."""
+    return 1 / (part**2 / r[0] + (1 - part) ** 2 / r[1])
+
+
+def _count_shared(a: Adjustment, b: Adjustment) -> int:
+    """Image points that both adjustments have with the same coordinates."""
+    # To the last digit: two measurements of a point in one photograph are never equal.
+
+    def measured(r: Adjustment) -> set[tuple[str, str, float, float]]:
+        network, given = r.problem.network, r.problem.network.observations
+        images, points = network.images.id, network.points.id
+        return {
+            (images[i], points[p], x, y)
+            for i, p, (x, y) in zip(given.image.tolist(), given.point.tolist(), given.xy.tolist())
+        }
+
+    return len(measured(a) & measured(b))

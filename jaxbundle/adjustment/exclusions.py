@@ -1,0 +1,356 @@
+"""What takes part in an adjustment: what rays do not determine is left out by name, and what start
+values excluded is tried again with the adjusted orientation.
+
+Before and after the iterations points whose rays are one line, and images that see a line, are
+looked for (`orientation.determined`). After them, everything that was excluded because of start
+values (image points that contradict them, points without intersection, images that could not be
+placed) is placed by the adjusted images and points, as `orient` does, and what agrees takes part in
+the next adjustment.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.adjustment.far_points import (
+    FAR_POINTS,
+    angle_of_rays,
+    noise_of_rays,
+)
+from jaxbundle.adjustment.minimum import adjusted_cameras, are_finite
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.columns import list_some
+from jaxbundle.network.sightings import equations_of, keep_images, keep_points, leave_out
+from jaxbundle.network.tables import LeftOut, Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.determined import have_one_line, see_a_line
+from jaxbundle.orientation.growth import (
+    START_VALUE_DEMANDS,
+    Demands,
+    Model,
+    are_held,
+    grow,
+    intersect,
+    misclosures,
+    place_far_points,
+)
+from jaxbundle.orientation.network import (
+    explain_missing,
+    note_missing,
+)
+from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.types import AnyArray
+
+COMES_BACK = Demands(START_VALUE_DEMANDS.angle, 1.0)
+"""On points and image points that come back: adjusted images are better than start values, which
+may miss by three times as much; blunders should not come back with the others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Undetermined:
+    """Points and images that rays do not determine, each with the reason."""
+
+    notes: tuple[LeftOut, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.notes)
+
+    def __add__(self, other: "Undetermined") -> "Undetermined":
+        return Undetermined(self.notes + other.notes)
+
+    def spares_most_of(self, network: Network) -> bool:
+        """Whether more than half of the tie points and of the images are determined; otherwise the
+        network has no depth, or σ says nothing, and nothing should be left out."""
+        number = {
+            thing: sum(len(n.names) for n in self.notes if n.thing == thing)
+            for thing in ("tie point", "image")
+        }
+        ties = int(network.points.has_role("tie").sum())
+        return 2 * number["tie point"] < max(ties, 1) and 2 * number["image"] < len(network.images)
+
+    def leave_out(self, network: Network) -> Network:
+        """The network without them, with notes."""
+        gone = {
+            thing: {name for note in self.notes if note.thing == thing for name in note.names}
+            for thing in ("tie point", "image")
+        }
+        keep = lambda ids, names: np.array([id not in names for id in ids], bool)
+        network = keep_points(network, keep(network.points.id, gone["tie point"]))
+        network = keep_images(network, keep(network.images.id, gone["image"]))
+        for note in self.notes:
+            network = leave_out(network, note.thing, note.names, note.why)
+        return network
+
+
+def find_undetermined(
+    problem: NetworkProblem, values: Values, factor: float | None
+) -> Undetermined:
+    """The tie points whose rays are one line, and the images whose points are on a line.
+
+    **Arguments:** `factor`: σ0, by which the a priori σ are multiplied; None before the adjustment.
+    """
+    network = problem.network
+    narrow, flat = _find_candidates(problem, values, factor)
+    if not (narrow.any() or flat.any()):
+        return Undetermined()
+    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    model = _adjusted_model(problem, values, network, seen)
+    points, one_place = have_one_line(seen, model, narrow, factor or 1.0)
+    images = flat & see_a_line(seen, model, factor or 1.0)
+    return Undetermined(_notes(network, seen, points, one_place, images))
+
+
+def may_be_undetermined(problem: NetworkProblem, values: Values) -> bool:
+    """Whether start values show points or images that rays may not determine: worth a look after a
+    few iterations, before they cost many. Rays of poor start values converge in appearance, so that
+    all narrow points count that would be narrow at the usual distance as well, unless some are
+    parallel: these would drift meanwhile."""
+    narrow, flat = _find_candidates(problem, values, None)
+    angle = angle_of_rays(problem, values)
+    near = (angle < FAR_POINTS.narrow) & (
+        _parallax_at_usual_distance(problem, values) < FAR_POINTS.narrow
+    )
+    parallel = angle < FAR_POINTS.parallel
+    return bool(narrow.any() or flat.any() or (near.any() and not parallel.any()))
+
+
+def _parallax_at_usual_distance(
+    problem: NetworkProblem, values: Values
+) -> Float[np.ndarray, " points"]:
+    """The largest angle at which a projection centre of a point is seen off the common line of its
+    rays, from the median distance of the points of its image; radians."""
+    # Start values may have put a point far out along its rays; seen from the median distance of its
+    # neighbours, its base shows whether it is really narrow.
+    point, image, n = problem.point, problem.image, len(problem.network.points)
+    X0 = np.asarray(values["image"].position)[image]
+    to_point = np.asarray(coordinates(values))[point] - X0
+    s = np.linalg.norm(to_point, axis=1)
+    usual = np.full(len(problem.network.images), np.inf)
+    order = np.lexsort((s, image))
+    seen, first, number = np.unique(image[order], return_index=True, return_counts=True)
+    usual[seen] = s[order][first + number // 2]
+    mean = lambda v: (
+        np.stack([np.bincount(point, c, n) for c in v.T], 1)
+        / np.maximum(np.bincount(point, minlength=n), 1)[:, None]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = mean(to_point / s[:, None])
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        off = np.linalg.norm(np.cross(X0 - mean(X0)[point], u[point]), axis=1) / usual[image]
+    largest = np.zeros(n)
+    np.fmax.at(largest, point, off)
+    return largest
+
+
+def _find_candidates(
+    problem: NetworkProblem, values: Values, factor: float | None, largest_sigma: float = 0.01
+) -> tuple[Bool[np.ndarray, " points"], Bool[np.ndarray, " images"]]:
+    """Tie points with nearly parallel rays, and images whose points are nearly on a line, that
+    nothing but image points determines: found without the rays, which are rarely needed.
+
+    `largest_sigma`: radians; a ray of a larger a priori σ, half a degree, was not measured. Its σ
+    is in a wrong unit or was not given, and says nothing before the adjustment has estimated it.
+    """
+    network = problem.network
+    ties, one = network.points.has_role("tie"), len(network.images)
+    none = np.zeros(len(ties), bool), np.zeros(one, bool)
+    noise = noise_of_rays(problem.network)
+    if not are_finite(problem, values) or factor is None and noise > largest_sigma:
+        return none
+    noise *= FAR_POINTS.vague * (factor or 1.0)
+    free = ties & ~problem.kept_rows & (equations_of(network, "POINTS") == 0)
+    free[network.distances.points.ravel()] = False
+    narrow = free & (angle_of_rays(problem, values) < noise)
+    # Further observations may hold an image through tables of their own: then none is judged.
+    if problem.further_sets:
+        return narrow, none[1]
+    only_rays = np.isnan(network.images.sigma).all(1) & (equations_of(network, "IMAGES") == 0)
+    return narrow, only_rays & (_width_of_points(problem, values) < noise)
+
+
+def _notes(
+    network: Network,
+    seen: Sights,
+    points: Bool[np.ndarray, " points"],
+    one_place: Bool[np.ndarray, " points"],
+    images: Bool[np.ndarray, " images"],
+) -> tuple[LeftOut, ...]:
+    of = lambda ids, mask: tuple(ids[k] for k in np.flatnonzero(mask))
+    groups = []
+    for mask, where in (
+        (points & one_place, "from one place (images {})"),
+        (points & ~one_place, "along the line through the projection centres (images {})"),
+    ):
+        by = np.unique(seen.image[mask[seen.point]])
+        where = where.format(list_some((network.images.id[k] for k in by), 4))
+        why = f"whose rays are one line to their noise, {where}, so that they have no distance"
+        groups.append(LeftOut("tie point", of(network.points.id, mask), why))
+    why = "whose points are on one line, about which the image may turn"
+    groups.append(LeftOut("image", of(network.images.id, images), why))
+    return tuple(group for group in groups if group.names)
+
+
+def _width_of_points(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " images"]:
+    """The RMS angle between the points of every image and their best line, radians."""
+    # The middle eigenvalue of Σ(X − X̄)(X − X̄)ᵀ/s²: the largest is along the line, the sum of the
+    # other two across it. Weighted by 1/s, since an angle counts, not a distance.
+    image, n = problem.image, len(problem.network.images)
+    X = np.asarray(coordinates(values))[problem.point]
+    away = np.linalg.norm(X - np.asarray(values["image"].position)[image], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.nan_to_num(1 / away, posinf=0.0)
+    total = lambda v: np.stack([np.bincount(image, c, n) for c in v.reshape(len(image), -1).T], 1)
+    weight = np.maximum(np.bincount(image, root**2, n), 1e-300)[:, None]
+    scaled = root[:, None] * (X - (total(root[:, None] ** 2 * X) / weight)[image])
+    C = np.nan_to_num(total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3))
+    number = np.maximum(np.bincount(image, minlength=n), 1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(C)[:, 1], 0) / number)
+
+
+def _adjusted_model(
+    problem: NetworkProblem, values: Values, network: Network, seen: Sights
+) -> Model:
+    """The adjusted images and points, as rows of `network`."""
+    model = Model.empty(seen)
+    images, points = (
+        np.array([place[id] for id in own.id], int)
+        for own, place in (
+            (table, {id: k for k, id in enumerate(whole.id)})
+            for table, whole in (
+                (problem.network.images, network.images),
+                (problem.network.points, network.points),
+            )
+        )
+    )
+    position, rotation = map(np.asarray, values["image"])
+    M = many.matrices_of_quaternions(rotation)
+    model.place(images, position + problem.origin, M)
+    X = np.asarray(coordinates(values)) + problem.origin
+    model.X[points], model.known[points] = X, np.isfinite(X).all(1)
+    return model
+
+
+def take_back(
+    given: Network, current: Network, problem: NetworkProblem, values: Values, factor: float
+) -> Network:
+    """The given network with everything that agrees with adjusted images and points, and notes of
+    what does not.
+
+    **Arguments:** `current`: the part of `given` that was adjusted, with its check points;
+    `factor`: σ0."""
+    # The same steps as in `orient` (place images, intersect points, find contradictions), but from
+    # adjusted images, and with a narrower tolerance for what comes back.
+    cameras = adjusted_cameras(problem, values)
+    lens = tuple(cameras.get(camera.id, camera) for camera in given.cameras)
+    seen = sights(given.replace(cameras=lens))
+    model = _adjusted_model(problem, values, given, seen)
+    model.control = are_held(given.points)
+    new = model.control & ~model.known
+    model.X[new], model.known[new] = given.points.position[new], True
+    before = np.isin(np.array(given.points.id, object), np.array(current.points.id, object))
+    straight = see_a_line(seen, model, factor) & ~model.placed
+    grow(seen, model, ~straight)
+    intersect(seen, model, COMES_BACK)
+    place_far_points(seen, model)
+    # An image point that was adjusted stays, even if it misses: its residual is judged by the
+    # tests. Only what was left out has to agree first.
+    used = _are_among(given, current)
+    off = misclosures(seen, model) > COMES_BACK.miss * seen.tolerance[seen.image]
+    wrong = off & ~used[seen.row]
+    kept = dataclasses.replace(
+        seen,
+        **{name: getattr(seen, name)[~wrong] for name in ("image", "point", "ray", "sigma", "row")},
+    )
+    ties = given.points.has_role("tie") & ~before
+    line, one_place = have_one_line(kept, model, ties, factor)
+    network = _with_start_values(given, model)
+    images, points = given.images, given.points
+    X = network.points.position
+    # A tie point that was left out comes back if its rays meet, even if it has given coordinates.
+    known = np.isfinite(X).all(1) & (before | model.known | ~given.points.has_role("tie"))
+    missing_images, missing_points = explain_missing(given, seen, model, known | line)
+    for k in np.flatnonzero(straight & (np.bincount(seen.image, minlength=seen.images) > 2)):
+        missing_images[images.id[k]] = "its points are on one line, about which it may turn"
+    network = network.replace(
+        observations=given.observations.take(np.setdiff1d(np.arange(len(used)), seen.row[wrong]))
+    )
+    network = keep_points(keep_images(network, model.placed), known & ~line)
+    after = "that the adjusted orientation does not determine either"
+    network = note_missing(network, "image", missing_images, after)
+    network = note_missing(network, "point", missing_points, after)
+    for note in _notes(given, kept, line, one_place, np.zeros(len(images), bool)):
+        network = leave_out(network, note.thing, note.names, note.why)
+    rays = given.observations
+    names = [f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in seen.row[wrong]]
+    return leave_out(network, "image point", names, "that contradict the adjusted orientation")
+
+
+def _with_start_values(network: Network, model: Model) -> Network:
+    """The network with poses and coordinates of a model where it has none."""
+    images, points = network.images, network.points
+    given = np.isfinite(np.concatenate([images.position, images.angles], 1)).all(1)
+    lacking = model.placed & ~given
+    position, angles = images.position.copy(), images.angles.copy()
+    position[lacking] = model.X0[lacking]
+    if lacking.any():
+        angles[lacking] = many.angles(model.M[lacking])
+    found = model.known & ~np.isfinite(points.position).all(1)
+    X = np.where(found[:, None], model.X, points.position)
+    return network.replace(
+        images=dataclasses.replace(images, position=position, angles=angles),
+        points=dataclasses.replace(points, position=X),
+    )
+
+
+def _are_among(given: Network, current: Network) -> Bool[np.ndarray, " rays"]:
+    """Which image points of a network are in a part of it."""
+    key = lambda network, ids: np.array(
+        [
+            ids[0][network.images.id[i]] * len(given.points) + ids[1][network.points.id[p]]
+            for i, p in zip(network.observations.image, network.observations.point)
+        ],
+        np.int64,
+    )
+    places = [{id: k for k, id in enumerate(table.id)} for table in (given.images, given.points)]
+    return np.isin(key(given, places), key(current, places))
+
+
+def carry(problem: NetworkProblem, before: NetworkProblem, values: Values) -> Values:
+    """Start values of a problem: those at which another of the same network ended, by name; its own
+    for what that did not have."""
+    start = problem.data.start
+
+    def carry_rows(
+        own: Float[AnyArray, "n k"],
+        ids: Sequence[str],
+        other: Float[AnyArray, "m k"],
+        other_ids: Sequence[str],
+        shift: np.ndarray | float = 0.0,
+    ) -> Float[Array, "n k"]:
+        own, other = np.array(own), np.asarray(other)
+        place = {id: k for k, id in enumerate(other_ids)}
+        rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]
+        to, of = np.array(rows, int).reshape(-1, 2).T
+        there = np.isfinite(other[of]).all(1)
+        own[to[there]] = (other[of] + shift)[there]
+        return jax.device_put(own)
+
+    network, old, shift = problem.network, before.network, before.origin - problem.origin
+    images, points = (network.images.id, old.images.id), (network.points.id, old.points.id)
+    cameras = [c.id for c in network.cameras], [c.id for c in old.cameras]
+    own, other = problem.interior_orientation(start), before.interior_orientation(values)
+    other = np.asarray(other)[:, : own.shape[1]]
+    found = problem.with_interior_orientation(start, carry_rows(own, cameras[0], other, cameras[1]))
+    position, rotation = start["image"]
+    at, turned = values["image"]
+    image = PoseValue(
+        carry_rows(position, images[0], at, images[1], shift),
+        carry_rows(rotation, images[0], turned, images[1]),
+    )
+    X = carry_rows(coordinates(start), points[0], coordinates(values), points[1], shift)
+    return found | {"image": image, "point": with_coordinates(start["point"], X)}

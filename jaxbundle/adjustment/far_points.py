@@ -1,0 +1,280 @@
+"""Points with nearly parallel rays, which determine the direction but hardly the distance.
+
+Their distances drift without end, or make the normal equations singular. So points with parallel
+rays, and if an adjustment does not converge all narrow ones, are adjusted as points at any distance
+(`leastsquares.any_distance`). A point pulled beyond infinity by its rays is held there as a
+direction, and released when they pull it back (an active set).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import History, Minimum
+from jaxbundle.leastsquares.iterations.stopping import LIMIT
+from jaxbundle.leastsquares.problem import with_data, with_factor, with_free
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.tables import Network
+from jaxbundle.orientation.many import matrices_of_quaternions
+from jaxbundle.orientation.sights import sights
+from jaxbundle.types import present
+
+
+@dataclasses.dataclass(frozen=True)
+class FarPointSettings:
+    """Which points may be at any distance, and when that is looked at.
+
+    - `narrow`: radians; largest angle between the rays of a point that may be at any distance.
+      0.03 is a base of 1/33 of the distance. Larger: well determined points lose their place among
+      the datum points; smaller: an adjustment that fails because of such points is not saved.
+    - `parallel`: radians; largest angle of a point that is so from the start, unless half of the
+      tie points are: then all images have nearly the same projection centre, and no point is far.
+    - `vague`: points with an angle below this number of σ of a ray are at any distance from the
+      start as well. σ of their distance is above 1/`vague` of it: at a tenth, errors of second
+      order at 3 σ, (3/10)²/2, are no longer small, while the reciprocal distance is nearly linear
+      in the observations.
+    - `evaluations_before_release`: evaluations before narrow points are put at any distance; twice
+      as many if half of the tie points are narrow, since then the network may only be slow.
+      Larger: failing adjustments take longer to recover; smaller: points move to the other
+      parametrisation, and out of the datum, that would have settled.
+    - `evaluations_between_checks` of points pulled beyond infinity, or back; doubled whenever no
+      point changed. A compromise between iterations with the wrong points held and the cost of a
+      check, which is that of a residual; not critical.
+    - `max_releases`: a point released this often stays at infinity. It ends the cycles that an
+      active set may have; few points are released more than once.
+    """
+
+    narrow: float = 0.03
+    parallel: float = 1e-3
+    vague: float = 10.0
+    evaluations_before_release: int = 30
+    evaluations_between_checks: int = 4
+    max_releases: int = 10
+
+
+FAR_POINTS = FarPointSettings()
+
+
+def minimise_at_any_distance(
+    problem: NetworkProblem,
+    start: Values,
+    make: Callable,
+    *,
+    max_steps: int,
+    settings: FarPointSettings = FAR_POINTS,
+    **options: Any,
+) -> tuple[NetworkProblem, Minimum]:
+    """Iterate from `start` with points with parallel rays at any distance; without convergence,
+    with all narrow ones. Returns that problem if it was solved, else the given one.
+    `make(lengths=…)`: makes the problem (see `make_problem`)."""
+    angle = angle_of_rays(problem, start)
+    narrow = angle < settings.narrow
+    if not narrow.any():
+        return problem, find_minimum(problem, start, max_steps=max_steps, **options)
+    mostly = lambda chosen: 2 * chosen.sum() >= (angle < np.pi).sum()
+    noise = min(settings.vague * noise_of_rays(problem.network), settings.narrow)
+    legs, parallel = [], angle < max(settings.parallel, noise)
+    # First only points whose rays are parallel; if that does not converge, all narrow points. The
+    # other parametrisation costs little, but points at any distance carry no datum.
+    for chosen in (parallel & ~mostly(parallel), None):
+        if chosen is None:
+            patience = settings.evaluations_before_release * (2 if mostly(narrow) else 1)
+            plain = find_minimum(problem, start, max_steps=min(patience, max_steps), **options)
+            if inspect_solution(with_factor(problem), plain) or int(plain.iterations) >= max_steps:
+                return problem, plain
+            legs, start = [plain], plain.values
+            chosen = angle_of_rays(problem, start) < settings.narrow
+        left = max_steps - sum(int(leg.iterations) for leg in legs)
+        far = _with_far_points(problem, start, chosen, make)
+        if far is not None:
+            found, minimum = minimise_with_infinity(
+                *far, max_steps=left, settings=settings, **options
+            )
+            if inspect_solution(with_factor(found), minimum):
+                return found, join_legs([*legs, minimum])
+    if int(legs[0].termination) != LIMIT:
+        return problem, legs[0]
+    return problem, join_legs([*legs, find_minimum(problem, start, max_steps=left, **options)])
+
+
+def minimise_with_infinity(
+    problem: NetworkProblem,
+    start: Values,
+    *,
+    max_steps: int,
+    settings: FarPointSettings = FAR_POINTS,
+    **options: Any,
+) -> tuple[NetworkProblem, Minimum]:
+    """Iterate from `start`; points at any distance that are pulled beyond infinity are held there,
+    also in the returned problem."""
+    if problem.lengths is None:
+        return problem, find_minimum(problem, start, max_steps=max_steps, **options)
+    # The third direction of change of such a point is that of its inverse distance.
+    held = problem.table("point").free[:, 2] == 0
+    held &= problem.at_any_distance & ~problem.excluded
+    legs, released, steps = [], np.zeros(len(held), int), settings.evaluations_between_checks
+    # An active set: the inverse distance of a point is free, or held at 0 (infinity) while its
+    # rays pull it beyond. Holding changes the mask of free columns only, so that all rounds run the
+    # same compiled program.
+    problem = _hold_at_infinity(problem, held, start)
+    while True:
+        left = max_steps - sum(int(leg.iterations) for leg in legs)
+        legs.append(find_minimum(problem, start, max_steps=min(steps, left), **options))
+        start = legs[-1].values
+        there = at_infinity(problem, start)
+        if there.any():
+            outward = _are_pulled_outward(problem, start)
+            there &= np.where(held, outward | (released >= settings.max_releases), outward)
+            there &= ~problem.excluded
+        released += held & ~there
+        changed = (there != held).any()
+        if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
+            return problem, join_legs(legs)
+        steps = settings.evaluations_between_checks if changed else 2 * steps
+        if changed:
+            held = there
+            problem = _hold_at_infinity(problem, held, start)
+
+
+def noise_of_rays(network: Network) -> float:
+    """The median a priori σ of an image coordinate, in principal distances."""
+    c = np.array(
+        [
+            min(
+                (camera.parameters[n] for n in get_model(camera.model).principal_distance),
+                default=1.0,
+            )
+            for camera in network.cameras
+        ]
+    )
+    camera = network.images.camera[network.observations.image]
+    return float(np.median(network.observations.sigma.max(1) / np.abs(c[camera])))
+
+
+def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " points"]:
+    """Approximately the largest angle between two rays of every tie point, radians; 180° for other
+    points and points with fewer than two rays."""
+    point, image = problem.point[problem.used], problem.image[problem.used]
+    X0, X = np.asarray(values["image"].position), np.asarray(coordinates(values))
+    ray = _unit_vectors(X[point] - X0[image])
+    first = np.zeros_like(X)
+    # Lines, not directions: a point between two images has opposite rays.
+    first[point[::-1]] = ray[::-1]
+    ray *= np.where((ray * first[point]).sum(1) < 0, -1.0, 1.0)[:, None]
+    middle = np.zeros_like(X)
+    np.add.at(middle, point, ray)
+    off = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)
+    widest = np.zeros(len(middle))
+    np.fmax.at(widest, point, off)
+    number = np.bincount(point, minlength=len(middle))
+    tie = (number > 1) & problem.network.points.has_role("tie")
+    return np.where(tie, 2 * widest, np.pi)
+
+
+def _with_far_points(
+    problem: NetworkProblem, values: Values, chosen: Bool[np.ndarray, " points"], make: Callable
+) -> tuple[NetworkProblem, Values] | None:
+    """The problem and its values with these points at any distance, except those whose coordinates
+    other observations touch; None if none is left, or too few others for the datum.
+    """
+    lengths = np.where(chosen & ~problem.kept_rows, _unit(problem), 0.0)
+    if not lengths.any():
+        return None
+    try:
+        far = make(lengths=lengths)
+    except InputError:
+        return None
+    # The origin becomes the centroid of the projection centres. Frames and other tables would have
+    # to move with it: such networks begin again from their start values.
+    if problem.further_tables:
+        return far, far.data.start
+    shift = problem.origin - far.origin
+    position, rotation = map(np.asarray, values["image"])
+    moved = values | {"image": PoseValue(position + shift, rotation)}
+    X = _in_front(far, moved, np.asarray(coordinates(values)) + shift)
+    return far, moved | {"point": with_coordinates(far.data.start["point"], X)}
+
+
+def _in_front(
+    problem: NetworkProblem, values: Values, X: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "points 3"]:
+    """The points X, with those at any distance that drifted to or beyond infinity put at
+    infinity."""
+    network = problem.network
+    position, rotation = map(np.asarray, values["image"])
+    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    M = matrices_of_quaternions(rotation)[seen.image]
+    ray = np.einsum("nij,ni->nj", M, seen.ray)
+    depth = (ray * (X[seen.point] - position[seen.image])).sum(1)
+    sides = np.bincount(seen.point, np.sign(depth), len(X))
+    length = np.linalg.norm(X, axis=1)
+    most = LARGEST_DISTANCE * present(problem.lengths)
+    move = (most > 0) & ((sides < 0) | (length > most))
+    factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
+    return X * factor[:, None]
+
+
+def at_infinity(problem: NetworkProblem, values: Values) -> Bool[np.ndarray, " points"]:
+    """Which points are at infinity."""
+    if problem.lengths is None:
+        return problem.at_any_distance
+    return is_at_infinity(np.asarray(coordinates(values)), problem.lengths)
+
+
+def _hold_at_infinity(
+    problem: NetworkProblem, held: Bool[np.ndarray, " points"], values: Values
+) -> NetworkProblem:
+    """These points held at infinity, the others not."""
+    start, far = problem.data.start, problem.at_any_distance & ~problem.excluded
+    point = np.where(held[:, None], np.asarray(values["point"]), np.asarray(start["point"]))
+    start = start | {"point": jax.device_put(point)}
+    problem = with_data(problem, dataclasses.replace(problem.data, start=start))
+    free = problem.table("point").free.copy()
+    free[:, 2] = np.where(far, ~held, free[:, 2])
+    return with_free(problem, "point", free)
+
+
+def _are_pulled_outward(problem: NetworkProblem, values: Values) -> Bool[np.ndarray, " points"]:
+    """Whether vᵀPv decreases with the distance of a point."""
+    number = len(problem.network.points)
+    free = _hold_at_infinity(problem, np.zeros(number, bool), values)
+    solution, slope = Solution(free, values), np.zeros(number)
+    for name, rows in problem.image_rows.items():
+        along = solution.residuals[name] * solution.by_eliminated[name][:, :, 2]
+        np.add.at(slope, problem.point[rows], along.sum(1))
+    return slope > 0
+
+
+def _unit(problem: NetworkProblem) -> float:
+    """RMS distance of the projection centres from their centroid."""
+    centres = problem.network.images.position
+    return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
+
+
+def join_legs(legs: Sequence[Minimum]) -> Minimum:
+    """Several successive minimisations combined into one; each but the first re-evaluates the end
+    point of the previous one."""
+    if len(legs) == 1:
+        return legs[0]
+    rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]
+    column = lambda name: jax.device_put(
+        np.concatenate([np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)])
+    )
+    history = History(column("cost"), column("damping"), column("accepted"))
+    return dataclasses.replace(legs[-1], iterations=np.asarray(len(history.cost)), history=history)
+
+
+def _unit_vectors(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return v / np.linalg.norm(v, axis=1, keepdims=True)

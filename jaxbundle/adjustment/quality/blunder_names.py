@@ -1,0 +1,68 @@
+"""Names in network terms of the blunders and suspects that the engine found."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.leastsquares.quality import robust, snooping
+from jaxbundle.network.blunders import Removed, Suspect, either_of
+from jaxbundle.types import present
+
+
+def name_removed(problem: NetworkProblem, found: snooping.RemovedRow) -> Removed:
+    """Observations removed by data snooping, with names."""
+    kind, rows = _place(problem, found.set, found.rows)
+    names = [_name(problem, found.set, row, found.residual) for row in found.rows]
+    # Control points lose single axes: their rows count axes, three a point.
+    if kind == "control":
+        rows = tuple(3 * row + present(found.residual) for row in rows)
+    return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
+
+
+def image_points_removed(
+    problem: NetworkProblem, named: Iterable[tuple[str, str]]
+) -> list[snooping.RemovedRow]:
+    """Image points, by image and point id, as removals for data snooping."""
+    named = set(named)
+    if not named:
+        return []
+    images, points = problem.network.images.id, problem.network.points.id
+    places = zip(problem.image.tolist(), problem.point.tolist())
+    rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
+    return [
+        snooping.RemovedRow(name, row, None, math.inf)
+        for name, places in problem.image_rows.items()
+        for row, place in enumerate(places.tolist())
+        if place in rows
+    ]
+
+
+def name_suspect(problem: NetworkProblem, found: robust.SuspectRow) -> Suspect:
+    """Suspects of the robust estimation, with names."""
+    kind, rows = _place(problem, found.set, (found.row,))
+    name = _name(problem, found.set, found.row, None)
+    return Suspect(kind, rows[0], name, found.test, found.weight)
+
+
+def _place(problem: NetworkProblem, name: str, rows: Sequence[int]) -> tuple[str, tuple[int, ...]]:
+    """Kind and rows: of image points those of the network, of others those of their set."""
+    if name in problem.image_rows:
+        return "image", tuple(int(problem.image_rows[name][row]) for row in rows)
+    if name in problem.further_sets:
+        return problem.observations_of(name).kind.name, tuple(rows)
+    return name.partition(",")[0], tuple(rows)
+
+
+def _name(problem: NetworkProblem, name: str, row: int, residual: int | None) -> str:
+    kind, (place,) = _place(problem, name, (row,))
+    network, given = problem.network, problem.observations_of(name)
+    points = network.points.id
+    if kind == "image":
+        image = network.images.id[problem.image[place]]
+        return f"point {points[problem.point[place]]} in image {image}"
+    if kind == "control":
+        return f"{'XYZ'[present(residual)]} of control point {points[given.rows[0][row]]}"
+    if kind == "distance":
+        a, b = (points[int(p)] for p in network.distances.points[place])
+        return f"distance {a}–{b}"
+    return given.label(problem.tables, row)

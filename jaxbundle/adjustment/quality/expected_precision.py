@@ -1,0 +1,61 @@
+"""The expected precision of a network before measurement.
+
+Cofactors at the start values, with the a priori σ and σ0 = 1: the report of `adjust` for a network
+whose residuals agree with its σ.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
+from jaxbundle.leastsquares.problem import with_factor
+from jaxbundle.network.check import check_network
+from jaxbundle.network.tables import Network
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class ExpectedPrecision:
+    """A priori σ: of points [P, 3] (object unit; 0 where held) and projection centres [I, 3]."""
+
+    point_ids: tuple[str, ...]
+    roles: tuple[str, ...]
+    points: Float[np.ndarray, "points 3"]
+    centres: Float[np.ndarray, "images 3"]
+    redundancy: int
+
+    def summary(self, role: str = "tie") -> dict[str, tuple[float, float, float]]:
+        """Mean, smallest and largest σ of X, Y, Z of the points of a role."""
+        sigma = self.points[np.array(self.roles, dtype=object) == role]
+        return {
+            axis: (float(s.mean()), float(s.min()), float(s.max()))
+            for axis, s in zip("XYZ", sigma.T)
+        }
+
+
+def expected_precision(network: Network) -> ExpectedPrecision:
+    """The a priori precision of a network with start values.
+
+    **Raises:** `InputError` for a network that cannot be adjusted.
+    """
+    problem = with_factor(make_problem(check_network(network)))
+    if problem.reduction not in FACTORS:
+        raise InputError("the planned network is too large for its covariance; plan a part of it")
+    found = Inspection(problem, problem.data.start)
+    if not found.determined:
+        raise InputError("the planned network is not fully determined; plan more overlap")
+    sigma = lambda Q: np.sqrt(np.clip(np.diagonal(np.asarray(Q), axis1=1, axis2=2), 0, None))
+    points = problem.network.points
+    return ExpectedPrecision(
+        points.id,
+        points.role,
+        sigma(found.point_cofactors),
+        sigma(found.image_cofactors)[:, :3],
+        problem.counts.redundancy,
+    )

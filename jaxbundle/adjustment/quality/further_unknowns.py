@@ -1,0 +1,95 @@
+"""The unknowns of further kinds of observations, by row, with σ."""
+
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
+from jaxbundle.leastsquares.declarations import Table
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.leastsquares.spaces import PoseValue, Rotation, Space
+from jaxbundle.network.kinds.rigs import MOUNTING
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
+
+ANGLES = ("omega", "phi", "kappa")
+
+
+class Estimate(NamedTuple):
+    """An unknown of a row: table, row, name, value, a posteriori σ (0 if held); `angle`:
+    radians."""
+
+    table: str
+    row: str
+    name: str
+    value: float
+    sigma: float
+    angle: bool = False
+
+
+def estimates(
+    found: Solution, names: Collection[str], sigma0: float, origin: Float[np.ndarray, "3"]
+) -> list[Estimate]:
+    """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
+    (mountings in the reference camera), ω, φ, κ."""
+    every = []
+    for table in (t for t in found.problem.tables if t.name in names):
+        values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
+        shown, A = map(np.array, _read_rows(table.space, values))
+        # Frames are in object space, relative to the origin; a mounting is relative to a camera.
+        if isinstance(values, PoseValue) and table.name != MOUNTING:
+            shown[:, :3] += origin
+        variance = np.einsum("nij,njk,nik->ni", A, Q, A)
+        sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))
+        labels, angles = _labels(table, shown.shape[1])
+        every += [
+            Estimate(table.name, table.label(row), *one)
+            for row in range(table.rows)
+            for one in zip(labels, shown[row].tolist(), sigma[row].tolist(), angles)
+        ]
+    return every
+
+
+@partial(compile_once, static=0)
+def _read_rows(
+    space: Space, values: Any
+) -> tuple[Float[Array, "rows n"], Float[Array, "rows n width"]]:
+    """Every row as reported numbers [rows, n], and their derivatives by its changes [rows, n,
+    width]."""
+
+    def of_row(value: Any) -> tuple[Float[Array, " n"], Float[Array, "n width"]]:
+        near = _read(space, value, jnp.zeros(3))[-3:]  # of angles, the same after a change
+        # σ of what is reported, by the derivative of the reported numbers along the changes: a
+        # rotation changes by δθ, and is reported as angles.
+        change = lambda d: _read(space, space.retract(value, d), near)
+        return _read(space, value, near), jax.jacfwd(change)(jnp.zeros(space.width))
+
+    return jax.vmap(of_row)(values)
+
+
+def _read(space: Space, value: Any, near: Float[Array, "3"]) -> Float[Array, " n"]:
+    """A row as reported numbers; `near`: choose the angles nearest to these."""
+    if isinstance(value, PoseValue):
+        return jnp.concatenate([value.position, _angles(value.rotation, near)])
+    if isinstance(space, Rotation):
+        return _angles(value, near)
+    return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(value)])
+
+
+def _labels(table: Table, size: int) -> tuple[Sequence[str], tuple[bool, ...]]:
+    """The names of these numbers, and which of them are angles."""
+    if isinstance(table.value, PoseValue):
+        return ("X0", "Y0", "Z0", *ANGLES), (False,) * 3 + (True,) * 3
+    if isinstance(table.space, Rotation):
+        return ANGLES, (True,) * 3
+    named = len(table.parameters) == size
+    return table.parameters if named else [str(k + 1) for k in range(size)], (False,) * size
+
+
+def _angles(q: Float[AnyArray, "4"], near: Float[AnyArray, "3"]) -> Float[Array, "3"]:
+    return omega_phi_kappa_near(matrix_from_quaternion(q), near)

@@ -1,0 +1,202 @@
+"""Repeated adjustments: robust estimation, data snooping, variance components, elimination."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from typing import cast
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.adjustment.minimum import inspect_solution, require_solved
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.blunder_names import image_points_removed, name_removed
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.quality.misfit import contradicts, doubt_of_baarda
+from jaxbundle.adjustment.quality.variance_components import groups
+from jaxbundle.adjustment.result import Adjustment
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.indexing.rows import Values
+from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.leastsquares.problem import Problem, hold, with_data
+from jaxbundle.leastsquares.quality.components import (
+    ROUNDS,
+    Component,
+    estimate,
+    variance_components,
+)
+from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.leastsquares.quality.robust import (
+    Reweighted,
+    residual_lengths,
+    reweight,
+    robust_scale,
+)
+from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.network.blunders import Removed
+
+Minimise = Callable[[Problem, Values], tuple[NetworkProblem, Minimum]]
+"""Iterates a changed problem from given values to its minimum; returns the problem as it ended."""
+
+
+def snoop_network(
+    found: Inspection,
+    minimum: Minimum,
+    again: Minimise,
+    test: str,
+    significance: float,
+    doubtful: Iterable[tuple[str, str]] = (),
+) -> tuple[NetworkProblem, Minimum, list[Removed], str | None]:
+    """The problem and its minimum without blunders, the removed observations, and warnings about a
+    priori σ that the test relies on although the data contradict them.
+
+    `doubtful`: image and point, by id, of initially removed image points."""
+    # The engine removes and restores in its own terms (sets and rows); names are given at the end.
+    problem, whole, doubt = found.problem, found.solution, None
+    repeat = _Repeat(again, "after data snooping", minimum)
+    solution, removed = snoop(
+        whole,
+        repeat,
+        test=test,
+        significance=significance,
+        doubtful=image_points_removed(problem, doubtful),
+    )
+    removed = [name_removed(problem, r) for r in removed]
+    counts = problem.counts
+    if test == "baarda" and counts.redundancy > 0:
+        scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
+        rays = sum(len(r.rows) for r in removed if r.kind == "image")
+        doubt = doubt_of_baarda(
+            scale,
+            rays,
+            problem.rows_and_unknowns.observations // 2,
+            counts.redundancy,
+            significance,
+        )
+    return cast(NetworkProblem, solution.problem), repeat.minimum, removed, doubt
+
+
+def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
+    """The robust scale of the image points, whatever the a priori σ.
+
+    The observations left by Baarda's test fit too well, because they were selected for it; and
+    blunders spread over the residuals of good points. So if the scale of all points is large, the
+    scale of those that Tukey's estimator (with a posteriori scale) does not suspect is used.
+    """
+    problem = found.problem
+    scale = robust_scale(problem, residual_lengths(found))
+    if scale < 1 or not contradicts(scale, problem.counts.redundancy):
+        return scale
+    try:
+        tukey = reweight(problem, found.values, repeat, "tukey")
+    except NotSolvedError:
+        return scale
+    # Suspects are only left out of the median: the adjustment keeps the observations it has.
+    suspects = [RemovedRow(s.set, s.row, None, s.test) for s in tukey.suspects()]
+    if not suspects:
+        return scale
+    lengths = {o: t * tukey.scale for o, t in tukey.lengths.items()}
+    return robust_scale(without(problem, suspects), lengths)
+
+
+def adjust_robustly(
+    problem: NetworkProblem, minimum: Minimum, again: Minimise, estimator: str
+) -> tuple[Reweighted, Minimum]:
+    """The solution with the weights of a robust estimator, and its minimum. The first weights come
+    from the minimum, or from the start values without a solution."""
+    repeat = _Repeat(again, "by robust estimation", minimum)
+    # Weights of start values are poor, but where blunders prevent a solution there are no others.
+    first = minimum.values if inspect_solution(problem, minimum) else problem.data.start
+    reweighted = reweight(problem, first, repeat, estimator)
+    if not reweighted.rests:
+        raise NotSolvedError(
+            f"not solved by robust estimation: the weights of {estimator} do not converge; use "
+            f"{'' if estimator == 'huber' else 'huber, or '}data snooping"
+        )
+    return reweighted, repeat.minimum
+
+
+class _Repeat:
+    """Adjusts a changed problem of the network and keeps the minimum."""
+
+    def __init__(self, again: Minimise, when: str, minimum: Minimum):
+        self.again, self.when, self.minimum = again, when, minimum
+
+    def __call__(self, problem: Problem, values: Values) -> Solution:
+        of_network, self.minimum = self.again(problem, values)
+        return require_solved(of_network, self.minimum, self.when).solution
+
+
+def with_components(
+    problem: NetworkProblem, minimum: Minimum, again: Minimise
+) -> tuple[NetworkProblem, Minimum, dict[str, float]]:
+    """The problem with estimated σ of every group, its minimum, and the factors of σ by group."""
+    repeat = _Repeat(again, "with the estimated variance components", minimum)
+    # σ̂² of a group is vᵀPv/r of the group (Förstner 1979): iterated, since both depend on all σ.
+    # Groups with too little redundancy keep their σ, which is said in a note.
+    whole, of = Inspection(problem, minimum.values).solution, groups(problem)
+    found, factors, unsettled = estimate(whole, of, repeat)
+    components = variance_components(found, of, factors)
+    network = problem.network.note(*_unchanged(components))
+    if unsettled:
+        network = network.warn(
+            f"the variance components did not converge in {ROUNDS} rounds "
+            f"({', '.join(unsettled)}): their σ are not final"
+        )
+    problem = dataclasses.replace(cast(NetworkProblem, found.problem), network=network)
+    return problem, repeat.minimum, factors
+
+
+def _unchanged(components: dict[str, Component]) -> Iterator[str]:
+    """Notes on groups whose variance component cannot be estimated."""
+    for name, component in components.items():
+        if not component.usable:
+            why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
+            yield f"variance components: {name} {why}; their σ are unchanged"
+
+
+def eliminate_parameters(
+    problem: NetworkProblem, minimum: Minimum, again: Minimise, critical_t: float
+) -> tuple[NetworkProblem, Minimum, list[Name]]:
+    """Fix insignificant additional parameters at their default (mostly 0), the weakest first."""
+    names = []
+    models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
+    while True:
+        # One parameter a round: eliminating one changes the t of all that are correlated with it.
+        result = Adjustment(problem.network, problem, minimum)
+        weak = [
+            name
+            for _, name in result.insignificant(critical_t)
+            if name.parameter not in models[name.id].core
+        ]
+        if not weak:
+            return problem, minimum, names
+        names.append(weak[0])
+        problem, values = _without_parameter(problem, minimum.values, weak[0])
+        problem, minimum = again(problem, values)
+        require_solved(problem, minimum, f"without {weak[0]}")
+
+
+def _without_parameter(
+    problem: NetworkProblem, values: Values, name: Name
+) -> tuple[NetworkProblem, Values]:
+    """The problem with a parameter held at its default, and all parameters tied to it; a prior of
+    it has no weight any more, or it would count as an observation of a constant."""
+    c = [camera.id for camera in problem.network.cameras].index(name.id)
+    model = get_model(problem.network.cameras[c].model)
+    column = model.parameters.index(name.parameter)
+    tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
+    columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
+    value = default_parameters(model)[name.parameter]
+    table, row = problem.table_of_camera(c)
+    rows_with_value = lambda rows: jnp.asarray(rows).at[row, columns].set(value)
+    reset = lambda values: values | {table.name: rows_with_value(values[table.name])}
+    weight = dict(problem.data.weight)
+    if table.interior_set in weight:
+        (prior,) = np.nonzero(problem.observations_of(table.interior_set).rows[0] == row)
+        given = jnp.asarray(weight[table.interior_set])
+        weight[table.interior_set] = given.at[prior, column].set(0.0)
+    data = dataclasses.replace(problem.data, start=reset(problem.data.start), weight=weight)
+    moving = problem.table(table.name).vector.moving.index(column)
+    return hold(with_data(problem, data), table.name, row, [moving]), reset(values)

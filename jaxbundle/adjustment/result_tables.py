@@ -1,0 +1,297 @@
+"""The tables of a result: columns by name from an `Adjustment`.
+
+σ are a posteriori, angles in the network's unit; there is one function per kind of table.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.quality.further_unknowns import estimates
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.leastsquares.declarations import ObservationSet
+from jaxbundle.leastsquares.quality.correlation import correlation_matrix, total_correlation
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
+from jaxbundle.network.kinds import OF_ANGLES
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.network.units import ANGLE_UNITS
+
+if TYPE_CHECKING:
+    from jaxbundle.adjustment.result import Adjustment
+
+
+def cameras(adjustment: "Adjustment") -> dict[str, dict]:
+    """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
+    correlation matrix of the free ones."""
+    tables = {}
+    for given in adjustment.problem.network.cameras:
+        values = adjustment.camera_parameters(given.id)
+        free, Q = adjustment.camera_cofactor(given.id)
+        sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
+        total = dict(zip(free, total_correlation(Q))) if free else {}
+        # Tied parameters are one unknown: all have its σ and its correlations.
+        for first, *others in given.tie:
+            if first in sigma:
+                sigma |= dict.fromkeys(others, sigma[first])
+                total |= dict.fromkeys(others, total[first])
+        default = default_parameters(get_model(given.model))
+        tables[given.id] = {
+            "model": str(given.model),
+            "parameters": {
+                name: {
+                    "value": value,
+                    "sigma": float(sigma[name]) if name in sigma else None,
+                    "free": name in sigma,
+                    "t": _significance(value - default.get(name, 0.0), sigma[name])
+                    if name in sigma
+                    else None,
+                    "total_correlation": float(total[name]) if name in sigma else None,
+                }
+                for name, value in values.items()
+            },
+            "free": free,
+            "tied": [list(group) for group in given.tie],
+            "correlations": correlation_matrix(Q),
+        }
+    return tables
+
+
+def parameters(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """The parameters of all cameras, one row each."""
+    rows = [
+        {"camera": camera, "model": given["model"], "parameter": parameter, **entry}
+        for camera, given in adjustment.cameras.items()
+        for parameter, entry in given["parameters"].items()
+    ]
+    return {key: np.array([row[key] for row in rows], dtype=object) for key in rows[0]}
+
+
+def images(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
+    image unit)."""
+    problem = adjustment.problem
+    scale = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
+    values = adjustment.image_values * scale
+    sigma = np.sqrt(np.clip(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2), 0, None))
+    sigma = sigma * scale
+    table = {"id": np.array(problem.network.images.id, dtype=object)}
+    table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
+    table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
+    return table | _rays_and_rms(adjustment, problem.image, len(values))
+
+
+def points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """Columns id, role, X, Y, Z, sX, sY, sZ, rays, rms (of v of its image points, image unit)."""
+    problem, network = adjustment.problem, adjustment.problem.network
+    sigma = np.sqrt(np.clip(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2), 0, None))
+    table = {
+        "id": np.array(network.points.id, dtype=object),
+        "role": np.array(network.points.role, dtype=object),
+    }
+    table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+    return table | _rays_and_rms(adjustment, problem.point, len(network.points))
+
+
+def far_points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """The points at any distance, if any: columns id, uX, uY, uZ (the direction from the centroid
+    of the projection centres), su (its largest σ, angle unit), distance, nearer and farther (one σ
+    of the inverse distance from it), at_infinity."""
+    found = adjustment.far_points
+    if found is None:
+        return {}
+    table = {"id": np.array(found.id, dtype=object)}
+    table |= {f"u{axis}": found.direction[:, i] for i, axis in enumerate("XYZ")}
+    table["su"] = found.sigma_direction[:, 0] * adjustment.angle_scale
+    table |= {"distance": found.distance, "nearer": found.reach[:, 0], "farther": found.reach[:, 1]}
+    return table | {"at_infinity": found.at_infinity}
+
+
+def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[str, str]:
+    """The units of columns of a table that have one for all rows."""
+    if name in ("residuals", "cameras"):
+        return {}
+    length, angle = adjustment.network.object_unit, adjustment.network.angle_unit
+    known = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
+    known |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
+    known["rms"] = adjustment.image_unit
+    of = lambda column: known.get(column) or known.get(column[1:] if column[:1] in "sd" else "")
+    return {column: unit for column in columns if (unit := of(column))}
+
+
+def _rays_and_rms(
+    adjustment: "Adjustment", of_ray: Int[np.ndarray, " rays"], n: int
+) -> dict[str, np.ndarray]:
+    """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
+    weight, used = adjustment.problem.image_weights, adjustment.problem.used_coordinates
+    v = adjustment.inspection.image_residuals / np.where(used, weight, 1.0)
+    squares = np.bincount(of_ray, (v**2 * used).sum(1), minlength=n)
+    number = np.bincount(of_ray, used.sum(1), minlength=n)
+    return {
+        "rays": np.bincount(of_ray, used.any(1), minlength=n).astype(int),
+        "rms": np.sqrt(np.where(number > 0, squares, np.nan) / np.maximum(number, 1)),
+    }
+
+
+def residuals(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """One row per observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda), tau
+    (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
+    first, in the given order."""
+    found = adjustment.reliability
+    parts = observations(adjustment.problem, *(getattr(found, name) for name in TESTED))
+    return concatenate([residual_rows(adjustment, part) for part in parts])
+
+
+BySet = Mapping[str, Float[np.ndarray, "n r"]]
+
+
+class KindRows(NamedTuple):
+    """Observations of one kind: ids of image and point of each ("" for none), names of its axes;
+    1/σ [observations, axes], and further quantities in that shape; `angle_scale`: factor from
+    radians to the unit of angles in tables."""
+
+    kind: str
+    image: Sequence[str] | np.ndarray
+    point: Sequence[str] | np.ndarray
+    axes: Sequence[str]
+    inverse_sigma: Float[np.ndarray, "observations axes"]
+    quantities: tuple[Float[np.ndarray, "observations axes"], ...]
+    angle_scale: float = 1.0
+
+
+def observations(problem: NetworkProblem, *found: BySet) -> Iterator[KindRows]:
+    """Every kind of observation, with the part of each of `found`."""
+    network = problem.network
+    images = np.array(network.images.id, dtype=object)
+    points = np.array(network.points.id, dtype=object)
+    cameras = np.array([c.id for c in network.cameras], dtype=object)
+    blank = lambda rows: np.full(rows, "", dtype=object)
+    known = {o.name: o for o in problem.observations}
+
+    scale = 1 / ANGLE_UNITS[network.angle_unit]
+
+    def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], float]:
+        return problem.weights(name), tuple(np.asarray(rows[name]) for rows in found), scale
+
+    weight, *rows = (np.asarray(problem.image_points(x)) for x in (problem.data.weight, *found))
+    of_image, of_point = images[problem.image], points[problem.point]
+    yield KindRows("image", of_image, of_point, ("x", "y"), weight, tuple(rows))
+    if "control" in known:
+        control = points[known["control"].rows[0]]
+        yield KindRows(
+            "control", blank(len(control)), control, tuple("XYZ"), *quantities("control")
+        )
+    if "exterior" in known:
+        exterior = images[known["exterior"].rows[0]]
+        yield KindRows("prior", exterior, blank(len(exterior)), EXTERIOR, *quantities("exterior"))
+    for table in problem.cameras:
+        name = table.interior_set
+        if name in known:
+            own = cameras[table.cameras[known[name].rows[0]]]
+            yield KindRows("prior", own, blank(len(own)), table.parameters, *quantities(name))
+    for name in problem.further_sets:
+        yield KindRows(*_of_further_kind(problem, known[name]), *quantities(name))
+    if "distance" in known:
+        a, b = (points[network.distances.points[:, i]] for i in range(2))
+        yield KindRows("distance", a, b, ("d",), *quantities("distance"))
+
+
+def _of_further_kind(
+    problem: NetworkProblem, given: ObservationSet
+) -> tuple[str, np.ndarray, np.ndarray, tuple[str, ...]]:
+    """The rows that observations of a further kind touch are in the column of the point."""
+    touched = [given.label(problem.tables, row) for row in range(given.number)]
+    touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
+    width = problem.weights(given.name).shape[1]
+    axes = given.kind.axes or tuple(str(i + 1) for i in range(width))
+    blank = np.full(given.number, "", dtype=object)
+    return given.kind.name, blank, np.array(touched, dtype=object), axes
+
+
+def further_unknowns(adjustment: "Adjustment") -> dict[str, dict]:
+    """By table, row and name: value and sigma, like `Adjustment.further_unknowns`."""
+    found: dict[str, dict] = {}
+    names, origin = set(adjustment.problem.further_tables), adjustment.problem.origin
+    if not names:
+        return found
+    for one in estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin):
+        unit = adjustment.angle_scale if one.angle else 1.0
+        row = found.setdefault(one.table, {}).setdefault(one.row, {})
+        row[one.name] = {"value": one.value * unit, "sigma": one.sigma * unit}
+    return found
+
+
+def checks(adjustment: "Adjustment") -> dict[str, np.ndarray]:
+    """The check points, if any: columns id, X, Y, Z, dX, dY, dZ (against the given
+    coordinates), sX, sY, sZ, rays."""
+    found = adjustment.check_points
+    if found is None:
+        return {}
+    sigma = adjustment.sigma0 * np.sqrt(np.diagonal(found.cofactor, axis1=1, axis2=2))
+    table = {"id": np.array(found.id, dtype=object)}
+    table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+    return table | {"rays": found.rays}
+
+
+TESTED = ("residual", "gain", "redundancy", "w", "hat")
+"""Of `Reliability`, what a row of residuals is made of."""
+
+
+class TestedResult(Protocol):
+    """What rows of residuals need of an adjustment: the weight factors of robust estimation, and
+    Pope's τ of w."""
+
+    @property
+    def weights(self) -> Float[np.ndarray, " rays"] | None: ...
+
+    def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]: ...
+
+
+def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndarray]:
+    """The observations of one kind as columns, a row for every axis with weight; the quantities of
+    the part are `TESTED`."""
+    # The engine's quantities are of v/σ, and so without unit; rows of the table have that of their
+    # kind. Rows without weight (axes that are not given, removed observations) are left out.
+    v, gain, r, w, hat = part.quantities
+    kind, axes = part.kind, part.axes
+    free = np.clip(1 - hat, 0, 1)
+    unit = np.ones(part.inverse_sigma.shape[1])
+    if kind in OF_ANGLES or tuple(axes) == EXTERIOR:
+        unit[-3:] = part.angle_scale
+    used = part.inverse_sigma > 0
+    sigma = np.where(used, unit / np.where(used, part.inverse_sigma, 1), np.nan)
+    repeat = lambda ids: np.repeat(ids, len(axes))
+    columns = {
+        "kind": np.full(sigma.size, kind, dtype=object),
+        "image": repeat(part.image),
+        "point": repeat(part.point),
+        "axis": np.tile(np.array(axes, dtype=object), len(part.image)),
+        "v": (v * sigma).ravel(),
+        "sigma": sigma.ravel(),
+        "r": r.ravel(),
+        "w": w.ravel(),
+        "tau": adjustment.pope(w).ravel(),
+        "mdb": minimal_detectable(sigma / np.where(used, gain, 1.0), free).ravel(),
+        "external": external_reliability(free).ravel(),
+    }
+    if adjustment.weights is not None:
+        factor = adjustment.weights if kind == "image" else np.ones(len(part.image))
+        columns["weight"] = repeat(factor)
+    return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+def _significance(value: float, sigma: float) -> float:
+    """t = |value − default|/σ, the default mostly 0; for σ = 0, as after an exact fit, infinite, or
+    NaN for the value 0."""
+    if sigma == 0:
+        return float("inf") if value else float("nan")
+    return abs(value) / float(sigma)
+
+
+def concatenate(tables: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}

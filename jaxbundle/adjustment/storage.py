@@ -1,0 +1,166 @@
+"""The part of an adjustment that is saved: all that its result follows from without iterating.
+
+The network, the start values, weights and free unknowns that the adjustment ended with, and the
+adjusted values. Everything else (covariances, redundancy numbers, tests, tables) is computed from
+these on demand, as in the process that adjusted.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.cameras import CameraModel, get_model, is_own
+from jaxbundle.io.results.stored_tree import fingerprint, write_tree
+from jaxbundle.leastsquares.quality.names import Name
+from jaxbundle.network.blunders import Removed, Suspect
+from jaxbundle.network.kinds import KINDS
+from jaxbundle.network.tables import (
+    Camera,
+    Distances,
+    Images,
+    LeftOut,
+    Network,
+    Observations,
+    Points,
+    Source,
+)
+
+NETWORK = (
+    Network,
+    LeftOut,
+    Camera,
+    Images,
+    Points,
+    Observations,
+    Distances,
+    Source,
+    *KINDS.values(),
+)
+FORMAT = "jaxbundle adjustment 1"
+"""Its number changes when older files cannot be read any more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """Where the engine ended: `free` by table; `weights` by set of observations; `start` and
+    `values`, the leaves of `Values`; `history` of the iterations."""
+
+    tables: tuple[str, ...]
+    kinds: tuple[str, ...]
+    reduction: str
+    lengths: np.ndarray | None
+    free: tuple[np.ndarray, ...]
+    weights: tuple[np.ndarray, ...]
+    start: tuple[np.ndarray, ...]
+    values: tuple[np.ndarray, ...]
+    termination: int
+    iterations: int
+    history: tuple[np.ndarray, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stored:
+    """A saved adjustment; `check`: check points and their image points; `own_models`: names of
+    camera models that only an object describes; `notes`: arguments of the `Adjustment`;
+    `image_weights`, `robust_scale`: of robust estimation."""
+
+    format: str
+    version: str
+    fingerprint: str
+    sigma0: float
+    network: Network
+    check: tuple[Points, Observations] | None
+    own_models: tuple[str, ...]
+    state: State
+    notes: dict[str, Any]
+    image_weights: np.ndarray | None
+    robust_scale: float | None
+
+
+CLASSES = (*NETWORK, Stored, State, Removed, Suspect, Name)
+
+
+def network_fingerprint(network: Network) -> str:
+    """16 hex digits of a network's content: cameras, start values, measurements, settings; not of
+    where it was read."""
+    # Messages and names do not change a result: the same measurements have the same fingerprint.
+    network = with_named_models(network).replace(warnings=(), notes=(), left_out=(), name="")
+    return fingerprint(network, NETWORK, without=(Source,))
+
+
+def with_named_models(network: Network) -> Network:
+    """The network with the names of own camera models for the models."""
+    named = lambda model: model.name if isinstance(model, CameraModel) else model
+    cameras = (dataclasses.replace(c, model=named(c.model)) for c in network.cameras)
+    return network.replace(cameras=tuple(cameras))
+
+
+def with_own_models(network: Network, models: Sequence[CameraModel]) -> Network:
+    """The network with these camera models for their names."""
+    own = {model.name: model for model in models}
+    model = lambda camera: own.get(str(camera.model), camera.model)
+    cameras = (dataclasses.replace(c, model=model(c)) for c in network.cameras)
+    return network.replace(cameras=tuple(cameras))
+
+
+def store(adjustment: Any, path: str | Path) -> None:
+    """Write an `Adjustment` that was solved into a file.
+
+    **Raises:** `InputError` where the file cannot be written."""
+    from jaxbundle import __version__
+
+    problem, minimum = adjustment.problem, adjustment.minimum
+    network = problem.network
+    # Own camera models are functions, which a file cannot hold without executing it when read.
+    own = {get_model(c.model).name for c in network.cameras if is_own(get_model(c.model))}
+    named = (
+        "removed",
+        "eliminated",
+        "method",
+        "reduction",
+        "sigma_factors",
+        "robust",
+        "suspects",
+        "findings",
+    )
+    notes = {name: getattr(adjustment, name) for name in named}
+    found = Stored(
+        FORMAT,
+        __version__,
+        adjustment.fingerprint,
+        adjustment.sigma0,
+        with_named_models(network),
+        adjustment.check,
+        tuple(sorted(own)),
+        _state(problem, minimum),
+        notes | {"doubts": adjustment.given_doubts},
+        adjustment.weights,
+        adjustment.robust_scale,
+    )
+    write_tree(path, found, CLASSES)
+
+
+def _state(problem: NetworkProblem, minimum: Any) -> State:
+    steps = int(minimum.iterations)
+    leaves = lambda tree: tuple(np.asarray(x) for x in jax.tree.leaves(tree))
+    history = minimum.history
+    return State(
+        tables=tuple(t.name for t in problem.tables),
+        kinds=tuple(o.kind.name for o in problem.observations),
+        reduction=problem.reduction,
+        lengths=problem.lengths,
+        free=tuple(np.asarray(t.free) for t in problem.tables),
+        weights=leaves([problem.data.weight[o.name] for o in problem.observations]),
+        start=leaves(problem.data.start),
+        values=leaves(minimum.values),
+        termination=int(minimum.termination),
+        iterations=steps,
+        history=tuple(
+            np.asarray(x)[:steps] for x in (history.cost, history.damping, history.accepted)
+        ),
+    )

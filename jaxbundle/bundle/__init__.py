@@ -1,1 +1,0 @@
-"""Bundle adjustment: start values, rounds of the engine, and the `Adjustment`."""

@@ -1,0 +1,67 @@
+"""The global test of an adjustment: vᵀPv against the a priori σ that somebody stated.
+
+    χ²(α/2; r) ≤ vᵀPv ≤ χ²(1 − α/2; r)            Mikhail and Ackermann (1976), section 11
+
+It tests these σ, and needs them: σ that nobody gave are units of weight, of which σ0 is the
+estimate, and σ estimated from the same residuals make σ0 = 1. Then nothing is tested. This is the
+one place that decides it, for text, pages, JSON and every command.
+"""
+
+import math
+
+from jaxbundle.choices import ESTIMATED, STATED
+from jaxbundle.leastsquares.quality.distributions import chi2_quantile
+
+LEVEL = 0.05
+CONTRADICTING_RATIO = 1.2
+"""A scale beyond this factor contradicts the a priori σ, if it is also significant."""
+SIGNIFICANCE = 0.001
+
+
+def is_tested(redundancy: int, origin: str) -> bool:
+    """Whether there are a priori σ to test; `origin` of the σ (`SIGMA_ORIGINS`)."""
+    return redundancy > 0 and origin == STATED
+
+
+def contradicts(scale: float, redundancy: int) -> bool:
+    """Whether a scale of 1 can be excluded."""
+    low, high = (
+        math.sqrt(chi2_quantile(p, redundancy) / redundancy)
+        for p in (SIGNIFICANCE / 2, 1 - SIGNIFICANCE / 2)
+    )
+    return not (min(1 / CONTRADICTING_RATIO, low) <= scale <= max(CONTRADICTING_RATIO, high))
+
+
+def chi_squared_test(
+    vtpv: float, redundancy: int, origin: str = STATED, significance: float = LEVEL
+) -> dict:
+    """χ² test of vᵀPv against a variance factor of 1, two-sided: `vtpv`; `low`, `high`, the
+    interval; `passed`, None if nothing is tested; `sigma_origin`."""
+    low = high = passed = None
+    if redundancy > 0:
+        ends = significance / 2, 1 - significance / 2
+        low, high = (chi2_quantile(p, redundancy) for p in ends)
+    if low is not None and high is not None and is_tested(redundancy, origin):
+        passed = low <= vtpv <= high
+    return {"vtpv": vtpv, "low": low, "high": high, "passed": passed, "sigma_origin": origin}
+
+
+def describe_test(found: dict, unit: str, significance: float = LEVEL) -> str:
+    """The conclusion of a `chi_squared_test`, or why there is none; `unit`: of weight, such as
+    "1 mm"."""
+    if found["low"] is None:
+        return "no redundancy: σ0 and standard deviations cannot be estimated"
+    if found["sigma_origin"] == ESTIMATED:
+        return "not done: the σ were estimated from these residuals, so that σ0 is 1"
+    if found["passed"] is None:
+        return f"no a priori σ was given: {unit} is a unit of weight; σ0 a posteriori estimates it"
+    vtpv, low, high = (f"{found[name]:.5g}" for name in ("vtpv", "low", "high"))
+    said = (
+        f"{'' if found['passed'] else 'not '}passed: vᵀPv {vtpv}, "
+        f"{100 * (1 - significance):g} % interval {low} to {high}; "
+    )
+    if found["passed"]:
+        return f"{said}the a priori σ are confirmed"
+    if found["vtpv"] < found["low"]:
+        return f"{said}the observations are better than their a priori σ"
+    return f"{said}the a priori σ are too small, blunders are left, or the cameras lack parameters"
