@@ -59,6 +59,10 @@ $(VENV)/installed-demo: pyproject.toml
 	fi
 	@touch $@
 
+# The types of names that are imported on first use.
+stubs:
+	$(BIN)/python tests/stubs.py
+
 test: CASES = -m 'not further'
 test-further: CASES = -m further -x
 test test-further test-all: install

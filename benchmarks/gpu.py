@@ -254,8 +254,8 @@ def _scan(jax, part: str) -> dict:
     import numpy as np
     import pushbroom
 
-    from jaxbundle.pushbroom.locate import locate_lines
-    from jaxbundle.pushbroom.project import make_search, project_from
+    from jaxbundle.pushbroom.ground_to_image import make_search, project_from
+    from jaxbundle.pushbroom.image_to_ground import locate_lines
     from jaxbundle.pushbroom.surfaces import Ground
 
     scan, ground, rows = pushbroom.image(), Ground(), 512

@@ -39,9 +39,9 @@ jaxbundle.enable_x64()
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic, residual  # noqa: E402
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table  # noqa: E402
 from jaxbundle.pushbroom.earth_frames import circular_orbit  # noqa: E402
+from jaxbundle.pushbroom.ground_to_image import make_search, project_from, project_points  # noqa: E402
 from jaxbundle.pushbroom.image import make_image  # noqa: E402
-from jaxbundle.pushbroom.locate import locate_lines  # noqa: E402
-from jaxbundle.pushbroom.project import make_search, project_from, project_points  # noqa: E402
+from jaxbundle.pushbroom.image_to_ground import locate_lines  # noqa: E402
 from jaxbundle.pushbroom.rpc import locate_points as rpc_locate  # noqa: E402
 from jaxbundle.pushbroom.rpc import project_points as rpc_project  # noqa: E402
 from jaxbundle.pushbroom.rpc_fit import fit_image  # noqa: E402

@@ -17,10 +17,10 @@ import jaxbundle
 from jaxbundle.planning.render import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
-from jaxbundle.surface.correlation import correlate, make_pyramid
-from jaxbundle.surface.reconstruct import find_bounds, reconstruct
-from jaxbundle.surface.segments import segments, windows
-from jaxbundle.surface.views import FrameView
+from jaxbundle.surfaces.correlation import correlate, make_pyramid
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.segments import segments, windows
+from jaxbundle.surfaces.views import FrameView
 
 HALF, POSITIONS = 10, 100
 SIZE, F = (1000, 750), 1000.0

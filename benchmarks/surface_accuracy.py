@@ -17,8 +17,8 @@ import jaxbundle
 from jaxbundle.planning.render import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle, Shape
 from jaxbundle.planning.texture import Texture
-from jaxbundle.surface.reconstruct import find_bounds, reconstruct
-from jaxbundle.surface.views import FrameView
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.views import FrameView
 
 SIZE, F = (480, 360), 480.0
 HEIGHT = 10.0

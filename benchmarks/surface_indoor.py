@@ -21,8 +21,8 @@ import jaxbundle
 from jaxbundle.planning.render import Scene, Sensor, render
 from jaxbundle.planning.shapes import Rectangle
 from jaxbundle.planning.texture import Texture
-from jaxbundle.surface.reconstruct import find_bounds, reconstruct
-from jaxbundle.surface.views import FrameView
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.views import FrameView
 
 BASE, DEPTH = 0.2, 5.0
 ROOM = 2.6, 1.6

@@ -21,15 +21,15 @@ from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.planning.render import Scene, Sensor, first_hits, render_rays
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
-from jaxbundle.pushbroom.locate import locate_point
+from jaxbundle.pushbroom.flight import Flight, true_image
+from jaxbundle.pushbroom.image_to_ground import locate_point
 from jaxbundle.pushbroom.rpc_fit import fit_image
 from jaxbundle.pushbroom.scanner import FocalLine
-from jaxbundle.pushbroom.simulate import Flight, true_image
 from jaxbundle.pushbroom.surfaces import Ground
-from jaxbundle.surface.dsm import make_dsm
-from jaxbundle.surface.ground import RpcView, neighbourhood
-from jaxbundle.surface.reconstruct import ground_bounds, reconstruct
-from jaxbundle.surface.relative import align_all
+from jaxbundle.surfaces.dsm import make_dsm
+from jaxbundle.surfaces.ground import RpcView, neighbourhood
+from jaxbundle.surfaces.reconstruct import ground_bounds, reconstruct
+from jaxbundle.surfaces.relative import align_all
 
 GSD, ORBIT, SPEED = 0.5, 650e3, 6.9e3
 PITCHES = -0.22, 0.22

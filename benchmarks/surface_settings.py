@@ -17,7 +17,7 @@ import jax
 from surface_accuracy import SCENES, make, row
 
 import jaxbundle
-from jaxbundle.surface.reconstruct import SurfaceSettings
+from jaxbundle.surfaces.reconstruct import SurfaceSettings
 
 FIGURES = ("points", "% < 0.2", "RMS", "RMS robust", "% < 3s", "% out", "factor", "s")
 

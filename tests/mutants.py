@@ -41,7 +41,7 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 # What every child process needs and no mutant changes; JAX starts its threads later, in the child.
 import equinox, hypothesis, jax, lineax, optimistix, pytest, scipy.optimize  # noqa: E401, E402, F401, I001
 
-ROOMS = ("leastsquares", "network", "orientation", "reconstruction", "tiepoints", "surface")
+ROOMS = ("leastsquares", "network", "orientation", "reconstruction", "tiepoints", "surfaces")
 TESTS = (*ROOMS, "adjustment", "statistics", "test_blunders.py", "test_weak_networks.py")
 """Those of other rooms may notice what these do not: messages and reports, above all."""
 TIMES_AS_LONG, LEAST = 6, 60

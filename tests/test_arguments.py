@@ -167,7 +167,7 @@ def test_what_cannot_be_used_is_refused_by_name(convergent4):
 
 
 @pytest.mark.parametrize("call", [
-    jaxbundle.adjust, jaxbundle.orient, jaxbundle.check_network, jaxbundle.make_problem,
+    jaxbundle.check_network, jaxbundle.make_problem,
     lambda path: jaxbundle.write_project(path, "x"),
 ])  # fmt: skip
 def test_a_path_in_place_of_a_network_names_read_network(call):

@@ -54,7 +54,7 @@ def test_subpackages_are_attributes_of_the_package():
     found = subprocess.run([sys.executable, "-c", ROOMS], capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
     rooms, message = found.stdout.splitlines()
-    assert {"jaxbundle.io", "jaxbundle.leastsquares", "jaxbundle.surface"} <= {*rooms.split()}
+    assert {"jaxbundle.io", "jaxbundle.leastsquares", "jaxbundle.surfaces"} <= {*rooms.split()}
     assert message == "module 'jaxbundle' has no attribute 'leastsquare'"
 
 

@@ -10,11 +10,11 @@ import scipy.stats
 from numpy.testing import assert_allclose, assert_array_equal
 from page_reader import Page, column, data_of, decode
 
-from jaxbundle.batch.page import compose_batch
+from jaxbundle.batches.page import compose_batch
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.explore.camera import CameraView
-from jaxbundle.explore.network import NetworkView
-from jaxbundle.explore.server import page_file
+from jaxbundle.explorer.camera import CameraView
+from jaxbundle.explorer.network import NetworkView
+from jaxbundle.explorer.server import page_file
 from jaxbundle.network.tables import Camera
 from jaxbundle.plotting import views
 from jaxbundle.plotting.ticks import label_coordinates, label_ticks, offset_in_words
@@ -238,7 +238,7 @@ def test_the_explorer_draws_the_expected_ellipsoids_and_says_so(convergent4):
 def styles() -> str:
     return "".join(
         files("jaxbundle").joinpath(path).read_text(encoding="utf-8")
-        for path in ("report/page/page.css", "explore/page/explore.css")
+        for path in ("report/page/page.css", "explorer/page/explore.css")
     )
 
 

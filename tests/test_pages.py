@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from page_reader import Page, column
 
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.batch.page import compose_batch
-from jaxbundle.batch.run import result_rows
+from jaxbundle.batches.page import compose_batch
+from jaxbundle.batches.run import result_rows
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.page import compose_part

@@ -10,12 +10,12 @@ from rich.progress import Progress as Bars
 
 import jaxbundle
 from jaxbundle import types
-from jaxbundle.batch.run import run_batch
+from jaxbundle.batches.run import run_batch
 from jaxbundle.calibration.choice import compare_models
 from jaxbundle.io.rasters.correction import write_corrected
 from jaxbundle.measure.views import measure_boards
 from jaxbundle.reconstruction.reconstruct import reconstruct
-from jaxbundle.surface.reconstruct import reconstruct as reconstruct_surface
+from jaxbundle.surfaces.reconstruct import reconstruct as reconstruct_surface
 
 LONG = [
     jaxbundle.adjust, jaxbundle.calibrate, jaxbundle.calibrate_cameras, jaxbundle.calibrate_batch,

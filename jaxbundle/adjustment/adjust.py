@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -47,6 +48,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import at_least_zero, integer, one_of, show, truth
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.formats import as_network
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
@@ -58,7 +60,7 @@ from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import UNIT, Network, Observations, Points, require_network
+from jaxbundle.network.tables import UNIT, Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
     name_lengths,
     name_pixels,
@@ -111,8 +113,12 @@ ROUNDS = RoundSettings()
 
 
 def adjust(
-    network: Network,
+    network: Network | str | Path,
     *,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    control: str | Path | None = None,
+    check: Sequence[str] = (),
     also: Sequence[Table | ObservationSet] = (),
     method: str = "levenberg-marquardt",
     reduction: str | None = None,
@@ -130,8 +136,10 @@ def adjust(
 
     **Arguments:**
 
-    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`.
-      Missing start values are computed first (`jaxbundle.orient`).
+    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`; or
+      the path of one, which is read with `format`, `overrides` (`--set`) and `control`. Missing
+      start values are computed first (`jaxbundle.orient`).
+    - `check`: control points that are only compared with the result: names, or `"every 3rd"`.
     - `also`: observations of further kinds (`jaxbundle.leastsquares.Kind`), and tables of their
       unknowns. They touch the network's tables "image", "camera" and "point" by id, receive object
       coordinates unchanged, and have their own variance group, redundancy numbers and residuals
@@ -174,7 +182,9 @@ def adjust(
         estimate_components=estimate_components,
         progress=progress,
     )
-    given = without_placeholders(require_network(network))
+    given = without_placeholders(
+        as_network(network, format=format, overrides=overrides, control=control, check=check)
+    )
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, _largest_sigma0(given))
@@ -194,7 +204,7 @@ def adjust(
         else options | {"progress": partial(_tell, progress, max_iterations)}
     )
     first = _FirstMinimum(reduction, also, oriented, told)
-    problem, minimum, check = first.find(given, outliers=bool(robust or snooping))
+    problem, minimum, checked = first.find(given, outliers=bool(robust or snooping))
     again = partial(minimise_with_infinity, **told)
     # The statistics need the factor of the normal matrix even where the iterations did without.
     found = _AdjustmentState(
@@ -209,7 +219,7 @@ def adjust(
             found.estimate_components(again)
         if eliminate:
             found.eliminate_parameters(again, critical_t)
-    result = found.adjustment(check)
+    result = found.adjustment(checked)
     sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
     if found.inspection:
         result = result.with_changes(

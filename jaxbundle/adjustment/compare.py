@@ -21,6 +21,7 @@ geodätischer Deformationsmessungen (the test of congruency); Welch (1947), Biom
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -44,6 +45,7 @@ from jaxbundle.network.columns import count, data_frame, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.report.layout import fixed
+from jaxbundle.results import ResultMethods, rows_of
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -70,7 +72,7 @@ class Congruency:
 
 @print_anywhere
 @dataclasses.dataclass(frozen=True)
-class AdjustmentComparison:
+class AdjustmentComparison(ResultMethods):
     """Two adjustments compared: one row an unknown that both have.
 
     - `kind` (camera, image, point), `id`, `parameter` and `unit` of every row;
@@ -120,6 +122,25 @@ class AdjustmentComparison:
             "differs",
         )
         return {name: getattr(self, name) for name in names}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Rows and tests as plain dicts and numbers."""
+        return {
+            "unknowns": rows_of(self.table()),
+            "similarity": None if self.similarity is None else self.similarity.tolist(),
+            "held_by": list(self.held_by),
+            "tests": {
+                name: {
+                    "f": test.f,
+                    "rank": test.rank,
+                    "freedom": test.freedom,
+                    "probability": test.probability,
+                }
+                for name, test in self.tests.items()
+            },
+            "shared": self.shared,
+            "significance": self.significance,
+        }
 
     def to_pandas(self):
         """The table as a pandas data frame (extra `tables`)."""

@@ -22,11 +22,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.response import pull_back
 from jaxbundle.network.columns import data_frame
 from jaxbundle.report.layout import significant, table
+from jaxbundle.results import ResultMethods, rows_of
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Influence:
+class Influence(ResultMethods):
     """The influence of measurements on results.
 
     **Fields:** `results`, with names and descriptions; their `sigma` (a posteriori; for a design a
@@ -64,6 +65,13 @@ class Influence:
             )
             blocks.append("\n".join([f"Influence on {result.words}", *lines]))
         return "\n\n".join(blocks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """σ of every result, and the measurements with their influence, largest first."""
+        return {
+            one.name: {"sigma": float(sigma), "measurements": rows_of(self.table(one.name))}
+            for one, sigma in zip(self.results, self.sigma)
+        }
 
     def to_pandas(self, result: str | None = None):
         """`table` as a pandas data frame (extra `tables`)."""

@@ -2,7 +2,8 @@
 them."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Int
 from jaxbundle.adjustment.problem import coordinates, make_problem
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
+from jaxbundle.io.formats import as_network
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images, keep_points
@@ -20,15 +22,26 @@ from jaxbundle.orientation.network import Oriented, find_start_values
 from jaxbundle.orientation.sights import TOLERANCE, Sights
 
 
-def orient(network: Network, *, tolerance: float = TOLERANCE) -> Oriented:
+def orient(
+    network: Network | str | Path,
+    *,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    control: str | Path | None = None,
+    tolerance: float = TOLERANCE,
+) -> Oriented:
     """Compute missing start values of a network; given ones are kept.
 
     The principal distance of a camera should be correct to a few per cent; its distortion may be
     unknown, and some measurements wrong. Large networks are adjusted whenever they have grown by a
     factor of two and a half.
 
-    **Arguments:** `tolerance`: largest residual of image points, relative to the image extent; the
-    default allows for a completely unknown distortion.
+    **Arguments:**
+
+    - `network`: a network, or the path of one, which is read with `format`, `overrides` (`--set`)
+      and `control` (`jaxbundle.read_network`).
+    - `tolerance`: largest residual of image points, relative to the image extent; the default
+      allows for a completely unknown distortion.
 
     **Returns:** the network with start values. Images and points that could not be oriented, and
     image points that contradict all others, are excluded and listed with the reason.
@@ -36,7 +49,8 @@ def orient(network: Network, *, tolerance: float = TOLERANCE) -> Oriented:
     **Raises:** `InputError` for bad tables; `NotSolvedError` if no image could be oriented.
     """
     require_x64()
-    return find_start_values(network, _adjust, tolerance)
+    given = as_network(network, format=format, overrides=overrides, control=control)
+    return find_start_values(given, _adjust, tolerance)
 
 
 def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:

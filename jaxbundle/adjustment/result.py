@@ -42,6 +42,7 @@ from jaxbundle.arguments import at_least_zero
 from jaxbundle.arguments import path as given_path
 from jaxbundle.display import print_anywhere
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
 from jaxbundle.leastsquares.datum.motions import SEVEN
@@ -63,6 +64,7 @@ from jaxbundle.network.tables import ESTIMATED, UNIT, Network, Observations, Poi
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
+from jaxbundle.results import finite
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -573,6 +575,11 @@ class Adjustment:
         """The full report as text (options: see `jaxbundle.report.text`)."""
         residual_limit = at_least_zero("residual_limit", residual_limit)
         return report.text(self, residual_limit, **options)
+
+    def to_dict(self, brief: bool = False) -> dict[str, Any]:
+        """The result as plain dicts and numbers, as in JSON (docs/result.md); `brief`: without
+        points and residuals."""
+        return finite(result_dict(self, brief))
 
     def __str__(self) -> str:
         return report.short(self)

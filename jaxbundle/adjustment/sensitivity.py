@@ -29,6 +29,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import show
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
+from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.problem import with_data, with_factor
 from jaxbundle.leastsquares.quality.response import follow
@@ -36,13 +37,14 @@ from jaxbundle.network.columns import data_frame
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER
 from jaxbundle.report.layout import significant, table
+from jaxbundle.results import ResultMethods
 
 MEASUREMENTS, TOTAL = "measurements", "total"
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Budget:
+class Budget(ResultMethods):
     """Effects of errors of held quantities on results.
 
     **Fields:** `results` and `causes`, with names and descriptions; `sigma` of every result from
@@ -87,6 +89,10 @@ class Budget:
         columns = dict(zip(names, zip(*rows)))
         text = {"result", "cause"}
         return {n: np.array(c, object if n in text else float) for n, c in columns.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The budget as plain dicts and numbers, as in JSON."""
+        return budget_dict(self)
 
     def rows(self) -> list[tuple[str, str, str, str, str]]:
         """`table` as formatted text, under `report.budget.HEADER`."""

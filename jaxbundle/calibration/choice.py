@@ -50,6 +50,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.results import ResultMethods
 from jaxbundle.types import Progress
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class Difference:
     over_sigma: float
 
 
-class ModelComparison:
+class ModelComparison(ResultMethods):
     """Comparison of models. Printing shows the table and the conclusion.
 
     **Attributes:** `candidates`, in the given order; `failed`: model and reason; `folds`; `views`

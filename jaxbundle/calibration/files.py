@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbundle.calibration.page import compose_calibration, compose_calibrations
-from jaxbundle.calibration.report import rig_dict
-from jaxbundle.calibration.verdict import conclude_calibrations
+from jaxbundle.calibration.report import calibrations_dict as calibrations_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv
@@ -37,7 +36,6 @@ from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.networks.rig_result import IN_BOARD_UNITS
 from jaxbundle.io.networks.stereo import ROS_FILES
-from jaxbundle.io.results.result_json import verdict_dict
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
@@ -253,18 +251,6 @@ def fill_rig(network: Network, folder: Path) -> None:
         else:
             said.append(refused)
     write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
-
-
-def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
-    """The JSON of one calibration, or of several under their names, with the rig."""
-    if len(found.cameras) == 1:
-        return next(iter(found.cameras.values())).to_dict(brief)
-    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
-    verdict = verdict_dict(conclude_calibrations(found))
-    document = {"converged": found.converged, "verdict": verdict, "calibrations": parts}
-    if found.rig is not None:
-        document["rig"] = rig_dict(found.rig, brief)
-    return document
 
 
 def fill_comparison(

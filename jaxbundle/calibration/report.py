@@ -461,3 +461,15 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
         },
         "quality": {name: _rig_quality(rig, name) for name in rig.names},
     } | ({} if brief else {"residuals": residuals})
+
+
+def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
+    """The JSON of one calibration, or of several under their names, with the rig."""
+    if len(found.cameras) == 1:
+        return next(iter(found.cameras.values())).to_dict(brief)
+    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
+    verdict = verdict_dict(conclude_calibrations(found))
+    document = {"converged": found.converged, "verdict": verdict, "calibrations": parts}
+    if found.rig is not None:
+        document["rig"] = rig_dict(found.rig, brief)
+    return document

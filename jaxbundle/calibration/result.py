@@ -22,6 +22,7 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
+from jaxbundle.results import ResultMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @print_anywhere
-class Calibration:
+class Calibration(ResultMethods):
     """A calibrated camera. It prints as a summary; `report()` is the full report.
 
     **Attributes:**

@@ -13,11 +13,12 @@ from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.results import ResultMethods
 from jaxbundle.types import Progress
 
 
 @dataclasses.dataclass(frozen=True)
-class Calibrations:
+class Calibrations(ResultMethods):
     """Calibrations by the name of the camera, and the rig, if any."""
 
     cameras: dict[str, Calibration]
@@ -26,6 +27,17 @@ class Calibrations:
     @property
     def converged(self) -> bool:
         return all(one.converged for one in self.cameras.values())
+
+    def to_dict(self, brief: bool = False) -> dict[str, Any]:
+        """The result as plain dicts and numbers, as in JSON: of one camera, or of several by name,
+        with their rig."""
+        from jaxbundle.calibration.report import calibrations_dict
+
+        return calibrations_dict(self, brief)
+
+    def __str__(self) -> str:
+        parts = [] if self.rig is None else [str(self.rig)]
+        return "\n".join([*parts, *map(str, self.cameras.values())])
 
     def report(self) -> str:
         """The verdict on several cameras, the report of their rig, and those of all cameras."""

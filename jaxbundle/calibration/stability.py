@@ -30,6 +30,7 @@ of Research of the NBS 87, 377-385.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -40,7 +41,10 @@ from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
+from jaxbundle.network.columns import data_frame
 from jaxbundle.network.tables import Camera
+from jaxbundle.report.layout import table
+from jaxbundle.results import ResultMethods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +64,7 @@ class Homogeneity:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Stability:
+class Stability(ResultMethods):
     """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,
     `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
     `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
@@ -85,6 +89,51 @@ class Stability:
     slope_sigma: Float[np.ndarray, " k"] | None = None
     slope_probability: Float[np.ndarray, " k"] | None = None
     about_slope: Float[np.ndarray, " k"] | None = None
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns by name, one row a parameter; those of slopes if numbers of the epochs are
+        known."""
+        columns = {
+            "mean": self.mean,
+            "sigma": self.mean_sigma,
+            "between": self.between,
+            "probability": self.probability,
+            "slope": self.slope,
+            "sigma_slope": self.slope_sigma,
+            "probability_slope": self.slope_probability,
+            "about_slope": self.about_slope,
+        }
+        known = {name: column for name, column in columns.items() if column is not None}
+        return {"parameter": np.array(self.names, dtype=object), **known}
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas data frame (extra `tables`)."""
+        return data_frame(self.table())
+
+    def __str__(self) -> str:
+        """Parameters and tests in lines."""
+        digits = {"mean": 6, "sigma": 6, "between": 6, "probability": 2, "slope": 4}
+        columns = self.table()
+        rows = [
+            [
+                str(name),
+                *(f"{x:.{digits.get(column, 2)}g}" for column, x in zip([*columns][1:], numbers)),
+            ]
+            for name, *numbers in zip(*columns.values())
+        ]
+        head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope", "p", "about it"]
+        head = head[: len(columns)]  # those of slopes come last
+        return "\n".join(
+            [
+                *table(head, rows, "l" + "r" * (len(head) - 1)),
+                "",
+                f"all epochs the same, all parameters: {self.all_parameters}",
+                f"the same, rotation removed:          {self.rotation_removed}",
+                f"images against the mean (RMS, rotation removed): {self.image_found:.4g} px, "
+                f"expected by the σ {self.image_expected:.4g} px; between epochs "
+                f"{self.image_between:.4g} px",
+            ]
+        )
 
     def to_dict(self) -> dict:
         """The result as plain dicts and numbers, as in JSON."""

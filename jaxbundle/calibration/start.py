@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.batch.camera import STATUS
-from jaxbundle.batch.camera import WEAK as WEAK_NUMBER
-from jaxbundle.batch.first_cameras import FirstCamera, first_cameras, parameters_of
+from jaxbundle.batches.camera import STATUS
+from jaxbundle.batches.camera import WEAK as WEAK_NUMBER
+from jaxbundle.batches.first_cameras import FirstCamera, first_cameras, parameters_of
 from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.cameras import CameraModel
 from jaxbundle.cameras.pixel_frame import in_model_units

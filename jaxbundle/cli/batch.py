@@ -110,18 +110,18 @@ def batch(  # noqa: PLR0913 - the options of the command
     refused, or recomputed with --renew. Status 0 means that every input has a line and at least one
     of them a result, 3 that none has. Only one run at a time may write the file.
     """
-    from jaxbundle.batch.camera import SOLVED
-    from jaxbundle.batch.page import compose_batch
-    from jaxbundle.batch.photographs import is_photograph_folder
-    from jaxbundle.batch.population import Population, read_against
-    from jaxbundle.batch.processes import add_parts, run_joined
-    from jaxbundle.batch.run import result_rows, run_batch
-    from jaxbundle.batch.stacks import is_camera_stack
+    from jaxbundle.batches.page import compose_batch
+    from jaxbundle.batches.photographs import is_photograph_folder
+    from jaxbundle.batches.population import read_against
+    from jaxbundle.batches.processes import add_parts, run_joined
+    from jaxbundle.batches.run import run_batch
+    from jaxbundle.batches.stacks import is_camera_stack
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
     from jaxbundle.cli.board_options import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting
+    from jaxbundle.commands.batch_run import BatchRun
     from jaxbundle.io.text.csv_tables import read_csv, write_text
     from jaxbundle.network.columns import count
 
@@ -192,8 +192,9 @@ def batch(  # noqa: PLR0913 - the options of the command
             renew=renew,
             progress=lambda _, done, total: bar.update(task, completed=done, total=total),
         )
+    done = BatchRun(tuple(inputs), json_lines, counts)
     if asked:
-        found = Population(result_rows(inputs, json_lines))
+        found = done.population
         # read again, for the keys that now have results
         beside = {} if columns is None else read_against(columns, found.keys, str(against))
         write_outputs(found, beside, table, summary)
@@ -217,11 +218,10 @@ def batch(  # noqa: PLR0913 - the options of the command
             },
         )
         write_text(Path(html), compose_batch(found, origin, beside))
-    skipped = counts.pop("skipped", 0)
-    said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
-    total, solved = counts.total(), sum(counts[status] for status in SOLVED)
+    total, solved = done.statuses.total(), done.solved
+    said = ", ".join(f"{n} {status}" for status, n in done.statuses.most_common() if n)
     if not quiet:
-        print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
+        print(done.report())
         if any(counts[status] for status in STATUSES_WITH_REASON):
             _print_reasons(inputs, json_lines)
     if first and known:
@@ -250,7 +250,7 @@ def _made_of_lines(outputs: Mapping[str, object], json_lines: str) -> list[str]:
 
 def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5) -> None:
     """The first errors of a file of results, if it is one that can be read again."""
-    from jaxbundle.batch.run import result_rows
+    from jaxbundle.batches.run import result_rows
 
     if not os.path.isfile(json_lines):
         return
@@ -262,8 +262,8 @@ def _print_reasons(inputs: Sequence[str], json_lines: str, max_reasons: int = 5)
 
 def _name_unsearched(inputs: Sequence[str], json_lines: str, most: int = 5) -> None:
     """Warn of photographs that results lack by a fault of the machine, with the reason."""
-    from jaxbundle.batch.photographs import NOT_SEARCHED
-    from jaxbundle.batch.run import result_rows
+    from jaxbundle.batches.photographs import NOT_SEARCHED
+    from jaxbundle.batches.run import result_rows
 
     rows = result_rows(inputs, json_lines) if os.path.isfile(json_lines) else ()
     lost = [

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.batch.population import Population
+from jaxbundle.batches.population import Population
 from jaxbundle.cli.outputs import FORCE_ADVICE, check_file, check_json
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.parquet import is_parquet, need_pyarrow, write_parquet

@@ -1,5 +1,6 @@
 """`jaxbundle camera`: field of view of a camera, and its distortion by radius."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -26,41 +27,33 @@ def camera(
     ] = None,
 ) -> None:
     """Print field of view, 35 mm equivalent, and distortion by radius."""
-    import numpy as np
+    import jaxbundle
+    from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
+    from jaxbundle.commands.cameras import CameraDescription
+    from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
-    from jaxbundle.cameras import get_model
-    from jaxbundle.cli.camera_inputs import camera_given, pair, write_png
-    from jaxbundle.cli.camera_table import print_camera, sizes_of, table_of
-    from jaxbundle.io.text.csv_tables import write_csv
-
-    # without --step a table that fits a terminal; a curve that looks smooth; and a limit for
-    # steps that were given in another unit
-    rows, points, max_rows = 12, 200, 100_000
-    sizes = pair("--image-size", image_size), pair("--pixel-size", pixel_size)
-    tables, curves, units = [], {}, set()
+    smooth = 200  # points of a curve that looks smooth
+    sizes = {
+        "image_size": pair("--image-size", image_size),
+        "pixel_size": pair("--pixel-size", pixel_size),
+    }
+    found: dict[str, CameraDescription] = {}
     for file in files:
-        given = camera_given(file)
-        size, pitch = sizes_of(file, given, *sizes)
-        unit = get_model(given.model).unit
-        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch).tolist()
-        reach = float(np.hypot(*extent) / 2)
-        width = reach / rows if step is None else step
-        if width * max_rows < reach:
-            raise InputError(
-                f"--step {width:g}: more than {max_rows} rows to a radius of {reach:.4g} {unit}"
-            )
-        tables.append(table_of(given, reach, width, about_origin))
-        print_camera(given, extent, size, pitch, tables[-1])
+        calibration_given(file)  # its warnings
+        described = jaxbundle.camera(file, step=step, about_origin=about_origin, **sizes)
+        print(described.report())
         # two files may have cameras of one name
-        name = given.id if given.id not in curves else f"{given.id} ({file})"
-        curves[name] = table_of(given, reach, reach / points, about_origin)
-        units.add(unit)
+        id = described.camera.id
+        found[id if id not in found else f"{id} ({file})"] = described
     if plot is not None:
+        units = {one.unit for one in found.values()}
         if len(units) > 1:
             raise InputError("--plot: cameras in mm and in pixels cannot share one figure")
         from jaxbundle.plotting.calibrations import radial_curves
 
+        reach = {name: math.hypot(*one.extent) / 2 for name, one in found.items()}
+        curves = {name: one.table(reach[name] / smooth) for name, one in found.items()}
         write_png(plot, (6.5, 4.2), lambda ax: radial_curves(curves, units.pop(), ax))
     if csv is not None:
-        columns = (column.tolist() for column in tables[0].values())
-        write_csv(csv, list(tables[0]), zip(*columns))
+        table = next(iter(found.values())).table()
+        write_csv(csv, list(table), table_rows(table))

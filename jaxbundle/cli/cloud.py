@@ -1,6 +1,5 @@
 """`jaxbundle cloud`: filter, thin, convert and compare point clouds."""
 
-import json as json_text
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -37,47 +36,41 @@ def cloud(  # noqa: PLR0913 - the options of the command
     json: Annotated[str, typer.Option(help="figures as JSON; - for standard output")] = "",
 ) -> None:
     """Filter, thin, convert and compare point clouds; accuracy and DSM."""
+    import jaxbundle
     from jaxbundle.cli.outputs import check_json
-    from jaxbundle.io.results.result_json import without_nan
+    from jaxbundle.io.results.result_json import json_text
     from jaxbundle.io.text.csv_tables import write_text
-    from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
-    from jaxbundle.surface.compare import compare
-    from jaxbundle.surface.dsm import make_dsm, write_dsm
-    from jaxbundle.surface.filtering import drop_isolated, drop_weak, thin
-    from jaxbundle.surface.point_files import read_cloud, write_cloud
+    from jaxbundle.surfaces.dsm import write_dsm
+    from jaxbundle.surfaces.point_files import write_cloud
 
     check_json(json)
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
     _check_targets([file] if against is None else [file, against], out, dsm)
-    found = given = read_cloud(file)
-    other = None if against is None else read_cloud(against)
-    found = drop_weak(found, max_sigma, min_rays)
-    if statistical is not None:
-        found = drop_isolated(found, limit=statistical)
-    if cube is not None:
-        found = thin(found, cube, least, place)
-    report = {"points_read": len(given), "points": len(found), "accuracy": accuracy_of(found)}
-    if plane:
-        report["plane"] = to_plane(found.X)
-    if check is not None:
-        report["check_points"] = at_check_points(found, read_cloud(check).X)
-    if other is not None:
-        report["comparison"] = compare(found, other)
-    if dsm is not None and size is not None:
-        write_dsm(make_dsm(found, size), dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
+    found = jaxbundle.cloud(
+        file,
+        cube=cube,
+        least=least,
+        place=place,
+        max_sigma=max_sigma,
+        min_rays=min_rays,
+        statistical=statistical,
+        size=size,
+        against=against,
+        check=check,
+        plane=plane,
+    )
+    if dsm is not None and found.dsm is not None:
+        write_dsm(found.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
     if out is not None:
-        write_cloud(found, out)
-    text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"
+        write_cloud(found.cloud, out)
+    text = json_text(found.to_dict())
     if json == "-":
         write_json(text)
         return
     if json:
         write_text(Path(json), text)
-    print(f"{len(given)} points read, {len(found)} kept")
-    for name in ("plane", "check_points", "comparison"):
-        for key, value in report.get(name, {}).items():
-            print(f"{name} {key:20} {value}")
+    print(found.report())
 
 
 def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import jaxbundle
 from jaxbundle.choices import AIMS, DESIGNED, ORDERS
 from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.cli.habits import is_in_file
@@ -53,7 +54,10 @@ def design(  # noqa: PLR0913 - the options of the command
     ] = None,
     targets: Annotated[str, typer.Option(help=f"box for movable targets: {BOX_FORM}")] = "",
     starts: Annotated[int, typer.Option(help="searches, all but one from random stations")] = 1,
-    iterations: Annotated[int, typer.Option(min=1, help="per round of the search")] = 60,
+    max_iterations: Annotated[
+        int,
+        typer.Option("--max-iterations", "--iterations", min=1, help="per round of the search"),
+    ] = 60,
     draws: Annotated[
         int, typer.Option(help="networks simulated and adjusted for verification; 0: none")
     ] = 200,
@@ -71,14 +75,14 @@ def design(  # noqa: PLR0913 - the options of the command
 
     from jaxbundle.cli.camera_inputs import pair
     from jaxbundle.cli.design_files import FILES, fill_design
-    from jaxbundle.cli.design_options import box_of, normals_of, parse_aim, sigma_of, words_of
+    from jaxbundle.cli.design_options import box_of, normals_of, parse_aim, words_of
     from jaxbundle.cli.outputs import can_plot, check_writable, network_files, write_result
     from jaxbundle.cli.progress import staging
     from jaxbundle.io.formats import read_oriented
-    from jaxbundle.io.results.design_json import design_text
+    from jaxbundle.io.results.result_json import json_text
     from jaxbundle.network_design.aims import Aim
     from jaxbundle.network_design.conditions import Conditions
-    from jaxbundle.network_design.design import design as design_network
+    from jaxbundle.network_design.design_json import design_dict
     from jaxbundle.types import present
 
     network = read_oriented(project)
@@ -94,22 +98,22 @@ def design(  # noqa: PLR0913 - the options of the command
         obstacles=tuple(present(box_of("--obstacle", text)) for text in obstacle or ()),
         targets=box_of("--targets", targets),
     )
-    designed = design_network(
-        network,
+    designed = jaxbundle.design(
+        project,
         Aim(aim, parse_aim(of)),
         order=order,
         conditions=conditions,
         free=words_of(free),
         stations=words_of(stations) if stations else None,
         photographs=photographs,
-        sigma_image=sigma_of(project, network) if sigma_image is None else sigma_image,
+        sigma_image=sigma_image,
         starts=starts,
-        max_iterations=iterations,
+        max_iterations=max_iterations,
         seed=seed,
     )
     proof = designed.prove(draws, seed) if draws else None
     report = f"{designed}\n" + (f"proof: {proof}\n" if proof else "")
-    text = design_text(designed, proof)
+    text = json_text(design_dict(designed, proof))
     with write_result(json, text, out, "design", FILES, force) as folder:
         if folder is not None:
             with staging(quiet or json == "-") as show:

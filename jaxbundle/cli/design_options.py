@@ -4,25 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.arguments import positive, show
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
-from jaxbundle.io.formats import recognise_format
-from jaxbundle.io.networks.project import project_file
-from jaxbundle.io.text.csv_tables import read_csv, read_toml
+from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.tables import Network, units_of
+from jaxbundle.network.tables import Network
 from jaxbundle.network_design.conditions import Box
-
-
-def sigma_of(project: Path, network: Network) -> float | None:
-    """`sigma_image` of a project without image points; None if image points or no setting give
-    it."""
-    if len(network.observations) or recognise_format(project) != "project":
-        return None
-    given = read_toml(project_file(project))["project"].get("sigma_image")
-    if given is None or network.image_unit != units_of(network.cameras):
-        return None
-    return positive("sigma_image", given)
 
 
 def parse_aim(given: list[str] | None):

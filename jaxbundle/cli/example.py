@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
+import jaxbundle
 from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
-from jaxbundle.system.examples import EXAMPLES, write_example
+from jaxbundle.system.examples import EXAMPLES
 
 
 @app.command(example="convergent4 first")
@@ -22,6 +23,6 @@ def example(
         return
     if folder is None:
         raise InputError(f"FOLDER is missing: jaxbundle example {name} {name}")
-    write_example(name, folder)
+    jaxbundle.example(name, folder)
     print(f"{folder}: {EXAMPLES[name].about}")
     print(f"next: {EXAMPLES[name].command.replace('FOLDER', str(folder))}")

@@ -39,22 +39,26 @@ def explore(  # noqa: PLR0913 - the options of the command
     """
     import webbrowser
 
-    from jaxbundle.cli.explore_inputs import open_view
-    from jaxbundle.explore.server import Server
+    import jaxbundle
+    from jaxbundle.cli.camera_inputs import pair
+    from jaxbundle.cli.progress import iterating
 
-    view = open_view(
-        input,
-        kind,
-        photo=photo,
-        sizes=(image_size, pixel_size),
-        truth=truth,
-        settings=set or (),
-        format=format,
-        control=control,
-        quiet=quiet,
-    )
     tell = lambda line: typer.echo(f"jaxbundle: {line}", err=True)
-    server = Server(view, port, tell)
+    with iterating(quiet) as progress:
+        server = jaxbundle.explore(
+            input,
+            kind=kind,
+            photo=photo,
+            image_size=pair("--image-size", image_size),
+            pixel_size=pair("--pixel-size", pixel_size),
+            truth=truth,
+            overrides=tuple(set or ()),
+            format=format,
+            control=control,
+            port=port,
+            progress=progress,
+            tell=tell,
+        )
     print(server.address, flush=True)
     if not quiet:
         tell("programs are compiled once per size; Ctrl-C ends")

@@ -16,26 +16,27 @@ from jaxbundle import report
 from jaxbundle.adjustment.orientation_covariance import orientation_covariance
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.sensitivity import Budget
+from jaxbundle.commands.origins import network_files as network_files
+from jaxbundle.commands.origins import trace_files as trace_files
+from jaxbundle.commands.origins import trace_origin as trace_origin
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.orientation_covariance import FILE as PRECISION
 from jaxbundle.io.networks.orientation_covariance import write_orientation_covariance
-from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
+from jaxbundle.io.networks.project import ADJUSTED, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.io.results.result_json import result_text, unsolved_text
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
-from jaxbundle.io.writing.fingerprints import input_files
 from jaxbundle.io.writing.folders import check_folder, replace_folder
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
-from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
+from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure
 from jaxbundle.report.page.budget import describe_budget
 from jaxbundle.report.verdict import Verdict
-from jaxbundle.system.clock import in_words, now
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Progress
 
@@ -63,28 +64,6 @@ SAVED_ADJUSTMENT = re.compile(rb"PK\x03\x04")
 HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
 """The beginning of a page."""
 FORCE_ADVICE = ", or --force to replace it"
-
-
-def network_files(
-    input: Path, network: Network, control: Path | None = None
-) -> tuple[str | Path, ...]:
-    """The input files of a network."""
-    tables = (network.images, network.points, network.observations, network.distances)
-    files = (input, input / FILE_NAME, *(table.source.name for table in tables))
-    return files if control is None else (*files, control)
-
-
-def trace_origin(
-    input: Path, network: Network, control: Path | None, settings: Mapping[str, object]
-) -> Origin:
-    """The fingerprints of the input files of a network, and the chosen settings."""
-    return trace_files((*input_files(input), *network_files(input, network, control)), settings)
-
-
-def trace_files(files: Iterable[str | Path], settings: Mapping[str, object]) -> Origin:
-    """The fingerprints of files, and the chosen settings."""
-    chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
-    return Origin(fingerprint_files(files), chosen, in_words(now()))
 
 
 def check_writable(

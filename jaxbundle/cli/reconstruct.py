@@ -1,7 +1,5 @@
 """`jaxbundle reconstruct`: photographs to an adjusted network."""
 
-from dataclasses import replace
-from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -60,36 +58,24 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct a network from photographs: tie points, self-calibration, adjustment."""
-    from jaxbundle.cli.camera_inputs import camera_given
+    import jaxbundle
+    from jaxbundle.cli.camera_inputs import calibration_given
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.reconstruct_files import COMMAND, FILES, make_store, write_reconstruction
-    from jaxbundle.io.networks.control import select_checks
+    from jaxbundle.commands.reconstruction import open_control
     from jaxbundle.measure.coded_targets import check_kind
-    from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
     from jaxbundle.reconstruction.named import read_distances
     from jaxbundle.reconstruction.page import conclude_part
     from jaxbundle.reconstruction.photographs import find_photographs
-    from jaxbundle.reconstruction.reconstruct import reconstruct
-    from jaxbundle.reconstruction.settings import ReconstructionSettings
-    from jaxbundle.tiepoints.features import Detection
 
     if surface and not (len(photos) == 1 and photos[0].is_dir()):
         raise InputError("--surface: give one folder of photographs")
+    # read here, before --out becomes this command's: their errors leave nothing behind
     if targets is not None:
         check_kind(targets)
-    settings = ReconstructionSettings(Detection(features), pairs, points, targets=targets)
-    if not square_pixels:
-        # an infinite σ is no prior
-        settings = replace(settings, aspect_sigma=inf)
-    given = None if camera is None else camera_given(camera)
-    known = None if control is None else read_control_measurements(control)
-    if known is None and (control_sigma or check):
-        raise InputError("--control-sigma and --check need --control")
-    if known is not None and control_sigma:
-        known = with_sigma(known, control_sigma)
-    if known is not None and check:
-        known = replace(known, points=select_checks(known.points, check))
+    given = None if camera is None else calibration_given(camera)[0]
+    known = open_control(control, control_sigma, check or ())
     bars = () if distances is None else read_distances(distances)
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     # before the search, which opens every photograph; after it the photographs are inputs, too
@@ -99,7 +85,20 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     store = make_store(out, force)
     advise(f"run the same command again to resume; matches are kept in {store}")
     with staging(quiet or json == "-") as tell:
-        result = reconstruct(photos, given, settings, store, tell, known, bars, name)
+        result = jaxbundle.reconstruct(
+            photos,
+            camera=given,
+            control=known,
+            name=name,
+            targets=targets,
+            distances=bars,
+            features=features,
+            pairs=pairs,
+            points=points,
+            square_pixels=square_pixels,
+            store=store,
+            progress=tell,
+        )
     origin = trace_files(
         [*files, *(p.path for p in found)],
         {

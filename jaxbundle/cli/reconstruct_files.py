@@ -53,7 +53,7 @@ def write_reconstruction(
 ) -> None:
     """Write JSON and page, and the folder with each part, its pairs and figures."""
     first, plots = found.parts[0], plots and can_plot()
-    also = {"reconstruction": _summary(found), "verdict": verdict_dict(conclude_part(found, first))}
+    also = {"reconstruction": found.to_dict(), "verdict": verdict_dict(conclude_part(found, first))}
     text = result_text(first.adjustment, brief, also)
     page = partial(compose_part, found, first, origin)
     with write_result(json, text, out, COMMAND, FILES, force, html, page) as new:
@@ -148,27 +148,3 @@ def _thumbnail(path: Path, max_pixels: int = 1200) -> UInt8[np.ndarray, "rows co
         return np.full((2, 2), 255, np.uint8)
     step = max(1, max(grey.shape) // max_pixels)
     return grey[::step, ::step]
-
-
-def _summary(found: Reconstruction) -> dict:
-    return {
-        "name": found.name,
-        "parts": [
-            {
-                "name": part.name,
-                "images": list(part.adjustment.network.images.id),
-                "sigma0": part.adjustment.sigma0,
-                "sigma_factors": dict(part.factors),
-                "removed": len(part.adjustment.removed),
-                "global_test_passed": part.adjustment.global_test()["passed"],
-                "block": part.block.as_dict(),
-                "control": None if part.control is None else part.control.as_dict(),
-                "control_not_used": part.no_control,
-            }
-            for part in found.parts
-        ],
-        "warnings": list(found.warnings),
-        "left_out": dict(found.left_out),
-        "notes": list(found.notes),
-        "pairs": len(found.pairs),
-    }

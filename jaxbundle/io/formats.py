@@ -21,7 +21,7 @@ from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap, write_colmap_cameras
 from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
-from jaxbundle.io.networks.control import read_control, with_control
+from jaxbundle.io.networks.control import read_control, select_checks, with_control
 from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov, write_jaicov
 from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
 from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr, write_kalibr
@@ -452,4 +452,37 @@ def _with_adjusted_control(network: Network) -> Network:
             "posteriori σ; adjusted again, control counts twice and σ0 is too small. Give the "
             "control as it was measured: --control FILE (id,X,Y,Z,sX,sY,sZ)"
         )
+    return network
+
+
+def as_network(
+    network: Network | str | Path,
+    *,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    control: str | Path | None = None,
+    check: Sequence[str] = (),
+    oriented: bool = False,
+) -> Network:
+    """A network, or that of an input in any known format.
+
+    **Arguments:** `format`, `overrides`, `control`: as of `read_network`, for a path; `check`:
+    control points that are only compared with the result, names or `"every 3rd"`; `oriented`: a
+    project needs only cameras and images.
+
+    **Raises:** `InputError`."""
+    if isinstance(network, str | os.PathLike):
+        if oriented:
+            network = read_oriented(network)
+        else:
+            network = read_network(network, format=format, overrides=overrides, control=control)
+    elif not isinstance(network, Network):
+        raise InputError(
+            f"network must be a Network or the path of one, but is {show(network)}: "
+            "read_network, make_network and simulate make networks"
+        )
+    elif format or overrides or control:
+        raise InputError("format, overrides and control are for the network of a file: give a path")
+    if check:
+        network = network.replace(points=select_checks(network.points, check))
     return network

@@ -10,7 +10,9 @@ configuration; second, the weights of observations, here of whole photographs; t
 densification of an existing network.
 """
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,11 +21,14 @@ from jaxbundle.arguments import integer, one_of, positive, show
 from jaxbundle.choices import DESIGNED, ORDERS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
+from jaxbundle.io.formats import as_network, recognise_format
+from jaxbundle.io.networks.project import project_file
+from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.sightings import keep_images, split_check_points
-from jaxbundle.network.tables import Images, Network, require_network
+from jaxbundle.network.tables import Images, Network, units_of
 from jaxbundle.network_design.aims import Aim, aim_of
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.feasible import (
@@ -45,7 +50,7 @@ from jaxbundle.network_design.weights import select
 
 
 def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
-    network: Network,
+    network: Network | str | Path,
     aim: str | Aim = "mean",
     *,
     order: str = "first",
@@ -63,8 +68,8 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
 
     **Arguments:**
 
-    - `network`: cameras with their `image_size`, targets, and stations to start from; image points
-      are needed only to add a photograph to an existing network.
+    - `network`: cameras with their `image_size`, targets, and stations to start from, or the path
+      of such a project; image points are needed only to add a photograph to an existing network.
     - `aim`: "mean", "worst", "determinant" of the σ of points, "reliability", or an `Aim`.
     - `order`: "zero": the datum of smallest mean σ. "first": positions, directions and roll of
       stations, and targets (`free`: some of "position", "direction", "roll", "targets"), of all
@@ -72,7 +77,7 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
       (`Design.board_poses`). "second": select this number of `photographs` from the given
       candidates. "third": add this number of `photographs`, default 1, with the last camera.
     - `sigma_image`: σ of future image coordinates, in the unit of the camera models; default: the
-      median of the network.
+      median of the network, or that of a project without image points.
     - `starts`: number of searches of first order, all but one from random stations in the room.
     - `max_iterations`: per round of the search; `seed`: random seed; `settings`: of the search.
 
@@ -88,7 +93,10 @@ def design(  # noqa: PLR0913 (public: a table of options, all but two by name)
         raise InputError(f"conditions must be Conditions, but is {show(conditions)}")
     conditions = Conditions() if conditions is None else conditions
     # Check points have no part in an adjustment, and so none in its σ.
-    network = use_prior_tables(split_check_points(require_network(network))[0])
+    given = as_network(network, oriented=True)
+    if sigma_image is None and isinstance(network, str | os.PathLike):
+        sigma_image = _sigma_of_project(Path(network), given)
+    network = use_prior_tables(split_check_points(given)[0])
     sigma = _sigma(network, sigma_image)
     integer("starts", starts)
     if order == "zero":
@@ -426,3 +434,14 @@ def _sigma(network: Network, given: float | None) -> float:
     if not len(sigma) or not np.isfinite(sigma).any():
         raise InputError("sigma_image: the network has no image points; give the σ they will have")
     return float(np.nanmedian(sigma))
+
+
+def _sigma_of_project(path: Path, network: Network) -> float | None:
+    """`sigma_image` of a project without image points; None if image points or no setting give
+    it."""
+    if len(network.observations) or recognise_format(path) != "project":
+        return None
+    given = read_toml(project_file(path))["project"].get("sigma_image")
+    if given is None or network.image_unit != units_of(network.cameras):
+        return None
+    return positive("sigma_image", given)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,13 +11,16 @@ from jaxtyping import Float
 from jaxbundle.choices import ORDERS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network_design.aims import Aim, smallest_redundancy
 from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.network_design.design_json import design_dict
 from jaxbundle.network_design.proof import Proof, prove
 from jaxbundle.network_design.realise import problem_of
 from jaxbundle.network_design.search import Step
+from jaxbundle.results import ResultMethods
 from jaxbundle.types import present
 
 
@@ -50,7 +54,7 @@ class DesignState:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Design:
+class Design(ResultMethods):
     """A designed network.
 
     `order`: "zero", "first", "second", "third"; `path`: the aim by iteration, and the projection
@@ -96,6 +100,10 @@ class Design:
         if problem is None:
             raise NotSolvedError("design: the designed network cannot be adjusted")
         return prove(problem, self.aim, draws, seed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain dicts and numbers, as in JSON; with the proof if it was made."""
+        return without_nan(design_dict(self, self.__dict__.get("proof")))
 
     @property
     def board_poses(self) -> Float[np.ndarray, "images 4 4"]:

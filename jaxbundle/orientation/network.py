@@ -18,6 +18,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -46,6 +47,7 @@ from jaxbundle.orientation.growth import (
 )
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import TOLERANCE, Sights, in_plane, sights
+from jaxbundle.results import ResultMethods
 from jaxbundle.types import Index
 
 CONTRADICTION = "that contradict the start values"
@@ -53,7 +55,7 @@ CONTRADICTION = "that contradict the start values"
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Oriented:
+class Oriented(ResultMethods):
     """A network with start values; `images`, `points`: reasons for those that could not be
     oriented; `left_out`: image points that contradict the start values; `frame`: the reference of
     the coordinates; `finding`: contradictory control points, and the correction."""
@@ -64,6 +66,19 @@ class Oriented:
     points: Mapping[str, str]
     left_out: tuple[str, ...] = ()
     finding: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What was oriented and what was not, with reasons; `write_project(oriented.network, …)`
+        writes the start values."""
+        return {
+            "frame": self.frame,
+            "images": list(self.network.images.id),
+            "points": len(self.network.points),
+            "images_not_placed": dict(self.images),
+            "points_not_placed": dict(self.points),
+            "left_out": list(self.left_out),
+            "finding": self.finding,
+        }
 
     def __str__(self) -> str:
         placed, known = len(self.network.images), len(self.network.points)

@@ -13,8 +13,8 @@ if TYPE_CHECKING:  # with them come scanners and matching, which an adjustment d
     from matplotlib.axes import Axes
     from mpl_toolkits.mplot3d import Axes3D
 
-    from jaxbundle.surface.cloud import Cloud
-    from jaxbundle.surface.dsm import Dsm
+    from jaxbundle.surfaces.cloud import Cloud
+    from jaxbundle.surfaces.dsm import Dsm
 
 
 def cloud_perspective(

@@ -1,5 +1,7 @@
 """Line scanners: from trajectory and optics to the ground and back.
 
+    table = locate("scanner.toml", grid=(3, 3))           # the commands, on files
+
     image = read_scanner("scanner.toml").image            # jaxbundle.io.scanner; or make_image(…)
     X = locate_lines(image, Ground(), lines, pixels)      # [3, lines, pixels], metres
     found = project_points(image, make_search(image), X.reshape(3, -1))
@@ -12,103 +14,107 @@ differentiates by it. Times are in seconds, angles in radians, the Earth is WGS 
 ellipsoid is given. `docs/pushbroom.md` has the conventions.
 """
 
-from jaxbundle.pushbroom import rpc
-from jaxbundle.pushbroom.accuracy import (
-    closed_form,
-    ground_errors,
-    propagate_accuracy,
-    simulate_accuracy,
-    spread_positions,
-)
-from jaxbundle.pushbroom.ancillary import attitude_table, position_table
-from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.earth_frames import (
-    EarthOrientation,
-    circular_orbit,
-    to_earth,
-    turn_positions,
-    turn_quaternions,
-    two_line_orbit,
-)
-from jaxbundle.pushbroom.image import Offsets, PushbroomImage, make_image, pose_at
-from jaxbundle.pushbroom.locate import locate_lines, locate_point, locate_points
-from jaxbundle.pushbroom.noise import Noise, add_errors
-from jaxbundle.pushbroom.orbit import state_orbit
-from jaxbundle.pushbroom.project import (
-    Projected,
-    ProjectionStatus,
-    make_search,
-    project_from,
-    project_near,
-    project_points,
-)
-from jaxbundle.pushbroom.rpc import Rpc, RpcStatus
-from jaxbundle.pushbroom.rpc_bias import apply_bias, fit_bias
-from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcFit, RpcTable, check_rpc, fit_image, fit_rpc
-from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, LineTimes
-from jaxbundle.pushbroom.search_settings import SearchSettings
-from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image
-from jaxbundle.pushbroom.study import AccuracyTable, accuracy_table
-from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
-from jaxbundle.pushbroom.terrain import Terrain, make_terrain
-from jaxbundle.pushbroom.trajectory import Trajectory
+from jaxbundle.lazy import import_on_use
 
-__all__ = [
-    "AccuracyTable",
-    "AnglePolynomial",
-    "AngleTable",
-    "Corrections",
-    "EarthOrientation",
-    "Flight",
-    "FocalLine",
-    "Ground",
-    "Height",
-    "LineTimes",
-    "Noise",
-    "Offsets",
-    "Plane",
-    "Projected",
-    "PushbroomImage",
-    "Rpc",
-    "RpcCheck",
-    "RpcFit",
-    "RpcStatus",
-    "RpcTable",
-    "SearchSettings",
-    "ProjectionStatus",
-    "Terrain",
-    "Trajectory",
-    "accuracy_table",
-    "add_errors",
-    "apply_bias",
-    "attitude_table",
-    "check_rpc",
-    "circular_orbit",
-    "closed_form",
-    "fit_bias",
-    "fit_image",
-    "fit_rpc",
-    "ground_errors",
-    "locate_lines",
-    "locate_point",
-    "locate_points",
-    "make_image",
-    "make_search",
-    "make_terrain",
-    "measured_image",
-    "pose_at",
-    "position_table",
-    "project_from",
-    "project_near",
-    "project_points",
-    "propagate_accuracy",
-    "rpc",
-    "simulate_accuracy",
-    "spread_positions",
-    "state_orbit",
-    "to_earth",
-    "true_image",
-    "turn_positions",
-    "turn_quaternions",
-    "two_line_orbit",
-]
+# By module; __init__.pyi has their types: `make stubs` writes it.
+_HOME = {
+    "jaxbundle.commands.scanner_images": (
+        "CorrectedImage",
+        "correct",
+        "refine",
+        "simulate",
+    ),
+    "jaxbundle.commands.scanner_tables": (
+        "ScannerTable",
+        "accuracy",
+        "locate",
+        "project",
+    ),
+    "jaxbundle.pushbroom.ancillary": (
+        "attitude_table",
+        "position_table",
+    ),
+    "jaxbundle.pushbroom.corrections": ("Corrections",),
+    "jaxbundle.pushbroom.earth_frames": (
+        "EarthOrientation",
+        "circular_orbit",
+        "to_earth",
+        "turn_positions",
+        "turn_quaternions",
+        "two_line_orbit",
+    ),
+    "jaxbundle.pushbroom.error_propagation": (
+        "closed_form",
+        "ground_errors",
+        "propagate_accuracy",
+        "simulate_accuracy",
+        "spread_positions",
+    ),
+    "jaxbundle.pushbroom.flight": (
+        "Flight",
+        "measured_image",
+        "true_image",
+    ),
+    "jaxbundle.pushbroom.ground_to_image": (
+        "Projected",
+        "ProjectionStatus",
+        "make_search",
+        "project_from",
+        "project_near",
+        "project_points",
+    ),
+    "jaxbundle.pushbroom.image": (
+        "Offsets",
+        "PushbroomImage",
+        "make_image",
+        "pose_at",
+    ),
+    "jaxbundle.pushbroom.image_to_ground": (
+        "locate_lines",
+        "locate_point",
+        "locate_points",
+    ),
+    "jaxbundle.pushbroom.noise": (
+        "Noise",
+        "add_errors",
+    ),
+    "jaxbundle.pushbroom.orbit": ("state_orbit",),
+    "jaxbundle.pushbroom.rpc": (
+        "Rpc",
+        "RpcStatus",
+    ),
+    "jaxbundle.pushbroom.rpc_bias": (
+        "apply_bias",
+        "fit_bias",
+    ),
+    "jaxbundle.pushbroom.rpc_fit": (
+        "RpcCheck",
+        "RpcFit",
+        "RpcTable",
+        "check_rpc",
+        "fit_image",
+        "fit_rpc",
+    ),
+    "jaxbundle.pushbroom.scanner": (
+        "AnglePolynomial",
+        "AngleTable",
+        "FocalLine",
+        "LineTimes",
+    ),
+    "jaxbundle.pushbroom.search_settings": ("SearchSettings",),
+    "jaxbundle.pushbroom.study": (
+        "AccuracyTable",
+        "accuracy_table",
+    ),
+    "jaxbundle.pushbroom.surfaces": (
+        "Ground",
+        "Height",
+        "Plane",
+    ),
+    "jaxbundle.pushbroom.terrain": (
+        "Terrain",
+        "make_terrain",
+    ),
+    "jaxbundle.pushbroom.trajectory": ("Trajectory",),
+}
+__getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)

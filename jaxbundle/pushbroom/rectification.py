@@ -20,13 +20,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 from jaxbundle.geometry.vectors import Triple, difference, dot, length
-from jaxbundle.pushbroom.accuracy import east_north, horizontal
+from jaxbundle.pushbroom.error_propagation import east_north, horizontal
+from jaxbundle.pushbroom.ground_to_image import project_from, project_points
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage
-from jaxbundle.pushbroom.locate import ground_point
+from jaxbundle.pushbroom.image_to_ground import ground_point
 from jaxbundle.pushbroom.pieces import sample
-from jaxbundle.pushbroom.project import project_from, project_points
 from jaxbundle.pushbroom.search import ScannerGeometry, Search, scanner_of
-from jaxbundle.pushbroom.surfaces import Height, Plane, Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
@@ -53,7 +53,9 @@ class Places(NamedTuple):
     pixel: Float[AnyArray, "rows columns"]
 
 
-def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> MapNodes:
+def geographic_nodes(
+    surface: GroundSurface, longitude: np.ndarray, latitude: np.ndarray
+) -> MapNodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
     return MapNodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
@@ -73,7 +75,7 @@ def local_nodes(x: np.ndarray, y: np.ndarray) -> MapNodes:
 def block_places(
     image: PushbroomImage,
     search: Search,
-    surface: Surface,
+    surface: GroundSurface,
     nodes: MapNodes,
     occlusion: bool = False,
 ) -> Places | None:
@@ -121,7 +123,7 @@ def _search(
 
 
 def block_errors(
-    truth: PushbroomImage, search: Search, surface: Surface, nodes: MapNodes, places: Places
+    truth: PushbroomImage, search: Search, surface: GroundSurface, nodes: MapNodes, places: Places
 ) -> Float[np.ndarray, "2 rows columns"]:
     """East and north map errors of the pixels of a block, metres.
 
@@ -134,7 +136,7 @@ def block_errors(
 
 @partial(compile_once, static=())
 def _errors(
-    truth: ScannerGeometry, search: Search, surface: Surface, nodes: MapNodes, places: Places
+    truth: ScannerGeometry, search: Search, surface: GroundSurface, nodes: MapNodes, places: Places
 ) -> Float[Array, "2 rows columns"]:
     ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
 
@@ -148,7 +150,7 @@ def _errors(
 
 
 def _locate(
-    image: ScannerGeometry, search: Search, surface: Surface, line: Scalar, pixel: Scalar
+    image: ScannerGeometry, search: Search, surface: GroundSurface, line: Scalar, pixel: Scalar
 ) -> Triple:
     """The point seen at an image position, by the pieces of the search."""
     numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
@@ -160,7 +162,7 @@ def _locate(
 def _are_occluded(
     image: ScannerGeometry,
     search: Search,
-    surface: Surface,
+    surface: GroundSurface,
     line: Float[AnyArray, "rows columns"],
     pixel: Float[AnyArray, "rows columns"],
     ground: Float[AnyArray, "3 rows columns"],
@@ -195,7 +197,7 @@ def _fill(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, "2 n n"]:
     return np.where(seen, starts, (A @ plane).T.reshape(starts.shape))
 
 
-def _level(surface: Surface) -> Scalar:
+def _level(surface: GroundSurface) -> Scalar:
     """A representative height of the surface."""
     if isinstance(surface, Terrain):
         return (surface.lowest + surface.highest) / 2
@@ -206,7 +208,7 @@ def _level(surface: Surface) -> Scalar:
 def _places(
     image: ScannerGeometry,
     search: Search,
-    surface: Surface,
+    surface: GroundSurface,
     nodes: MapNodes,
     starts: Float[AnyArray, "2 n n"],
 ) -> tuple[Array, Array, Array]:
@@ -214,7 +216,7 @@ def _places(
     return *project_from(image, search, tuple(ground), *_spread(starts)), ground
 
 
-def _ground(surface: Surface, nodes: MapNodes) -> Float[Array, "3 rows columns"]:
+def _ground(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "3 rows columns"]:
     """The points of all pixels, [3, BLOCK, BLOCK]."""
     X, vertical = _spread(nodes.X), _spread(nodes.up)
     if isinstance(surface, Terrain):

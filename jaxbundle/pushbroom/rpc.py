@@ -32,7 +32,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
 from jaxbundle.geometry.vectors import Triple, Vector, along, difference, unit, unpack
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.corrections import require_ellipsoid
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
@@ -154,7 +154,7 @@ def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Arr
 
 
 def locate_on(
-    rpc: Rpc, surface: Surface, line: Scalar, sample: Scalar
+    rpc: Rpc, surface: GroundSurface, line: Scalar, sample: Scalar
 ) -> tuple[Array, Array, Scalar, Array]:
     """(longitude, latitude, height, status) of the first point of the line of sight on a surface.
 
@@ -229,7 +229,7 @@ def locate_points(
 
 @partial(compile_once, static=())
 def locate_points_on(
-    rpc: Rpc, surface: Surface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
+    rpc: Rpc, surface: GroundSurface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
 ) -> tuple[Array, Array, Scalar, Array]:
     """Longitudes, latitudes, heights and statuses of many positions on a surface."""
     return jax.vmap(lambda l, s: locate_on(rpc, surface, l, s))(line, sample)

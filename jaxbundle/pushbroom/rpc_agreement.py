@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
-from jaxbundle.pushbroom.locate import ground_point
+from jaxbundle.pushbroom.image_to_ground import ground_point
 from jaxbundle.pushbroom.rpc import Rpc, project
 from jaxbundle.pushbroom.scanner import slopes_of
 from jaxbundle.pushbroom.surfaces import Height

@@ -37,7 +37,7 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.rpc import TERMS, Rpc, monomials, project_points
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.system.programs import compile_once

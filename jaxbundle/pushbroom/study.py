@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxbundle.choices import AttitudeError
-from jaxbundle.pushbroom.accuracy import (
+from jaxbundle.pushbroom.error_propagation import (
     circular_error,
     closed_form,
     ground_errors,
@@ -24,12 +24,12 @@ from jaxbundle.pushbroom.accuracy import (
     simulate_accuracy,
     spread_positions,
 )
+from jaxbundle.pushbroom.flight import Flight, measured_image, true_image
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
-from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.scanner import slopes_of
-from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import Numbers
 
@@ -79,7 +79,7 @@ class AccuracyTable(NamedTuple):
 
 def accuracy_table(
     flight: Flight,
-    surface: Surface,
+    surface: GroundSurface,
     sigmas: Numbers = SIGMAS,
     kind: AttitudeError = "bias",
     draws: int = 1000,
@@ -135,7 +135,7 @@ def accuracy_table(
     return AccuracyTable(altitude, view, kind, draws, error_free, erring)
 
 
-def altitude_and_view(image: PushbroomImage, surface: Surface) -> tuple[float, float]:
+def altitude_and_view(image: PushbroomImage, surface: GroundSurface) -> tuple[float, float]:
     """Height of the middle line above the surface, metres, and the angle of the line, radians."""
     P = np.asarray(_position(image))
     ground = np.asarray(

@@ -22,7 +22,7 @@ from jaxbundle.geometry.ellipsoid import (
 from jaxbundle.geometry.vectors import Scalar, Vector
 
 
-class Surface(eqx.Module):
+class GroundSurface(eqx.Module):
     """A surface."""
 
     earth: eqx.AbstractVar[Ellipsoid | None]
@@ -39,7 +39,7 @@ class Surface(eqx.Module):
         return X[2] if self.earth is None else geodetic(self.earth, X)[2]
 
 
-class Plane(Surface):
+class Plane(GroundSurface):
     """Z = height, in a local frame with Z up."""
 
     level: Scalar = 0.0
@@ -50,7 +50,7 @@ class Plane(Surface):
         return jnp.where(s > 0, s, jnp.nan)
 
 
-class Ground(Surface):
+class Ground(GroundSurface):
     """The ellipsoid itself; three semi-axes may differ."""
 
     earth: Ellipsoid = WGS84
@@ -59,7 +59,7 @@ class Ground(Surface):
         return _from_outside(self.earth, o, ray_to_ellipsoid(self.earth, o, d))
 
 
-class Height(Surface):
+class Height(GroundSurface):
     """All points of one geodetic height above an ellipsoid of revolution."""
 
     level: Scalar

@@ -35,7 +35,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, 
 from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import AnyArray, Numbers
 
 # column and row at which a cell begins, the heights of its corners z₀₀, z₀₁, z₁₀, z₁₁
@@ -47,7 +47,7 @@ Path = tuple[Parabola, Parabola, Parabola]
 TraversalState = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
 
 
-class Terrain(Surface):
+class Terrain(GroundSurface):
     """Heights at (x, y) = (x₀ + column·dx, y₀ + row·dy): radians, or metres in a local frame.
 
     NaN: no height. A ray that would hit in such a cell, or beyond the grid, has no point; with

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.display import print_in_one_screen
@@ -11,6 +12,7 @@ from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.report.head import count_points
+from jaxbundle.results import ResultMethods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class ReconstructedPart:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(ResultMethods):
     """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
     why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
     matches, agreeing matches, kind; `photographs`: the examined files, by name;
@@ -48,6 +50,40 @@ class Reconstruction:
     photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     name: str = ""
+
+    @property
+    def converged(self) -> bool:
+        """Whether all parts have a solution."""
+        return all(part.adjustment.converged for part in self.parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Parts, warnings, and what was left out, as in JSON; each part has its `adjustment`."""
+        return {
+            "name": self.name,
+            "parts": [
+                {
+                    "name": part.name,
+                    "images": list(part.adjustment.network.images.id),
+                    "sigma0": part.adjustment.sigma0,
+                    "sigma_factors": dict(part.factors),
+                    "removed": len(part.adjustment.removed),
+                    "global_test_passed": part.adjustment.global_test()["passed"],
+                    "block": part.block.as_dict(),
+                    "control": None if part.control is None else part.control.as_dict(),
+                    "control_not_used": part.no_control,
+                }
+                for part in self.parts
+            ],
+            "warnings": list(self.warnings),
+            "left_out": dict(self.left_out),
+            "notes": list(self.notes),
+            "pairs": len(self.pairs),
+        }
+
+    def report(self) -> str:
+        """The summary, and the report of every part."""
+        parts = [f"{part.name}\n\n{part.adjustment.report()}" for part in self.parts]
+        return "\n\n".join([str(self), *parts])
 
     def __str__(self) -> str:
         lines = [f"warning: {said}" for said in self.warnings]

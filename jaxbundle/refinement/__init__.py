@@ -2,9 +2,9 @@
 
 from jaxbundle.refinement.adjusted_tables import adjusted_photographs, point_rows
 from jaxbundle.refinement.freedom import FREE, HELD, Freedom
-from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement, refine
+from jaxbundle.refinement.refining import Refinement, refine
 from jaxbundle.refinement.report import report, to_json
-from jaxbundle.refinement.tables import GroundPoints, ScannerImage, local_points
+from jaxbundle.refinement.tables import UNIT_OF_WEIGHT, GroundPoints, ScannerImage, local_points
 
 __all__ = [
     "FREE",

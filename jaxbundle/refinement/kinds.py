@@ -8,8 +8,8 @@
 | priors of corrections | every correction | scanner image, or sensor |
 
 **Scanner.** The pose at the time t(l) of the measured line is known, so the condition is explicit
-(`jaxbundle.pushbroom.project.misclosure`): the slopes of the ray to the point, minus those of the
-measured pixel,
+(`jaxbundle.pushbroom.ground_to_image.misclosure`): the slopes of the ray to the point, minus those
+of the measured pixel,
 
     g = [−r/q − ξ(u), −s/q − η(u)],        [r, s, q] = Rᵀ(t)·(X̃ − P(t)),
 
@@ -39,8 +39,8 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.spaces import Change, Vector
 from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.ground_to_image import misclosure_of
 from jaxbundle.pushbroom.image import LinePose, Offsets, PushbroomImage, move_pose, recorded_pose
-from jaxbundle.pushbroom.project import misclosure_of
 from jaxbundle.refinement.freedom import (
     Form,
     Sizes,

@@ -6,6 +6,7 @@ equations of `kinds`, statistics, blunders, check points, warnings, and the refi
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -24,21 +25,33 @@ from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
 from jaxbundle.refinement.freedom import UnknownName, change_of
 from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
+from jaxbundle.refinement.report import report as describe_refinement
+from jaxbundle.refinement.report import to_json
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
+from jaxbundle.results import ResultMethods, finite
 
 TESTS = ("none", "baarda", "pope")
-UNIT_OF_WEIGHT = "1 line or pixel"
-"""The σ of an image point where none is stated."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Refinement:
+class Refinement(ResultMethods):
     """The result: `inspection` holds its numbers."""
 
     inspection: RefinementInspection
     check: RefinementCheckPoints | None
     warnings: tuple[str, ...]
+
+    def report(self) -> str:
+        """The report as text."""
+        return describe_refinement(self)
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain dicts and numbers, as in JSON."""
+        return finite(to_json(self))
 
     @property
     def images(self) -> list[ScannerImage]:

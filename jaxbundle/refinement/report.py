@@ -1,16 +1,20 @@
 """The report of a refinement as text and as a document for JSON."""
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
-from jaxbundle.refinement.refining import UNIT_OF_WEIGHT, Refinement
+from jaxbundle.refinement.tables import UNIT_OF_WEIGHT
 from jaxbundle.types import present
 
+if TYPE_CHECKING:
+    from jaxbundle.refinement.refining import Refinement
 
-def to_json(result: Refinement) -> dict:
+
+def to_json(result: "Refinement") -> dict:
     """The result as plain values: unknowns, correlations, points, image points, checks."""
     found = result.inspection
     names, prior = result.names, result.prior_sigma
@@ -70,7 +74,7 @@ def to_json(result: Refinement) -> dict:
 
 
 def report(
-    result: Refinement, verdict: str = "", *, min_correlation: float = 0.9, most: int = 12
+    result: "Refinement", verdict: str = "", *, min_correlation: float = 0.9, most: int = 12
 ) -> str:
     """The report: the `verdict` if given, input, warnings, unknowns, correlations, blunders,
     checks.
@@ -119,7 +123,7 @@ def report(
     return "\n".join(lines) + "\n"
 
 
-def _unknowns(result: Refinement) -> Iterator[str]:
+def _unknowns(result: "Refinement") -> Iterator[str]:
     sigma = result.inspection.sigma
     yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
     for name, value, s, p in zip(result.names, result.estimate, sigma, result.prior_sigma):
@@ -144,7 +148,7 @@ def _tests(rows: list[dict], most: int) -> Iterator[str]:
         )
 
 
-def _checks(result: Refinement) -> Iterator[str]:
+def _checks(result: "Refinement") -> Iterator[str]:
     c = present(result.check)
     earth = result.images[0].earth is not None
     names = ("east", "north", "up") if earth else ("X", "Y", "Z")

@@ -16,6 +16,9 @@ from jaxbundle.refinement.freedom import Freedom
 
 ROLES = ("control", "tie", "check")
 
+UNIT_OF_WEIGHT = "1 line or pixel"
+"""The σ of an image point where none is stated."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ScannerImage:

@@ -13,8 +13,8 @@ from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
-from jaxbundle.batch import input as batch_input
-from jaxbundle.batch.input import bucket, single_list
+from jaxbundle.batches import input as batch_input
+from jaxbundle.batches.input import bucket, single_list
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)

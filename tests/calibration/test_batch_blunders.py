@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.batch.misfit import NORMAL, axes_remark, far_outside, misfits
-from jaxbundle.batch.normal import CameraUnknowns, Sightings, design
-from jaxbundle.batch.test_values import point_tests
-from jaxbundle.batch.weakness import weak_geometry
+from jaxbundle.batches.misfit import NORMAL, axes_remark, far_outside, misfits
+from jaxbundle.batches.normal import CameraUnknowns, Sightings, design
+from jaxbundle.batches.test_values import point_tests
+from jaxbundle.batches.weakness import weak_geometry
 from jaxbundle.cameras import get_model
 
 SIZE, VIEWS, NOISE = (1280, 960), 8, 0.2

@@ -9,7 +9,7 @@ import pytest
 import render
 from scipy.spatial.transform import Rotation
 
-from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.calibration import Board, BoardViews, calibrate
 from jaxbundle.calibration.affinity import find_missing_affinity
 from jaxbundle.calibration.calibrate import board_network

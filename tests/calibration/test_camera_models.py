@@ -12,7 +12,7 @@ import render
 from test_calibrate import normalised
 
 from jaxbundle.adjustment.quality.projection_uncertainty import interior_covariance_of_images
-from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.calibration import (
     Board,
     BoardViews,

@@ -10,7 +10,7 @@ from test_calibrate import TRUTH, VIEWS, normalised, simulated
 from test_rig import pair
 
 from jaxbundle import CameraModel
-from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.calibration import calibrate, calibrate_rig
 from jaxbundle.calibration.files import json_text
 from jaxbundle.calibration.report import rig_dict, rig_text

@@ -16,8 +16,8 @@ import jaxbundle
 from jaxbundle import cli
 from jaxbundle.adjustment.quality.calibration_difference import expected_difference
 from jaxbundle.adjustment.quality.projection_uncertainty import images_through_scene
-from jaxbundle.batch.calibrate import calibrate_batch
-from jaxbundle.batch.calibrate_rigs import calibrate_rigs
+from jaxbundle.batches.calibrate import calibrate_batch
+from jaxbundle.batches.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.advice import advice, suggest
 from jaxbundle.calibration.files import json_text, write_calibration

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from batch_cameras import images_of, write_cameras
 
-from jaxbundle.batch.processes import add_parts
-from jaxbundle.batch.run import run_batch
+from jaxbundle.batches.processes import add_parts
+from jaxbundle.batches.run import run_batch
 
 ROOT = Path(__file__).parents[2]
 CAMERAS = 9

@@ -12,8 +12,8 @@ import pytest
 import render
 from board_photographs import poses
 
-from jaxbundle.batch import work as batches
-from jaxbundle.batch.run import run_batch
+from jaxbundle.batches import work as batches
+from jaxbundle.batches.run import run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.measure.boards import Board

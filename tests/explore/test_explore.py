@@ -31,21 +31,21 @@ import jaxbundle
 from jaxbundle.adjustment.quality.expected_precision import expected_precision
 from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
-from jaxbundle.explore import server as server_module
-from jaxbundle.explore.camera import CameraView
-from jaxbundle.explore.network import NetworkView
-from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
-from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, FlightView
-from jaxbundle.explore.server import MOST_BYTES, Server, page_file
-from jaxbundle.explore.tracks import ORBIT, STRAIGHT, USUAL, choose_track
-from jaxbundle.explore.view import File, check_keys, number
-from jaxbundle.explore.widget import reply, show
+from jaxbundle.explorer import server as server_module
+from jaxbundle.explorer.camera import CameraView
+from jaxbundle.explorer.network import NetworkView
+from jaxbundle.explorer.page import Number, draw_controls, draw_tools, make_page, place
+from jaxbundle.explorer.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, FlightView
+from jaxbundle.explorer.server import MOST_BYTES, Server, page_file
+from jaxbundle.explorer.tracks import ORBIT, STRAIGHT, USUAL, choose_track
+from jaxbundle.explorer.view import File, check_keys, number
+from jaxbundle.explorer.widget import reply, show
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
-from jaxbundle.pushbroom.accuracy import ground_errors
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.simulate import measured_image, true_image
+from jaxbundle.pushbroom.error_propagation import ground_errors
+from jaxbundle.pushbroom.flight import measured_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.report.page import UNKNOWN, Section
 from jaxbundle.report.page.scene import describe_network
@@ -538,7 +538,7 @@ def test_a_choice_that_means_nothing_is_refused(scanner, given, words):
 
 
 def test_inputs_are_recognised(tmp_path):
-    from jaxbundle.cli.explore_inputs import recognise
+    from jaxbundle.commands.exploring import recognise
 
     examples = ROOT / "examples"
     assert recognise(str(examples / "convergent4" / "project.toml")) == "network"
@@ -675,7 +675,7 @@ render({ el: document.getElementById("here"), model: {
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is missing")
 def test_in_the_frame_of_a_widget_a_control_changes_the_numbers(tmp_path):
-    script = files("jaxbundle.explore.page").joinpath("widget.js").read_text(encoding="utf-8")
+    script = files("jaxbundle.explorer.page").joinpath("widget.js").read_text(encoding="utf-8")
     script = script.replace("export default", "//")
     script = script.replace("allow-scripts", "allow-scripts allow-same-origin")  # to look into it
     page = page_file(Doubling(), {}, live=True).content.decode()

@@ -6,9 +6,9 @@ import re
 import pytest
 from browser import CHROMIUM, Browser
 
-from jaxbundle.explore.camera import CameraView
-from jaxbundle.explore.network import NetworkView
-from jaxbundle.explore.server import page_file
+from jaxbundle.explorer.camera import CameraView
+from jaxbundle.explorer.network import NetworkView
+from jaxbundle.explorer.server import page_file
 from jaxbundle.network.tables import Camera
 from jaxbundle.report.page import InputFile, Origin, compose
 

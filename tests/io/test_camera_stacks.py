@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from jaxbundle.batch.stacks import read_camera_stack
+from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 
 

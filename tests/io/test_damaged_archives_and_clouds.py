@@ -7,13 +7,13 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxbundle.batch.stacks import read_camera_stack
+from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.stored_tree import read_tree
 from jaxbundle.photographs.xmp import parse_xmp
 from jaxbundle.reconstruction.control import read_control_measurements
-from jaxbundle.surface.cloud import Cloud
-from jaxbundle.surface.point_files import read_cloud, write_cloud
+from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.point_files import read_cloud, write_cloud
 from jaxbundle.tiepoints.features import Detection
 from jaxbundle.tiepoints.store import Store
 

@@ -14,7 +14,7 @@ import pytest
 from exchange_cases import CAMERAS, network
 from garbling import often, read_or_refused, what_is_done
 
-from jaxbundle.batch.stacks import read_camera_stack
+from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, write_project
 from jaxbundle.io.cameras.calibrated import read_calibrated

@@ -6,8 +6,8 @@ from further_checks import check_jacobians, sample
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
-from jaxbundle.batch.population import Population
-from jaxbundle.batch.work import network_row
+from jaxbundle.batches.population import Population
+from jaxbundle.batches.work import network_row
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_further

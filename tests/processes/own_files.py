@@ -18,7 +18,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
-ROOMS = ("", "measure", "reconstruction", "surface", "io", "refinement", "cli")
+ROOMS = ("", "measure", "reconstruction", "surfaces", "io", "refinement", "cli")
 sys.path[:0] = [str(ROOT / "tests" / room) for room in ROOMS]
 
 import jaxbundle  # noqa: E402

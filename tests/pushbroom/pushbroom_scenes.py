@@ -12,7 +12,7 @@ from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.locate import locate_lines
+from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
 

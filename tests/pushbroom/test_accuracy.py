@@ -7,7 +7,7 @@ import pytest
 from pushbroom_scenes import PIXELS, above_a_plane, satellite
 from scipy.stats import chi2
 
-from jaxbundle.pushbroom.accuracy import (
+from jaxbundle.pushbroom.error_propagation import (
     circular_error,
     closed_form,
     propagate_accuracy,

@@ -15,8 +15,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE
+from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.scanner import FocalLine
 from jaxbundle.pushbroom.surfaces import Ground
 

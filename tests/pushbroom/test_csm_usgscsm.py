@@ -18,10 +18,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.csm import read_csm
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.writing import write_scanner_image
+from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.pieces import make_pieces
-from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.surfaces import Ground
 
 scattered = jax.jit(locate_points)

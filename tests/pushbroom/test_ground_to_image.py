@@ -20,15 +20,15 @@ from pushbroom_scenes import (
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.locate import locate_points
-from jaxbundle.pushbroom.project import (
+from jaxbundle.pushbroom.ground_to_image import (
     ProjectionStatus,
     make_search,
     project_from,
     project_near,
     project_points,
 )
+from jaxbundle.pushbroom.image import make_image
+from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.scanner import AngleTable, LineTimes
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
 from jaxbundle.pushbroom.terrain import make_terrain

@@ -35,7 +35,7 @@ from jaxbundle.pushbroom.corrections import (
 )
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
 from jaxbundle.pushbroom.image import LinePose, make_image, pose_at
-from jaxbundle.pushbroom.locate import ground_point, locate_points
+from jaxbundle.pushbroom.image_to_ground import ground_point, locate_points
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes, slopes_of
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
+from jaxbundle.pushbroom.flight import Flight, true_image
 from jaxbundle.pushbroom.orbit import J2, RADIUS, acceleration, state_orbit
-from jaxbundle.pushbroom.simulate import Flight, true_image
 from jaxbundle.pushbroom.surfaces import Ground
 
 START = tuple(v[0] for v in orbit([0.0]))

@@ -16,7 +16,7 @@ from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.pushbroom import rpc as polynomials
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.rpc_fit import fit_rpc, image_table
 from jaxbundle.pushbroom.surfaces import Height
 

@@ -15,11 +15,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters import correction
 from jaxbundle.io.rasters.correction import map_of, write_corrected
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
+from jaxbundle.pushbroom.flight import Flight, measured_image, take_image, true_image
+from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.noise import Noise
-from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.rectification import BLOCK, STEP, block_places
 from jaxbundle.pushbroom.signals import signal
-from jaxbundle.pushbroom.simulate import Flight, measured_image, take_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.terrain import make_terrain
 

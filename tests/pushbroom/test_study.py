@@ -11,9 +11,9 @@ import pytest
 from jaxbundle import cli
 from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
 from jaxbundle.io.scanner.flight import read_flight
-from jaxbundle.pushbroom.accuracy import ground_errors
+from jaxbundle.pushbroom.error_propagation import ground_errors
+from jaxbundle.pushbroom.flight import measured_image, true_image
 from jaxbundle.pushbroom.noise import Noise
-from jaxbundle.pushbroom.simulate import measured_image, true_image
 from jaxbundle.pushbroom.study import TRAJECTORIES
 from jaxbundle.pushbroom.surfaces import Ground
 

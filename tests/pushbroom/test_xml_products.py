@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, ray_to_ellipsoid
 from jaxbundle.io.scanner.read import read_scanner
-from jaxbundle.pushbroom.project import project_near
+from jaxbundle.pushbroom.ground_to_image import project_near
 from jaxbundle.pushbroom.surfaces import Ground
 
 START = np.datetime64("2016-06-22T23:59:59.25", "ns")

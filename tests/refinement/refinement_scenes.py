@@ -13,7 +13,7 @@ from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.locate import locate_point
+from jaxbundle.pushbroom.image_to_ground import locate_point
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.trajectory import Trajectory

@@ -24,7 +24,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.network.tables import Observations
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.project import misclosure
+from jaxbundle.pushbroom.ground_to_image import misclosure
 from jaxbundle.refinement import FREE, Freedom, refine, report, to_json
 from jaxbundle.refinement.freedom import make_form, pad_forms
 from jaxbundle.refinement.kinds import ScannerPoint, lines_of

@@ -10,8 +10,8 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Observations
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
+from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory
 from jaxbundle.refinement import FREE, Freedom, ScannerImage, local_points, refine, report

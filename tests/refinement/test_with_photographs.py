@@ -18,8 +18,8 @@ from jaxbundle.geometry import (
 from jaxbundle.io.formats import read_network
 from jaxbundle.io.networks.project import write_project
 from jaxbundle.network.tables import Camera, Distances, Images, Network, Observations, Points
+from jaxbundle.pushbroom.ground_to_image import misclosure
 from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.pushbroom.project import misclosure
 from jaxbundle.refinement import FREE, Freedom, adjusted_photographs, point_rows, refine
 from jaxbundle.refinement.freedom import change_image, change_of, make_form, names
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxbundle.batch.population import Population, read_against
+from jaxbundle.batches.population import Population, read_against
 from jaxbundle.errors import InputError
 
 CAMERAS = 200

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.arguments import show
-from jaxbundle.batch.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
+from jaxbundle.batches.epochs import MIN_SHARED_EPOCHS, contradicting, epoch_keys
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration

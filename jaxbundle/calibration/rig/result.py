@@ -27,6 +27,7 @@ from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.kinds.exterior_orientation import exterior
 from jaxbundle.network.tables import Camera, Network, units_of
+from jaxbundle.results import ResultMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -60,7 +61,7 @@ class Mounting:
         return np.sqrt(np.diagonal(self.covariance))
 
 
-class RigCalibration:
+class RigCalibration(ResultMethods):
     """Cameras of a rig, calibrated together.
 
     **Attributes:** `cameras`: their separate calibrations; `mountings`, `parameters`,
@@ -304,6 +305,18 @@ class RigCalibration:
         found, one = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name]
         unit = one.adjustment.network.object_unit
         return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
+
+    def report(self) -> str:
+        """The full report as text."""
+        from jaxbundle.calibration.report import rig_text
+
+        return rig_text(self)
+
+    def to_dict(self, brief: bool = False) -> dict[str, Any]:
+        """The result as plain dicts and numbers, as in JSON."""
+        from jaxbundle.calibration.report import rig_dict
+
+        return rig_dict(self, brief)
 
     def __str__(self) -> str:
         lines = [

@@ -50,26 +50,12 @@ def accuracy(  # noqa: PLR0913 - the options of the command
 
     Of about a thousand irregular positions, so that none of them falls in step with the records.
     """
-    import numpy as np
-
+    from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
     from jaxbundle.cli.pushbroom.places import grid_of
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, surface_of, write_rows
-    from jaxbundle.pushbroom.accuracy import (
-        ground_errors,
-        propagate_accuracy,
-        simulate_accuracy,
-        spread_positions,
-    )
-    from jaxbundle.pushbroom.noise import Noise
-    from jaxbundle.pushbroom.terrain import Terrain
+    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
-    fewest = 20  # the RMS of n draws is uncertain by up to 1/√n, here 22 %
-    if 0 < draws < fewest:
-        raise InputError(
-            f"--draws {draws}: too few for an RMS; at least {fewest}, 1000 are accurate to 3 %"
-        )
     if map_ is not None:
         _check_map(map_, table)
     if table:
@@ -78,67 +64,29 @@ def accuracy(  # noqa: PLR0913 - the options of the command
         kind = cast(AttitudeError, table)
         write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
-    file = open_scanner(scanner)
-    surface = surface_of(file.earth, height, dem, file.image, geoid)
-    cells = grid_of(grid)
-    size = file.image.lines, file.image.pixels
-    spread = spread_positions(*size, cells)
-    line, pixel = (v.ravel() for v in spread)
-    row, column = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(cells, size))
-    columns = {"line": np.repeat(row, len(column)), "pixel": np.tile(column, len(row))}
-    by_cell = lambda values: np.asarray(values).reshape(len(row) * len(column), -1)
-    known = lambda values: np.isfinite(values).sum(1)
-    # a cell where every ray misses the surface has no mean
-    mean = lambda values: np.nansum(values, 1) / np.where(known(values) > 0, known(values), np.nan)
-    rms = lambda values: np.sqrt(mean(values**2))
-    if truth is not None:
-        errors = ground_errors(file.image, open_scanner(truth).image, surface, line, pixel)
-        length = np.hypot(*errors.T)
-        columns |= {
-            "east": mean(by_cell(errors[:, 0])),
-            "north": mean(by_cell(errors[:, 1])),
-            "error": rms(by_cell(length)),
-        }
-        if not np.isfinite(length).any():
-            raise InputError("no ray meets the surface: check attitude, mounting and height")
-        head = {
-            "rms": float(np.sqrt(np.nanmean(length**2))),
-            "ce90": float(np.nanquantile(length, 0.9)),
-        }
-    else:
-        degree = np.pi / 180
-        noise = Noise(
-            degree * attitude_bias,
-            degree * attitude_drift,
-            degree * attitude_white,
-            position_bias,
-            position_drift,
-            position_white,
-        )
-        if not any(noise):
-            raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
-        if isinstance(surface, Terrain):
-            raise InputError("--dem: use --height with σ; terrain has no reverse mode")
-        found = propagate_accuracy(file.image, surface, line, pixel, noise)
-        columns |= {"rms": rms(by_cell(found.rms)), "ce90": mean(by_cell(found.ce90))}
-        head = {"rms": found.overall, "ce90": found.overall_ce90}
-        if draws:
-            counted = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
-            columns |= {
-                "drawn_rms": rms(by_cell(counted.rms)),
-                "drawn_ce90": mean(by_cell(counted.ce90)),
-            }
-            head |= {
-                "drawn_rms": counted.overall,
-                "drawn_ce90": counted.overall_ce90,
-                "draws": draws,
-            }
-    head["positions"] = len(line)
+    found = line_scanners.accuracy(
+        scanner,
+        truth=truth,
+        attitude_bias=attitude_bias,
+        attitude_drift=attitude_drift,
+        attitude_white=attitude_white,
+        position_bias=position_bias,
+        position_drift=position_drift,
+        position_white=position_white,
+        draws=draws,
+        seed=seed,
+        grid=grid_of(grid),
+        height=height,
+        dem=dem,
+        geoid=geoid,
+        tell=warn,
+    )
+    figures = {name: value for name, value in found.figures.items() if name != "scanner"}
     if map_ is not None:
-        _write_map(map_, columns, head)
-    write_rows(columns, csv, json, {"scanner": file.name, **head})
+        _write_map(map_, found.table(), figures)
+    write_rows(found.columns, csv, json, found.figures)
     if json != "-":
-        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)
+        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in figures.items()), err=True)
 
 
 def _check_map(path: Path, table: str | None) -> None:

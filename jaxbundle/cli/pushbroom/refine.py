@@ -1,6 +1,5 @@
 """`jaxbundle pushbroom refine`: adjust scanner images with control and tie points."""
 
-import dataclasses
 import json as json_
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ def refine(
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images with control and tie points."""
+    from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.outputs import (
         PAGE,
         REPORT,
@@ -41,7 +41,6 @@ def refine(
     from jaxbundle.io.text.csv_tables import write_csv, write_text
     from jaxbundle.io.writing.fingerprints import files_read
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
-    from jaxbundle.refinement import refine as refine_images
     from jaxbundle.report.page import UNKNOWN, head_line
     from jaxbundle.report.page.refinement import compose_refinement
     from jaxbundle.report.refinement import conclude_refinement
@@ -60,15 +59,7 @@ def refine(
                 "significance": file.significance,
             },
         )
-    result = refine_images(
-        file.images,
-        file.points,
-        file.observations,
-        file.frames,
-        snooping=file.snooping,
-        significance=file.significance,
-    )
-    result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
+    result = line_scanners.refine(file)
     verdict = conclude_refinement(result)
     text = head_line(origin) + report(result, verdict.words)
     document = without_nan({"verdict": verdict_dict(verdict), **to_json(result)})

@@ -9,64 +9,22 @@ import numpy as np
 import typer
 
 from jaxbundle.cli.outputs import check_json
+from jaxbundle.commands.scanner_inputs import check_spheroid as check_spheroid
+from jaxbundle.commands.scanner_inputs import geographic as geographic
+from jaxbundle.commands.scanner_inputs import open_scanner as read_scanner_file
+from jaxbundle.commands.scanner_inputs import surface_of as surface_of
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid
-from jaxbundle.io.rasters.extent import image_extent, rpc_extent
-from jaxbundle.io.rasters.geoid import add_geoid
-from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.fingerprints import files_read
-from jaxbundle.network.columns import Columns
-from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc import Rpc
-from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
 from jaxbundle.system.terminals import write_json
 from jaxbundle.types import Column
 
 
-def surface_of(
-    earth: Ellipsoid | None,
-    height: float | None,
-    dem: Path | None,
-    image: PushbroomImage | Rpc | None = None,
-    geoid: Path | None = None,
-) -> Surface:
-    """The surface selected by the options; default: the ellipsoid (or Z = 0).
-
-    Only the visible part of a terrain model is read.
-    """
-    if geoid is not None and dem is None:
-        raise InputError("--geoid: needs a terrain model; give --dem")
-    if height is not None and not np.isfinite(height):
-        raise InputError(f"--height {height}: a finite number is expected, in metres")
-    if dem is not None:
-        if height is not None:
-            raise InputError("--height and --dem: give one of them")
-        check_spheroid(earth)
-        extent = None
-        if isinstance(image, Rpc):
-            extent = rpc_extent(image)
-        elif image is not None and earth is not None:
-            extent = image_extent(image, earth)
-        terrain = read_terrain(dem, earth, extent)
-        return terrain if geoid is None else add_geoid(terrain, geoid)
-    if earth is None:
-        return Plane(level=height or 0.0)
-    if height is None:
-        return Ground(earth)
-    check_spheroid(earth)
-    return Height(level=height, earth=earth)
-
-
 def open_scanner(path: Path) -> ScannerInput:
     """A scanner file; its warnings go to standard error."""
-    file = read_scanner(path)
-    for warning in file.warnings:
-        warn(warning)
-    return file
+    return read_scanner_file(path, warn)
 
 
 def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
@@ -79,32 +37,6 @@ def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | Non
                 "overwritten; give another"
             )
     check_json(str(outputs.get("json") or ""))
-
-
-def check_spheroid(earth: Ellipsoid | None) -> None:
-    """Refuse heights above a triaxial ellipsoid."""
-    if earth is not None and earth.a != earth.b:
-        raise InputError(
-            "heights, longitude and latitude need an ellipsoid of revolution; make the first two "
-            "axes of [scanner] earth equal"
-        )
-
-
-def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns longitude, latitude (degrees), height as radians and metres.
-
-    **Raises:** `InputError` with the row of an angle out of range.
-    """
-    names = "longitude", "latitude", "height"
-    longitude, latitude, height = (table.numbers(name, required=True) for name in names)
-    for name, values, most in ((names[0], longitude, 360), (names[1], latitude, 90)):
-        if (beyond := ~(np.abs(values) <= most)).any():
-            row = int(beyond.argmax())
-            raise InputError(
-                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; degrees are "
-                "expected; check the order of columns"
-            )
-    return np.radians(longitude), np.radians(latitude), height
 
 
 def write_rows(

@@ -14,12 +14,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
 from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.locate import locate_lines
-from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.rectification import BLOCK, MapNodes, block_places
 from jaxbundle.pushbroom.resample import resample
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Progress
@@ -38,7 +38,7 @@ _locate = compile_once(locate_lines, ())
 
 def map_of(
     image: PushbroomImage,
-    surface: Surface,
+    surface: GroundSurface,
     system: MapSystem,
     size: float | None,
     model: str | Path | None = None,
@@ -84,7 +84,7 @@ def write_corrected(
     target: str | Path,
     image: PushbroomImage,
     search: Search,
-    surface: Surface,
+    surface: GroundSurface,
     system: MapSystem,
     grid: MapGrid,
     resampling: Resampling = "bilinear",

@@ -10,10 +10,10 @@ from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import rasterio
 from jaxbundle.io.rasters.writing import write_raster
+from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.rectification import MapNodes, block_errors, block_places
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 
 BANDS = "east [m]", "north [m]", "error [m]"
@@ -25,7 +25,7 @@ def write_error_map(
     search: Search,
     truth: PushbroomImage,
     truth_search: Search,
-    surface: Surface,
+    surface: GroundSurface,
     system: MapSystem,
     grid: MapGrid,
     progress: Progress | None = None,

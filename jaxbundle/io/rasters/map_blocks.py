@@ -10,7 +10,7 @@ from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.pushbroom.rectification import BLOCK, STEP, MapNodes
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 
 
@@ -18,7 +18,7 @@ def write_map(
     target: str | Path,
     system: MapSystem,
     grid: MapGrid,
-    surface: Surface,
+    surface: GroundSurface,
     count: int,
     dtype: str,
     block: Callable[[MapNodes], np.ndarray | None],

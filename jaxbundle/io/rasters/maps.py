@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.rectification import MapNodes, geographic_nodes, local_nodes
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.system.programs import compile_once
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class MapSystem:
         """The longitudes shifted by full turns to within half a turn of the middle."""
         return x if self.turn is None else x - self.turn * np.round((x - middle) / self.turn)
 
-    def nodes(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> MapNodes:
+    def nodes(self, surface: GroundSurface, x: np.ndarray, y: np.ndarray) -> MapNodes:
         """Ground points at x and y."""
         if self.earth is None:
             return local_nodes(x, y)

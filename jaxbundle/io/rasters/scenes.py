@@ -13,9 +13,9 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
 from jaxbundle.io.rasters.reading import as_type, open_plain, rasterio, unreadable
 from jaxbundle.io.rasters.writing import write_raster
+from jaxbundle.pushbroom.flight import take_image
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.simulate import take_image
-from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 
 
@@ -57,7 +57,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
 def write_taken(
     path: Path,
     image: PushbroomImage,
-    surface: Surface,
+    surface: GroundSurface,
     bands: Float[Array, "bands rows columns"],
     place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     dtype: np.dtype | str,

@@ -132,6 +132,11 @@ def without_nan(value: Any) -> Any:
     return value
 
 
+def json_text(document: Mapping[str, Any]) -> str:
+    """A document as JSON text of one line, ended by a line feed; what is not finite is null."""
+    return json.dumps(without_nan(dict(document)), ensure_ascii=False) + "\n"
+
+
 def verdict_dict(verdict: "Verdict") -> dict:
     """A verdict (`report.verdict`) as plain dicts."""
     state, words, findings = verdict

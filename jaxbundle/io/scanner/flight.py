@@ -46,9 +46,9 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import did_you_mean
+from jaxbundle.pushbroom.flight import Flight
 from jaxbundle.pushbroom.noise import Noise, Sigma
 from jaxbundle.pushbroom.signals import KEYS
-from jaxbundle.pushbroom.simulate import Flight
 
 ORBIT = ("height", "inclination", "node", "argument")
 LINE = ("start", "velocity")

@@ -1,0 +1,375 @@
+"""`calibrate_batch`: many cameras, each calibrated independently from views of known points.
+
+Cameras are solved in portions of one compiled shape: views and points are padded to the next size
+of a short list (`bucket`) with invisible points. If many cameras have far fewer views than others,
+they get a separate shape.
+
+On a CPU a portion is a loop over its cameras (`lax.map`), and as many portions as there are cores
+run at the same time, each in a thread. Milliseconds of one core for a camera of 20 views × 88
+points: the loop 1.6, four cameras at a time 2.0, eight 2.4, `vmap` over 32 3.0, because all wait
+for the slowest and their arrays exceed the cache. On an accelerator a portion is a `vmap` over many
+cameras.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from jaxbundle.arguments import integer, one_of
+from jaxbundle.batches.camera import (
+    CONVERGED,
+    LIMIT,
+    MISFIT,
+    NOT_FINITE,
+    SINGULAR,
+    STATUS,
+    WEAK,
+    CameraSolution,
+    solve_camera,
+)
+from jaxbundle.batches.input import Batch, Portion
+from jaxbundle.batches.misfit import far_outside, misfits, remarks
+from jaxbundle.batches.normal import POSE, CameraUnknowns, Sightings, residual_lengths
+from jaxbundle.batches.result import BatchCalibration as BatchCalibration
+from jaxbundle.batches.snooping import MAX_ROUNDS, TESTS, Snooping
+from jaxbundle.batches.start import start_values
+from jaxbundle.batches.test_values import point_tests
+from jaxbundle.batches.weakness import is_vague, vanishing, weak_geometry
+from jaxbundle.cameras import CameraModel, get_model, key_of
+from jaxbundle.float64 import require_x64
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    matrix_from_rotation_vector,
+    omega_phi_kappa_from_matrix,
+)
+from jaxbundle.leastsquares.quality.snooping import check_test
+from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.devices import on_accelerator
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray, Progress
+
+OF_A_START = ("quaternion", "shift")
+"""Poses in the form of the solver, only for data snooping."""
+OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+Rows = dict[str, Shaped[np.ndarray, "cameras *axes"]]
+"""Fields of a `BatchCalibration`, and what it is made of, by name."""
+
+TESTED = (CONVERGED, LIMIT, SINGULAR)
+"""Statuses of cameras with residuals that data snooping can test."""
+
+
+class ProgramKey(NamedTuple):
+    """What is compiled into the programs of a call: the camera model, the columns of its free
+    parameters, whether the start values have focal lengths, and whether the cameras of a portion
+    come one after the other or all at once."""
+
+    model: CameraModel
+    free: tuple[int, ...]
+    known: bool
+    on_cpu: bool
+
+    def for_every(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """The function of one camera for all of a portion (see the module)."""
+        return partial(jax.lax.map, function) if self.on_cpu else jax.vmap(function)
+
+
+def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
+    object_points: Float[np.ndarray, "*cameras points 3"],
+    image_points: Float[np.ndarray, "cameras views points 2"],
+    image_size: tuple[int, int],
+    *,
+    model: str | CameraModel = "opencv",
+    visible: Bool[np.ndarray, "cameras views points"] | None = None,
+    free: Sequence[str] | None = None,
+    start: Mapping[str, float | Float[np.ndarray, " cameras"]] | None = None,
+    max_iterations: int = 100,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> BatchCalibration:
+    """Calibrate many cameras independently from views of points with known coordinates.
+
+    **Arguments:**
+
+    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; planar or spatial. They
+      may be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
+    - `image_points`: pixels in the axes of the model.
+    - `image_size`: width and height in pixels: the principal point starts at the image centre.
+    - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely", or a `CameraModel`.
+    - `visible`: mask of measured points; default: all. Invisible points may have any coordinates. A
+      point that is NaN or masked, in an image or in the object, is not visible (`make_network`
+      refuses such a row).
+    - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
+      coefficients, otherwise all.
+    - `start`: start values of parameters, for all cameras or [cameras]; missing focal lengths are
+      computed. Parameters neither free nor given are 0, or the image centre. A view is excluded if
+      the given camera has rays for too few of its points.
+    - `snooping`: `"pope"`: remove, camera by camera, blunders at the level `significance`, the
+      probability of removing anything from a camera without blunders; before that, points more than
+      one image size outside the image.
+    - `threads`: portions solved at the same time on a CPU; default: the number of cores.
+    - `progress(stage, done, total)`: called after every portion.
+
+    **Returns:** a `BatchCalibration`; check `status` first.
+
+    **Raises:** `InputError` for inconsistent shapes and names, and under `jax.jit`, `jax.vmap`
+    or `jax.grad`; `RuntimeError` without 64-bit floats. Bad numbers of one camera are reported
+    in its status.
+    """
+    require_x64()
+    max_iterations = integer("max_iterations", max_iterations)
+    one_of("snooping", snooping, TESTS, none=True)
+    check_test(snooping, significance)
+    threads = available_cores() if threads is None else integer("threads", threads)
+    batch = Batch.check(object_points, image_points, image_size, model, visible, free, start)
+    camera_model = get_model(model)
+    if snooping is not None:
+        down = camera_model.axes == "down"
+        far = far_outside(batch.xy, batch.visible, batch.image_size, down)
+        batch = dataclasses.replace(batch, visible=batch.visible & ~far)
+    on_cpu = not on_accelerator()
+    portions = list(batch.portions(on_cpu))
+    key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
+
+    def run(portion: Portion) -> Rows:
+        solve = partial(_solve_portion, key, max_iterations, batch.size)
+        rows = solve(portion)
+        return (
+            rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
+        )
+
+    parts, done = [], 0
+    # threads, not processes: compiled code leaves Python alone, and the programs are shared
+    with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
+        for portion, solved in zip(portions, pool.map(run, portions)):
+            parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
+            done += len(portion.cameras)
+            if progress is not None:
+                progress("calibrating", done, len(batch))
+    order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
+    rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
+    if snooping is not None:
+        rows["removed"] |= far
+    return _result(camera_model, batch, rows)
+
+
+def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
+    """The rows of the cameras of a portion, views at their original positions."""
+    views, points = shape
+    rows = {
+        name: values[: len(portion.cameras)]
+        for name, values in solved.items()
+        if name not in OF_A_START
+    }
+    camera = np.arange(len(portion.cameras))[:, None]
+    # the solver saw only views that show anything, in front; the user's numbers of views come back
+    for name in {"views", "removed", *OF_A_VIEW} & {*rows}:
+        values = rows[name] if name != "removed" else rows[name][:, :, :points]
+        rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
+        rows[name][camera, portion.views] = values[:, : portion.views.shape[1]]
+    return rows
+
+
+def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
+    """Rows in the order of the cameras; NaN for no result."""
+    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
+    solved = ended == CONVERGED
+    undetermined = _undetermined(model, batch, ended, rows)
+    # Singular or at the limit: mostly the geometry of the views, which is then said in words
+    # instead of a status that only tells the symptom.
+    weak = np.full(len(batch), "", dtype=object)
+    for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
+        points = batch.point if batch.point.ndim == 2 else batch.point[i]
+        weak[i] = weak_geometry(points, batch.xy[i], batch.visible[i])
+    # the last RMS of those at the limit: the residuals may fit perfectly where nothing is
+    # determined
+    rms = np.where(ended == LIMIT, rows["rms"], np.nan)
+    for name in OF_A_VIEW:
+        rows[name][~rows["views"]] = np.nan
+    for values in rows.values():
+        if np.issubdtype(values.dtype, np.floating):
+            values[~solved] = np.nan
+    rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
+    ended = np.where(weak != "", WEAK, ended)
+    ended = np.where(solved & undetermined.any(1), WEAK, ended)
+    # last, since it compares the cameras that have values
+    ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
+    del rows["reduced"], rows["mean_length"]
+    rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
+    rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
+    rows["remark"] = np.where(weak != "", weak, rows["remark"])
+    free = tuple(model.parameters[column] for column in batch.free)
+    return BatchCalibration(model=key_of(model), parameters=free, **rows)
+
+
+def _undetermined(
+    model: CameraModel, batch: Batch, ended: Int[np.ndarray, " cameras"], rows: Rows
+) -> Bool[np.ndarray, "cameras k"]:
+    """Undetermined parameters, of cameras for which they can be found."""
+    sigma = rows["sigma"]
+    null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
+    # At the limit the last σ say why, if the equations can be solved.
+    told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
+    return np.where(told[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
+
+
+def _snoop(
+    key: ProgramKey,
+    solve: Callable[[Portion], Rows],
+    portion: Portion,
+    rows: Rows,
+    test: str,
+    significance: float,
+) -> Rows:
+    """The rows of a portion without blunders; only cameras with removed points are solved again.
+
+    A camera without a solution is tested where its iterations ended, since blunders may be the
+    cause. If it has no solution without them either, it is unchanged.
+    """
+    weight = np.asarray(portion.seen.weight)
+    cameras = [Snooping(seen > 0, test, significance) for seen in weight]
+    open_ones = np.arange(len(portion.cameras))
+    first = {name: values.copy() for name, values in rows.items()}
+    failed = np.zeros(len(weight), int)
+    for _ in range(MAX_ROUNDS):
+        used = np.stack([camera.used for camera in cameras]).astype(float)
+        at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+        tests = np.asarray(_tests_program(key, portion.seen, used, at, rows["views"]))
+        tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
+        failed += rows["status"] != CONVERGED
+        # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
+        # point of every view; larger or smaller: the time until it is given up.
+        open_ones = np.array(
+            [
+                i
+                for i in open_ones
+                if tested[i]
+                and failed[i] <= 60
+                and cameras[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
+            ],
+            int,
+        )
+        if not len(open_ones):
+            break
+        # the others get no points: they end at once as "too few points", and keep their rows
+        left = np.zeros_like(weight)
+        left[open_ones] = [cameras[i].used for i in open_ones]
+        seen = dataclasses.replace(portion.seen, weight=left)
+        again = solve(dataclasses.replace(portion, seen=seen))
+        for name, values in rows.items():
+            values[open_ones] = again[name][open_ones]
+    # neither with nor without: nothing says that the removed points are blunders
+    lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
+    for name, values in rows.items():
+        values[lost] = first[name][lost]
+    for i in np.flatnonzero(lost):
+        cameras[i].used = cameras[i].seen
+    rows["removed"] = np.stack([camera.seen & ~camera.used for camera in cameras])
+    return rows
+
+
+@partial(compile_once, static=0)
+def _tests_program(
+    key: ProgramKey,
+    seen: Sightings,
+    used: Float[AnyArray, "cameras views points"],
+    at: CameraUnknowns,
+    views: Bool[AnyArray, "cameras views"],
+) -> Float[Array, "cameras views points"]:
+    def test(
+        arguments: tuple[Sightings, Array, CameraUnknowns, Array],
+    ) -> Float[AnyArray, "views points"]:
+        seen, used, at, views = arguments
+        seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
+        return point_tests(key.model, key.free, seen, seen.weight * used, at)
+
+    return key.for_every(test)((seen, used, at, views))
+
+
+def _solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
+    """The rows of a `BatchCalibration`, with the status as its number."""
+    data = portion.seen, portion.interior, portion.axes, portion.middle
+    result = _portion_program(key, portion.flat, max_steps, size, *data)
+    return jax.tree.map(np.array, result)
+
+
+@partial(compile_once, static=(0, 1))
+def _portion_program(
+    key: ProgramKey,
+    flat: bool,
+    max_steps: int,
+    size: float,
+    seen: Sightings,
+    interior: Float[AnyArray, "cameras parameters"],
+    axes: Float[AnyArray, "cameras 3 3"],
+    middle: Float[AnyArray, "cameras 3"],
+) -> dict[str, Array]:
+    model, free = key.model, key.free
+
+    def calibrate(arguments: tuple[Sightings, Array]) -> tuple[CameraSolution, Float[Array, ""]]:
+        seen, interior = arguments
+        usable, start = start_values(model, flat, key.known, seen, interior, size)
+        solved = solve_camera(model, free, max_steps, size, usable, start)
+        return solved, jnp.sum(residual_lengths(model, usable, solved.at))
+
+    solved, lengths = key.for_every(calibrate)((seen, interior))
+    # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
+    # redundancy, 2·points − k − 6·views.
+    variance = 2 * solved.cost / solved.redundancy
+    covariance = variance[:, None, None] * solved.interior_cofactors
+    points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
+    rotation, position, angles, pose_sigma = jax.vmap(
+        jax.vmap(_exterior_orientation, (0, 0, 0, None, None))
+    )(solved.at.rotation, solved.at.shift, solved.pose_cofactors, axes, middle)
+    pose_sigma = jnp.sqrt(variance)[:, None, None] * pose_sigma
+    return dict(
+        status=solved.status,
+        values=solved.at.interior[:, jnp.array(free)],
+        sigma=jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2)),
+        covariance=covariance,
+        reduced=solved.reduced,
+        interior=solved.at.interior,
+        sigma0=jnp.sqrt(variance),
+        rms=jnp.sqrt(2 * solved.cost / points),
+        mean_length=lengths / points,
+        quaternion=solved.at.rotation,
+        shift=solved.at.shift,
+        redundancy=solved.redundancy,
+        iterations=solved.steps,
+        views=solved.views,
+        position=position,
+        angles=angles,
+        sigma_position=pose_sigma[..., :3],
+        sigma_angles=pose_sigma[..., 3:],
+        rotation=rotation,
+    )
+
+
+def _exterior_orientation(
+    quaternion: Float[Array, "4"],
+    shift: Float[Array, "3"],
+    Q: Float[Array, "6 6"],
+    axes: Float[AnyArray, "3 3"],
+    middle: Float[AnyArray, "3"],
+) -> tuple[Array, Array, Array, Array]:
+    """M, X0, (ω, φ, κ) and their σ for σ₀ = 1 of one view, from the cofactors Q of (δt, δθ).
+
+    ray = M'·A·(X − X̄) + t, so that M = M'·A and X0 = X̄ − Mᵀ·t; A: the object's principal axes.
+    """
+
+    def pose(change: Float[Array, "6"]) -> tuple[Array, Array]:
+        M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
+        X0 = middle - M.T @ (shift + change[:3])
+        return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M
+
+    J, _ = jax.jacfwd(pose, has_aux=True)(jnp.zeros(6))
+    orientation, M = pose(jnp.zeros(6))
+    return M, orientation[:3], orientation[3:], jnp.sqrt(jnp.diagonal(J @ Q @ J.T))

@@ -1,0 +1,212 @@
+"""The result of `calibrate_batch`: numbers by camera, as arrays, a table, or HTML."""
+
+import dataclasses
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from jaxbundle.arguments import show as quoted
+from jaxbundle.batches.camera import CONVERGED, SOLVED, STATUS
+from jaxbundle.batches.population import Population
+from jaxbundle.cameras import CameraModel
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import data_frame
+from jaxbundle.results import ResultMethods
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class BatchCalibration(ResultMethods):
+    """The cameras of a batch; all values of a camera without a solution are NaN.
+
+    **Fields:**
+
+    - `model`, `parameters`: the camera model and its k free parameters.
+    - `status`: "converged"; "weak", the same, but the views do not determine the principal distance
+      or point, whose σ is above a fiftieth of the principal distance (NaN for the values if
+      the iterations could not end because of the geometry of the views, see `remark`); "misfit": it
+      has values, but the residuals are too large, on their own (gross errors) or compared with the
+      other cameras of the batch (see `jaxbundle.batches.misfit`). Without a solution "iteration
+      limit", "singular", "not finite" (an infinite number among the measurements, or the start) or
+      "too few points" (no usable view, or no redundancy).
+    - `remark`: suspicious image points, or for an undetermined camera an RMS far above that of the
+      others; mostly empty.
+    - `undetermined`: the free parameters that the views do not determine, if that is why the
+      camera is weak, singular or at the iteration limit.
+    - `values`, `sigma`, `covariance`: of the free parameters; pixels, dimensionless coefficients.
+    - `interior`: all parameters of the model, in its order.
+    - `sigma0`: √(vᵀv/redundancy), pixels; all σ and covariances are a posteriori.
+    - `rms`: √(Σ(vx² + vy²)/points), pixels, as OpenCV defines it.
+    - `redundancy`, `iterations` (evaluations of the normal equations).
+    - `views`: the used views. A view with fewer than 4 points of a planar object (6 of a spatial
+      one), or with all of them on a line (in a plane), is excluded.
+    - `removed`: the image points removed by data snooping; None without it.
+    - `position`, `angles`: X0, Y0, Z0 in the unit of the object; ω, φ, κ in radians, with
+      `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
+    """
+
+    model: str | CameraModel
+    parameters: tuple[str, ...]
+    status: Shaped[np.ndarray, " cameras"]
+    remark: Shaped[np.ndarray, " cameras"]
+    undetermined: Bool[np.ndarray, "cameras k"]
+    values: Float[np.ndarray, "cameras k"]
+    sigma: Float[np.ndarray, "cameras k"]
+    covariance: Float[np.ndarray, "cameras k k"]
+    interior: Float[np.ndarray, "cameras parameters"]
+    sigma0: Float[np.ndarray, " cameras"]
+    rms: Float[np.ndarray, " cameras"]
+    redundancy: Int[np.ndarray, " cameras"]
+    iterations: Int[np.ndarray, " cameras"]
+    views: Bool[np.ndarray, "cameras views"]
+    position: Float[np.ndarray, "cameras views 3"]
+    angles: Float[np.ndarray, "cameras views 3"]
+    sigma_position: Float[np.ndarray, "cameras views 3"]
+    sigma_angles: Float[np.ndarray, "cameras views 3"]
+    rotation: Float[np.ndarray, "cameras views 3 3"]
+    removed: Bool[np.ndarray, "cameras views points"] | None = None
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have a determined solution that fits."""
+        return self.status == STATUS[CONVERGED]
+
+    @property
+    def solved(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have values, including misfits and those of the weak ones that have any."""
+        return np.isin(self.status, SOLVED) & np.isfinite(self.interior).all(1)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Model and free parameters, and a row per camera."""
+        return {
+            "model": str(self.model),
+            "parameters": list(self.parameters),
+            "cameras": [
+                {
+                    "status": str(self.status[k]),
+                    "remark": str(self.remark[k]),
+                    "values": self.values[k].tolist(),
+                    "sigma": self.sigma[k].tolist(),
+                    "sigma0": float(self.sigma0[k]),
+                    "rms": float(self.rms[k]),
+                    "redundancy": int(self.redundancy[k]),
+                    "iterations": int(self.iterations[k]),
+                }
+                for k in range(len(self))
+            ],
+        }
+
+    def __str__(self) -> str:
+        names, counts = np.unique(self.status, return_counts=True)
+        states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
+        rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
+        said = [f"{len(self)} cameras, model {self.model}: {states}; {rms}"]
+        if self.removed is not None:
+            said.append(f"{int(self.removed.sum())} image points removed by data snooping")
+        remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
+        lines = [
+            f"camera {row}{f' and {count - 1} more' if count > 1 else ''}: {remark}"
+            for row, remark, count in sorted(zip(first, remarks, counts))
+            if remark
+        ]
+        shown = 10  # of remarks that differ
+        if len(lines) > shown:
+            lines[shown:] = [f"and {len(lines) - shown} more remarks, see `remark`"]
+        return "\n".join(said + lines)
+
+    def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
+        """The result of camera i as plain dicts and numbers (angles in radians), as a line of
+        `jaxbundle batch`; `brief`: without covariance and poses; `views`: their number without
+        padding; default: all."""
+        row = {
+            "status": str(self.status[i]),
+            "model": str(self.model),
+            "iterations": int(self.iterations[i]),
+            "redundancy": int(self.redundancy[i]),
+            "views": int(self.views[i].sum()),
+            "views_left_out": np.flatnonzero(~self.views[i][:views]).tolist(),
+        }
+        if self.remark[i]:
+            row["remark"] = str(self.remark[i])
+        if self.removed is not None:
+            removed = np.argwhere(self.removed[i])
+            row["removed"] = len(removed) if brief else removed.tolist()
+        if self.undetermined[i].any():
+            row["undetermined"] = np.array(self.parameters)[self.undetermined[i]].tolist()
+        if not self.solved[i]:
+            return row | ({"rms": float(self.rms[i])} if np.isfinite(self.rms[i]) else {})
+        estimates = zip(self.parameters, self.values[i].tolist(), self.sigma[i].tolist())
+        row |= {
+            "rms": float(self.rms[i]),
+            "sigma0": float(self.sigma0[i]),
+            "parameters": {name: {"value": v, "sigma": s} for name, v, s in estimates},
+        }
+        if not brief:
+            names = ("position", "angles", "sigma_position", "sigma_angles")
+            columns = zip(*(getattr(self, name)[i][:views].tolist() for name in names))
+            row |= {
+                "covariance": self.covariance[i].tolist(),
+                "poses": [dict(zip(names, values)) for values in columns],
+            }
+        return row
+
+    def population(self, ids: Sequence | None = None) -> Population:
+        """The distribution of the cameras, the outlying ones, and correlations of their parameters.
+
+        **Arguments:** `ids` of the cameras; 0, 1, 2, … if not given.
+
+        **Raises:** `InputError` where there are not as many ids as cameras."""
+        ids = range(len(self)) if ids is None else ids
+        if np.shape(ids) != (len(self),):
+            raise InputError(f"ids must be {len(self)}, one a camera, but are {quoted(ids)}")
+        return Population({"key": str(id)} | self.row(i, True) for i, id in enumerate(ids))
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row per camera: status, remark, rms and sigma0 (pixels), redundancy, iterations,
+        views, points removed where there was data snooping, every parameter and its σ."""
+        columns = {
+            "status": self.status,
+            "remark": self.remark,
+            "rms": self.rms,
+            "sigma0": self.sigma0,
+            "redundancy": self.redundancy,
+            "iterations": self.iterations,
+            "views": self.views.sum(1),
+        }
+        if self.removed is not None:
+            columns["removed"] = self.removed.sum((1, 2))
+        for k, name in enumerate(self.parameters):
+            columns |= {name: self.values[:, k], f"sigma_{name}": self.sigma[:, k]}
+        return columns
+
+    def to_pandas(self):
+        """`table` as a pandas data frame (extra `tables`)."""
+        return data_frame(self.table())
+
+    def _repr_html_(self) -> str:
+        """The cameras as a table, unconverged ones first."""
+        table = self.table()
+        if not (self.remark != "").any():
+            del table["remark"]
+        rows = np.argsort(self.converged, kind="stable")[:20]  # a screen
+        cell = 'style="text-align:left;padding:2px 12px 2px 0"'
+        shown = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
+        line = lambda tag, texts: (
+            "<tr>" + "".join(f"<{tag} {cell}>{text}</{tag}>" for text in texts) + "</tr>"
+        )
+        body = "".join(
+            line("td", [row, *(shown(column[row]) for column in table.values())]) for row in rows
+        )
+        more = f"<p>and {len(self) - len(rows)} more</p>" if len(self) > len(rows) else ""
+        head = "<br>".join(map(escape, str(self).splitlines()))
+        return (
+            f'<div><b>{head}</b><table style="border-collapse:collapse;font-size:90%">'
+            f"{line('th', ['camera', *table])}{body}</table>{more}</div>"
+        )

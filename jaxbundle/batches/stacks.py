@@ -1,0 +1,183 @@
+"""Many cameras in one file: an `.npz` with the arrays of `calibrate_batch`.
+
+| array | shape | |
+|---|---|---|
+| `object_points` | [points, 3] or [cameras, points, 3] | known coordinates |
+| `image_points` | [cameras, views, points, 2] | pixels |
+| `image_size` | [2] | width, height |
+| `visible` | [cameras, views, points] | optional: measured points; NaN is not visible either |
+| `ids` | [cameras] | optional: names; otherwise 0, 1, 2, … |
+
+Of rigs, as of `calibrate_rigs`, with an axis more: `image_points` [rigs, cameras, epochs, points,
+2], `visible` [rigs, cameras, epochs, points], `ids` [rigs]; `image_size` [2] or [cameras, 2];
+`cameras` [cameras], optional: their names.
+"""
+
+import dataclasses
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxbundle.arguments import numeric_array
+from jaxbundle.batches.calibrate_rigs import check_rigs, rigs_of_arrays
+from jaxbundle.batches.input import check_shapes, single_list
+from jaxbundle.batches.rigs import RigViews
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
+from jaxbundle.io.text.unpacking import UNREADABLE_ARCHIVE, largest_unpacked_size
+from jaxbundle.io.writing.fingerprints import of_arrays
+
+REQUIRED_ARRAYS = ("object_points", "image_points", "image_size")
+KNOWN_ARRAYS = (*REQUIRED_ARRAYS, "visible", "ids", "cameras")
+BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
+"""Numbers of axes of arrays with one row per camera, or per rig."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraStack:
+    """The cameras of a file; large arrays are read in place."""
+
+    ids: tuple[str, ...]
+    object_points: np.ndarray | StoredRows
+    image_points: np.ndarray | StoredRows
+    image_size: np.ndarray
+    visible: np.ndarray | StoredRows | None
+    cameras: tuple[str, ...] | None = None
+
+    @property
+    def of_rigs(self) -> bool:
+        """Whether its rows are rigs, not cameras."""
+        return self.image_points.ndim == 5
+
+    def rigs(self, chosen: Sequence[int]) -> list[RigViews]:
+        """Some of the rigs; a camera is a rig of one."""
+        given = self.arguments(np.asarray(chosen))
+        xy, visible = given["image_points"], given["visible"]
+        if not self.of_rigs:
+            xy, visible = xy[:, None], None if visible is None else visible[:, None]
+        X = np.asarray(given["object_points"], float)
+        return rigs_of_arrays(X, xy.astype(float), self.image_size, visible, self.cameras)
+
+    def arguments(self, chosen: np.ndarray) -> dict:
+        """Arguments of `calibrate_batch` for some of the cameras."""
+        X = self.object_points
+        return dict(
+            object_points=X[chosen] if isinstance(X, StoredRows) or X.ndim == 3 else X,
+            image_points=self.image_points[chosen],
+            image_size=tuple(self.image_size.ravel().tolist()),
+            visible=None if self.visible is None else self.visible[chosen],
+        )
+
+    def fingerprint(self, camera: int) -> str:
+        """The fingerprint of the measurements of a camera, independent of invisible points and
+        padding."""
+        X = self.object_points
+        X = X[camera] if isinstance(X, StoredRows) or X.ndim == 3 else X
+        xy = self.image_points[camera]
+        seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
+        seen = seen if self.visible is None else seen & (self.visible[camera] != 0)
+        shown = seen.reshape(-1, len(X)).any(0)
+        return of_arrays(np.argwhere(seen), xy[seen], X[shown], np.array(self.image_size.tolist()))
+
+
+def is_camera_stack(path: str | Path) -> bool:
+    """Whether the name is that of a file of many cameras."""
+    return Path(path).suffix.lower() == ".npz"
+
+
+def read_camera_stack(path: str | Path) -> CameraStack:
+    """The cameras of an `.npz` file.
+
+    **Raises:** `InputError` if an array is missing or its shape does not fit the others.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with open(path, "rb") as stream:
+            if not zipfile.is_zipfile(stream):
+                raise zipfile.BadZipFile("it is not an archive")
+            _check_size(stream)
+            with np.load(stream, allow_pickle=False) as file:
+                arrays = {name: _rows(path, name, file) for name in KNOWN_ARRAYS if name in file}
+    except UNREADABLE_ARCHIVE as error:
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
+    missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
+    if missing:
+        raise InputError(
+            f"{path}: no array {missing[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, if "
+            "needed, visible and ids"
+        )
+    X, xy, size = (arrays[name] for name in REQUIRED_ARRAYS)
+    visible, cameras = arrays.get("visible"), _names(path, arrays, "cameras")
+    try:
+        for name in [n for n, array in arrays.items() if isinstance(array, np.ndarray)]:
+            if name in ("ids", "cameras"):
+                continue
+            mask = name == "visible"
+            numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
+        if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:3:2]:
+            X = X[np.arange(len(X))]  # the points of a view each
+        if xy.ndim == 5:
+            cameras, _ = check_rigs(X, xy, size, visible, cameras)
+        else:
+            X = X if isinstance(X, StoredRows) else single_list(X, xy)
+            every = np.broadcast_to(np.True_, xy.shape[:3])
+            check_shapes(X, xy, size, every if visible is None else visible)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    names = _names(path, arrays, "ids")
+    names = tuple(map(str, range(len(xy)))) if names is None else names
+    if len(names) != len(xy):
+        raise InputError(f"{path}: ids must have the shape ({len(xy)},), but has ({len(names)},)")
+    if len({*names}) < len(xy):
+        raise InputError(f"{path}: ids must differ, but some occur twice")
+    return CameraStack(names, X, xy, size, visible, cameras)
+
+
+def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...] | None:
+    """An array of names, if there is one.
+
+    **Raises:** `InputError` for another one."""
+    found = arrays.get(name)
+    if found is None:
+        return None
+    if found.ndim != 1:
+        raise InputError(f"{path}: {name} must be a list, but has the shape {found.shape}")
+    if found.dtype.kind not in "biufUS":
+        raise InputError(f"{path}: {name} must be texts or numbers, but are {found.dtype}")
+    # Bytes become the text they are in ASCII.
+    texts = np.char.decode(found, "ascii", "replace") if found.dtype.kind == "S" else found
+    return tuple(map(str, texts.tolist()))
+
+
+def _rows(path: str | Path, name: str, file: Mapping[str, Any]) -> Any:
+    """An array, or on demand the rows of a large uncompressed one with one row per camera."""
+    # a stack may exceed the memory: rows of an uncompressed array are read from the file when
+    # needed
+    found = find_stored_rows(path, name) if name in BY_CAMERA else None
+    cameras = found is not None and found.ndim in BY_CAMERA[name]
+    truths = name == "visible"
+    if found is None or not cameras or (found.dtype.kind == "b") != truths:
+        found = file[name]
+        if not isinstance(found, np.ndarray):  # NumPy gives the bytes of other members
+            raise ValueError(f"{name} is no array")
+    return found
+
+
+def _check_size(stream: BinaryIO) -> None:
+    """Refuse an archive whose arrays unpack to implausible sizes."""
+    with zipfile.ZipFile(stream) as archive:
+        unpacked = sum(
+            member.file_size
+            for member in archive.infolist()
+            if member.filename.removesuffix(".npy") in KNOWN_ARRAYS
+        )
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(0)
+    if unpacked > largest_unpacked_size(size):
+        raise ValueError(f"{size} bytes that claim to unpack to {unpacked}")

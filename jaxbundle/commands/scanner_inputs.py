@@ -1,0 +1,184 @@
+"""Inputs of the functions of line scanners: scanner files, surfaces, positions, ground points."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
+from jaxbundle.io.rasters.extent import image_extent, rpc_extent
+from jaxbundle.io.rasters.geoid import add_geoid
+from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.scanner import ScannerInput
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
+
+Tell = Callable[[str], object]
+"""Called with a warning, a line of text."""
+OFF_IMAGE = "off the image"
+CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
+LOCATED_COLUMNS = ("id", *CARTESIAN, *GEOGRAPHIC, "count", "status")
+PROJECTED_COLUMNS = ("id", "line", "pixel", "count", "status")
+"""Further columns of the tables of `locate` and `project`, which are accepted as input."""
+
+
+def ignore(_: str) -> None:
+    """Discard a warning."""
+
+
+def surface_of(
+    earth: Ellipsoid | None,
+    height: float | None,
+    dem: str | Path | None,
+    image: PushbroomImage | Rpc | None = None,
+    geoid: str | Path | None = None,
+) -> GroundSurface:
+    """The surface selected by the options; default: the ellipsoid (or Z = 0).
+
+    Only the visible part of a terrain model is read.
+    """
+    if geoid is not None and dem is None:
+        raise InputError("--geoid: needs a terrain model; give --dem")
+    if height is not None and not np.isfinite(height):
+        raise InputError(f"--height {height}: a finite number is expected, in metres")
+    if dem is not None:
+        if height is not None:
+            raise InputError("--height and --dem: give one of them")
+        check_spheroid(earth)
+        extent = None
+        if isinstance(image, Rpc):
+            extent = rpc_extent(image)
+        elif image is not None and earth is not None:
+            extent = image_extent(image, earth)
+        terrain = read_terrain(dem, earth, extent)
+        return terrain if geoid is None else add_geoid(terrain, Path(geoid))
+    if earth is None:
+        return Plane(level=height or 0.0)
+    if height is None:
+        return Ground(earth)
+    check_spheroid(earth)
+    return Height(level=height, earth=earth)
+
+
+def open_scanner(path: str | Path, tell: Tell = ignore) -> ScannerInput:
+    """A scanner file; `tell` receives its warnings.
+
+    **Raises:** `InputError`."""
+    file = read_scanner(Path(path))
+    for warning in file.warnings:
+        tell(warning)
+    return file
+
+
+def check_spheroid(earth: Ellipsoid | None) -> None:
+    """Refuse heights above a triaxial ellipsoid."""
+    if earth is not None and earth.a != earth.b:
+        raise InputError(
+            "heights, longitude and latitude need an ellipsoid of revolution; make the first two "
+            "axes of [scanner] earth equal"
+        )
+
+
+def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns longitude, latitude (degrees), height as radians and metres.
+
+    **Raises:** `InputError` with the row of an angle out of range.
+    """
+    names = "longitude", "latitude", "height"
+    longitude, latitude, height = (table.numbers(name, required=True) for name in names)
+    for name, values, most in ((names[0], longitude, 360), (names[1], latitude, 90)):
+        if (beyond := ~(np.abs(values) <= most)).any():
+            row = int(beyond.argmax())
+            raise InputError(
+                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; degrees are "
+                "expected; check the order of columns"
+            )
+    return np.radians(longitude), np.radians(latitude), height
+
+
+def places(
+    image: PushbroomImage, points: str | Path | None, grid: tuple[int, int]
+) -> tuple[Sequence[str], np.ndarray, np.ndarray, Source]:
+    """Ids, lines, pixels and their source: a table, or a grid over the image.
+
+    **Raises:** `InputError`.
+    """
+    if points is None:
+        rows, columns = grid
+        lines = np.repeat(np.linspace(0, image.lines - 1, rows), columns)
+        pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
+        return (), lines, pixels, Source("grid", None, "place")
+    table = read_csv(Path(points))
+    table.check_names(("line", "pixel"), LOCATED_COLUMNS)
+    line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
+    ids = table.ids("id") if "id" in table.values else ()
+    return ids, line, pixel, table.source
+
+
+def off_image(
+    image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source, tell: Tell
+) -> np.ndarray:
+    """Which positions are outside the image; reported, and refused if all are.
+
+    **Raises:** `InputError`.
+    """
+    off = np.zeros(len(line), bool)
+    said = None
+    for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
+        outside = ~((values >= -0.5) & (values <= size - 0.5))
+        if outside.any() and said is None:
+            row = int(outside.argmax())
+            said = (
+                f"{source(row)}: {name} {values[row]:g} is {OFF_IMAGE}, which has {size}; -0.5 to "
+                f"{size - 0.5:g} is expected"
+            )
+        off |= outside
+    if said is not None:
+        said += f" ({off.sum()} of {len(off)} points)"
+        if off.all():
+            raise InputError(said)
+        tell(said)
+    return off
+
+
+def with_points(table: Columns, tell: Tell) -> Columns:
+    """The rows that have a point: `locate` leaves the others empty, with a status."""
+    if "status" not in table.values:
+        return table
+    given = [name for name in (*CARTESIAN, *GEOGRAPHIC) if name in table.values]
+    empty = np.all([np.isnan(table.numbers(name)) for name in given], axis=0)
+    if not np.any(empty):
+        return table
+    tell(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are skipped)")
+    kept = np.flatnonzero(~empty).tolist()
+    values = {name: [column[row] for row in kept] for name, column in table.values.items()}
+    return Columns(values, table.source.take(kept))
+
+
+def points_of(table: Columns, earth: Ellipsoid | None) -> np.ndarray:
+    """Points of a table, Earth-fixed or local; X, Y, Z have priority.
+
+    **Raises:** `InputError`.
+    """
+    cartesian = "X" in table.values
+    if not cartesian and not any(name in table.values for name in GEOGRAPHIC[:2]):
+        expected = (*CARTESIAN, *GEOGRAPHIC)
+        odd = next((name for name in table.values if name not in PROJECTED_COLUMNS), "")
+        raise InputError(
+            f"{table.source.name}: no columns {', '.join(CARTESIAN)} nor {', '.join(GEOGRAPHIC)}"
+            f"{did_you_mean(odd, expected, listing=False)}"
+        )
+    if cartesian:
+        table.check_names(CARTESIAN, (*GEOGRAPHIC, *PROJECTED_COLUMNS))
+        return np.stack([table.numbers(n, required=True) for n in CARTESIAN])
+    if earth is None:
+        raise InputError(f"{table.source.name}: a local frame has no longitudes; give X, Y, Z")
+    check_spheroid(earth)
+    table.check_names(GEOGRAPHIC, PROJECTED_COLUMNS)
+    return np.array(earth_fixed(earth, geographic(table)))

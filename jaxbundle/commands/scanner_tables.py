@@ -1,0 +1,280 @@
+"""`locate`, `project`, `accuracy` of line scanners: from files to a table."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxbundle.commands.scanner_inputs import (
+    OFF_IMAGE,
+    Tell,
+    ignore,
+    off_image,
+    open_scanner,
+    places,
+    points_of,
+    surface_of,
+    with_points,
+)
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import geodetic
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.network.columns import data_frame
+from jaxbundle.pushbroom.error_propagation import (
+    ground_errors,
+    propagate_accuracy,
+    simulate_accuracy,
+    spread_positions,
+)
+from jaxbundle.pushbroom.ground_to_image import ProjectionStatus, make_search, project_points
+from jaxbundle.pushbroom.image_to_ground import locate_points
+from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.terrain import Terrain
+from jaxbundle.results import ResultMethods
+from jaxbundle.types import Column
+
+GAP_REASON = "found beyond a place without height"
+MAX_IMAGES = 4
+"""Lines that see one point: several do where they overlap, as of a platform that sways."""
+MIN_DRAWS = 20
+"""The RMS of n draws is uncertain by up to 1/√n, here 22 %."""
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class ScannerTable(ResultMethods):
+    """A table of positions: `columns` by name, and `figures` of the whole."""
+
+    columns: Mapping[str, Column]
+    figures: Mapping[str, Any]
+
+    def table(self) -> dict[str, np.ndarray]:
+        """The columns as arrays."""
+        return {name: np.asarray(column) for name, column in self.columns.items()}
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas data frame (extra `tables`)."""
+        return data_frame(self.table())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Figures and rows as plain dicts and numbers, as in JSON."""
+        columns = [column.tolist() for column in self.table().values()]
+        rows = [dict(zip(self.columns, row)) for row in zip(*columns)]
+        return without_nan({**self.figures, "rows": rows})
+
+    def __str__(self) -> str:
+        """The table as CSV; NaN is an empty cell."""
+        rows = [",".join(self.columns)]
+        for row in zip(*(column.tolist() for column in self.table().values())):
+            rows.append(",".join("" if v != v else str(v) for v in row))
+        return "\n".join(rows)
+
+
+def locate(
+    scanner: str | Path,
+    *,
+    points: str | Path | None = None,
+    grid: tuple[int, int] = (11, 11),
+    height: float | None = None,
+    dem: str | Path | None = None,
+    geoid: str | Path | None = None,
+    tell: Tell = ignore,
+) -> ScannerTable:
+    """Locate image positions of a scanner file on the ground; (0, 0) is the centre of the first
+    pixel. Of arrays: `locate_points`.
+
+    **Arguments:**
+
+    - `scanner`: scanner file, or product file.
+    - `points`: table line, pixel[, id]; without it a `grid` of lines × pixels over the image.
+    - `height`: of the ground, metres above the ellipsoid (Z in a local frame), or `dem`: terrain
+      raster, with `geoid`: geoid heights, where its heights are orthometric.
+    - `tell`: called with every warning.
+
+    **Returns:** columns line, pixel, X, Y, Z, on the Earth longitude, latitude (degrees), height,
+    and status.
+
+    **Raises:** `InputError`, also if no position meets the surface.
+    """
+    file = open_scanner(scanner, tell)
+    surface = surface_of(file.earth, height, dem, file.image, geoid)
+    ids, line, pixel, source = places(file.image, points, grid)
+    off = off_image(file.image, line, pixel, source, tell)
+    find = jax.jit(locate_points)
+    X = np.array(find(file.image, surface, line, pixel))
+    X[:, off] = np.nan
+    missed = np.isnan(X).any(0) & ~off
+    over = np.zeros_like(missed)
+    if isinstance(surface, Terrain):
+        strict = dataclasses.replace(surface, over_voids=False)
+        over = ~(missed | off) & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
+    reason = "no terrain there" if dem else "misses the surface"
+    if missed.any():
+        row = int(missed.argmax())
+        remedy = (
+            f"give a model that covers the image instead of {dem}"
+            if dem
+            else "check attitude, mounting and height"
+        )
+        said = (
+            f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
+            f"{remedy} ({missed.sum()} of {len(line)} points)"
+        )
+        if (missed | off).all():
+            raise InputError(said)
+        tell(said)
+    columns: dict[str, Column] = {"id": ids} if ids else {}
+    columns |= {"line": line, "pixel": pixel, "X": X[0], "Y": X[1], "Z": X[2]}
+    if file.earth is not None and file.earth.a == file.earth.b:
+        longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
+        columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
+        columns |= {"height": h}
+    reasons = [OFF_IMAGE, reason, GAP_REASON]
+    columns["status"] = np.select([off, missed, over], reasons, "found").tolist()
+    return ScannerTable(columns, {"scanner": file.name})
+
+
+def project(scanner: str | Path, points: str | Path, *, tell: Tell = ignore) -> ScannerTable:
+    """Project ground points into the image of a scanner file: a row for every line that sees one.
+    Of arrays: `project_points`.
+
+    **Arguments:** `points`: table X, Y, Z[, id] (m) or longitude, latitude, height[, id]
+    (degrees); `tell`: called with every warning.
+
+    **Returns:** columns id, line, pixel, count (of lines that see the point), status.
+
+    **Raises:** `InputError`, also if no point is in the image.
+    """
+    file = open_scanner(scanner, tell)
+    table = with_points(read_csv(Path(points)), tell)
+    X = points_of(table, file.earth)
+    search = make_search(file.image, file.earth)
+    found = project_points(file.image, search, X, most=MAX_IMAGES)
+    line, pixel = np.asarray(found.line), np.asarray(found.pixel)
+    status, count = np.asarray(found.status), np.asarray(found.count)
+    if (status != ProjectionStatus.SEEN).all():
+        raise InputError(
+            f"{table.source(0)}: no point is in the image; this one is "
+            f"{ProjectionStatus(int(status[0])).meaning}: check coordinates, frame and units"
+        )
+    unseen = np.flatnonzero(status != ProjectionStatus.SEEN)
+    if len(unseen):
+        first = unseen[0]
+        tell(
+            f"{table.source(first)}: not in the image but "
+            f"{ProjectionStatus(int(status[first])).meaning} "
+            f"({len(unseen)} of {len(status)} points)"
+        )
+    first = (np.arange(MAX_IMAGES) == 0)[:, None]
+    solution, point = np.nonzero(~np.isnan(line) | (first & (count == 0)))
+    order = np.lexsort((solution, point))
+    solution, point = solution[order], point[order]
+    ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(status))]
+    columns = {
+        "id": [ids[p] for p in point],
+        "line": line[solution, point],
+        "pixel": pixel[solution, point],
+        "count": count[point],
+        "status": [ProjectionStatus(int(status[p])).meaning for p in point],
+    }
+    return ScannerTable(columns, {"scanner": file.name})
+
+
+def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one by name)
+    scanner: str | Path,
+    *,
+    truth: str | Path | None = None,
+    attitude_bias: float = 0.0,
+    attitude_drift: float = 0.0,
+    attitude_white: float = 0.0,
+    position_bias: float = 0.0,
+    position_drift: float = 0.0,
+    position_white: float = 0.0,
+    draws: int = 0,
+    seed: int = 0,
+    grid: tuple[int, int] = (11, 11),
+    height: float | None = None,
+    dem: str | Path | None = None,
+    geoid: str | Path | None = None,
+    tell: Tell = ignore,
+) -> ScannerTable:
+    """Ground RMS and CE90 for given σ of the ancillary data, or errors against a known truth; of
+    about a thousand irregular positions, so that none of them falls in step with the records.
+
+    **Arguments:**
+
+    - `scanner`: scanner file; `truth`: that of the truth.
+    - `attitude_…`, `position_…`: σ in degrees and metres, of drifts per second.
+    - `draws`: of a Monte Carlo simulation in addition to propagation; `seed`: of it.
+    - `grid`: parts of the image, lines × pixels, a row of the table each.
+    - `height`, `dem`, `geoid`: as of `locate`.
+
+    **Raises:** `InputError`.
+    """
+    if 0 < draws < MIN_DRAWS:
+        raise InputError(
+            f"--draws {draws}: too few for an RMS; at least {MIN_DRAWS}, 1000 are accurate to 3 %"
+        )
+    file = open_scanner(scanner, tell)
+    surface = surface_of(file.earth, height, dem, file.image, geoid)
+    size = file.image.lines, file.image.pixels
+    line, pixel = (v.ravel() for v in spread_positions(*size, grid))
+    row, column = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(grid, size))
+    columns: dict[str, Column] = {
+        "line": np.repeat(row, len(column)),
+        "pixel": np.tile(column, len(row)),
+    }
+    by_cell = lambda values: np.asarray(values).reshape(len(row) * len(column), -1)
+    known = lambda values: np.isfinite(values).sum(1)
+    # a cell where every ray misses the surface has no mean
+    mean = lambda values: np.nansum(values, 1) / np.where(known(values) > 0, known(values), np.nan)
+    rms = lambda values: np.sqrt(mean(values**2))
+    if truth is not None:
+        true = open_scanner(truth, tell).image
+        errors = ground_errors(file.image, true, surface, line, pixel)
+        length = np.hypot(*errors.T)
+        columns |= {
+            "east": mean(by_cell(errors[:, 0])),
+            "north": mean(by_cell(errors[:, 1])),
+            "error": rms(by_cell(length)),
+        }
+        if not np.isfinite(length).any():
+            raise InputError("no ray meets the surface: check attitude, mounting and height")
+        figures = {
+            "rms": float(np.sqrt(np.nanmean(length**2))),
+            "ce90": float(np.nanquantile(length, 0.9)),
+        }
+    else:
+        degree = np.pi / 180
+        noise = Noise(
+            degree * attitude_bias,
+            degree * attitude_drift,
+            degree * attitude_white,
+            position_bias,
+            position_drift,
+            position_white,
+        )
+        if not any(noise):
+            raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
+        if isinstance(surface, Terrain):
+            raise InputError("--dem: use --height with σ; terrain has no reverse mode")
+        found = propagate_accuracy(file.image, surface, line, pixel, noise)
+        columns |= {"rms": rms(by_cell(found.rms)), "ce90": mean(by_cell(found.ce90))}
+        figures = {"rms": found.overall, "ce90": found.overall_ce90}
+        if draws:
+            drawn = simulate_accuracy(file.image, surface, line, pixel, noise, draws, seed)
+            columns |= {
+                "drawn_rms": rms(by_cell(drawn.rms)),
+                "drawn_ce90": mean(by_cell(drawn.ce90)),
+            }
+            figures |= {
+                "drawn_rms": drawn.overall,
+                "drawn_ce90": drawn.overall_ce90,
+                "draws": draws,
+            }
+    return ScannerTable(columns, {"scanner": file.name, **figures, "positions": len(line)})

@@ -1,0 +1,594 @@
+"""The line scanner explorer: interpolation, attitude errors, corrections, and ground height.
+
+Two kinds of files. Changes of a *scanner file* are compared with the unchanged image, or with a
+known truth. A *flight file* is simulated: the records of its instruments, sampled, noisy
+and interpolated by the chosen methods, are compared with the true trajectory; its rates and σ are
+controls too.
+
+Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
+the table, so that the exported flight file has them. Ground places are those of `locate`, the error
+map is `ground_errors`, σ → RMS and CE90 are `propagate_accuracy` and, for a level camera,
+`closed_form`.
+"""
+
+import dataclasses
+import io
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.explorer.page import (
+    Choice,
+    Control,
+    Number,
+    Switch,
+    draw_controls,
+    draw_tools,
+    make_page,
+    place,
+)
+from jaxbundle.explorer.tracks import (
+    ORBIT,
+    STRAIGHT,
+    Tracks,
+    choose_track,
+    idle_controls,
+    shorten_number,
+    track_controls,
+    tracks_of,
+)
+from jaxbundle.explorer.view import File, Given, check_keys, number, switch, word
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed, geodetic
+from jaxbundle.io.scanner.writing import write_scanner_image
+from jaxbundle.plotting import image_map
+from jaxbundle.plotting.files import png
+from jaxbundle.pushbroom.ancillary import attitude_table, position_table
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.error_propagation import (
+    circular_error,
+    closed_form,
+    east_north,
+    ground_errors,
+    propagate_accuracy,
+    spread_positions,
+)
+from jaxbundle.pushbroom.flight import Flight, measured_image, true_image, with_errors_in_rows
+from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
+from jaxbundle.pushbroom.image_to_ground import locate_points
+from jaxbundle.pushbroom.interpolation import METHODS, TimeTable
+from jaxbundle.pushbroom.noise import Noise, Sigma, zero_errors
+from jaxbundle.pushbroom.study import altitude_and_view
+from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory, trajectory_in_pieces
+from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
+from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
+from jaxbundle.report.page.markup import figure, grid, paragraph
+
+ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
+"""The index of an angle in an attitude error: about right (pitch), forward (roll), up (yaw)."""
+POSITIVE_KEYS = ("altitude", "speed", "height")
+FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
+
+
+class Chosen(NamedTuple):
+    """An image with what was chosen, the ellipsoid (None in a local frame), the surface it is
+    located on, and the image that is true."""
+
+    image: PushbroomImage
+    earth: Ellipsoid | None
+    surface: GroundSurface
+    truth: PushbroomImage
+
+
+class FlightView:
+    """The image of a scanner file, or what a flight file simulates.
+
+    **Arguments:** `given` the image, or the flight; `earth`: the ellipsoid, None in a local frame;
+    `truth`: an image that is true, the given one if none is given; `cells`: parts of the image,
+    along lines and pixels, of the error map, with irregular positions in each.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        given: PushbroomImage | Flight,
+        earth: Ellipsoid | None,
+        truth: PushbroomImage | None = None,
+        origin: Origin = UNKNOWN,
+        cells: tuple[int, int] = (7, 6),
+    ):
+        self.cells = cells
+        self.name, self.earth, self.origin = name, earth, origin
+        self.flight = given if isinstance(given, Flight) else None
+        self.image = measured_image(given) if isinstance(given, Flight) else given
+        self.truth = (
+            truth
+            if truth is not None
+            else (self.image if self.flight is None else true_image(self.flight))
+        )
+        self.known = truth is not None or self.flight is not None
+        self.tracks = (
+            None if self.flight is None else tracks_of(self.flight.track, self.image, earth)
+        )
+
+    # --- values -----------------------------------------------------------------------------
+
+    @cached_property
+    def controls(self) -> list[Control]:
+        """The controls with the values of the file."""
+        position, attitude = self.image.trajectory.position, self.image.trajectory.attitude
+        quaternions = attitude.table.values.shape[1] == 4
+        ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
+        turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
+        found: list[Control] = []
+        if self.tracks is not None:
+            found += [
+                Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
+                *track_controls(self.tracks),
+            ]
+        found += [
+            Choice(
+                "position_interpolation", "interpolation of the position", position.method, ways
+            ),
+            Choice(
+                "attitude_interpolation",
+                "interpolation of the attitude",
+                "slerp" if attitude.slerp else attitude.table.method,
+                turns,
+            ),
+        ]
+        found += [Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES]
+        if self.flight is not None:
+            found += [
+                Number("position_rate", "samples of the position", self.flight.position_rate, "Hz"),
+                Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
+                Number(
+                    "attitude_white",
+                    "σ of every attitude row",
+                    _degrees(self.flight.noise.attitude_white),
+                    "°",
+                ),
+                Number(
+                    "position_white",
+                    "σ of every position row",
+                    _largest(self.flight.noise.position_white),
+                    "m",
+                ),
+            ]
+        if self.earth is not None or self.tracks is not None:
+            found += [
+                Switch(name, name.replace("_", " "), on)
+                for name, on in zip(Corrections._fields, self.image.corrections)
+            ]
+        return [*found, Number("ground", "height of the ground", 0.0, "m")]
+
+    def values(self, given: Given) -> dict[str, Any]:
+        """All values by key, by default those of the file.
+
+        **Raises:** `InputError`."""
+        check_keys(given, [control.key for control in self.controls])
+        found: dict[str, Any] = {}
+        for one in self.controls:
+            if isinstance(one, Number):
+                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE_KEYS else -np.inf
+                found[one.key] = number(given, one.key, one.value, lowest)
+                if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
+                    raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
+            elif isinstance(one, Switch):
+                found[one.key] = switch({one.key: given.get(one.key, one.value)}, one.key)
+            else:
+                found[one.key] = word(given, one.key, one.value, one.words)
+        return found
+
+    def choose(self, values: Mapping[str, Any]) -> Chosen:
+        """The image with these values.
+
+        **Raises:** `InputError`."""
+        image, truth, earth = self.image, self.truth, self.earth
+        if self.flight is not None and self.tracks is not None:
+            flight = self._flight_with(self.flight, self.tracks, values)
+            image = measured_image(flight)
+            if flight.track != self.flight.track:
+                truth = true_image(flight)
+            earth = self.tracks.earth if values["track"] == ORBIT else None
+        trajectory = Trajectory(
+            _table_with(image.trajectory.position, values["position_interpolation"]),
+            _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
+        )
+        corrections = Corrections(
+            *(earth is not None and values.get(name, False) for name in Corrections._fields)
+        )
+        image = make_image(
+            trajectory,
+            image.times,
+            image.optics,
+            image.lines,
+            image.pixels,
+            image.mounting,
+            corrections,
+        )
+        error = np.zeros(3)
+        for name, k in ANGLES.items():
+            error[k] = np.radians(values[name])
+        if error.any():
+            errors = zero_errors(image)._replace(attitude_bias=jnp.asarray(error))
+            image = with_errors_in_rows(image, errors)
+        return Chosen(image, earth, _surface_at(values["ground"], earth), truth)
+
+    def _flight_with(self, flight: Flight, tracks: Tracks, values: Mapping[str, Any]) -> Flight:
+        noise = flight.noise
+        for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
+            # A σ for every axis stays as the file has it until it is changed.
+            if values[name] != _control(self.controls, name).value:
+                noise = noise._replace(**{name: unit * values[name]})
+        names = (
+            "position_interpolation",
+            "attitude_interpolation",
+            "position_rate",
+            "attitude_rate",
+        )
+        return dataclasses.replace(
+            flight,
+            noise=noise,
+            track=choose_track(tracks, values),
+            **{n: values[n] for n in names},
+        )
+
+    # --- what the server asks ---------------------------------------------------------------
+
+    def answer(self, given: Given) -> dict[str, Any]:
+        """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors`: the RMS
+        of each part of the image [lines, pixels]; `expected`: rows of the accuracy table; `idle`:
+        controls without effect."""
+        values = self.values(given)
+        chosen = _in_pieces(self.choose(values))
+        errors = self._errors(chosen)
+        length = np.hypot(*errors.T)
+        if not np.isfinite(length).all():
+            raise InputError(
+                "not every image position has a point on the ground: check "
+                "attitude, mounting and height"
+            )
+        expected = self._expected_accuracy(chosen)
+        rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
+        told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
+        field = self._rms_of_cells(length)
+        return {
+            "parts": {
+                "ground": self._draw_ground(chosen),
+                "errors": self._draw_errors(field, told),
+                "accuracy": self._list(told, errors, expected),
+            },
+            **told,
+            "errors": field.tolist(),
+            "expected": expected,
+            "idle": self._idle(values),
+        }
+
+    def _idle(self, values: Mapping[str, Any]) -> list[str]:
+        """The controls without effect: those of the other track, corrections without an Earth."""
+        if self.tracks is None:
+            return []
+        corrections = Corrections._fields if values["track"] == STRAIGHT else ()
+        return [*idle_controls(self.tracks, values["track"]), *corrections]
+
+    def export(self, name: str, given: Given) -> File:
+        """The flight file with its tables (zip), the accuracy table (CSV), the error map (PNG).
+
+        **Raises:** `InputError`."""
+        values = self.values(given)
+        chosen = self.choose(values)
+        if name == FLIGHT_FILE:
+            return File(name, "application/zip", self._zip(chosen))
+        if name == TABLE_FILE:
+            return File(name, "text/csv", self._csv(chosen).encode())
+        if name == PICTURE_FILE:
+            return File(name, "image/png", self._picture(chosen))
+        raise InputError(
+            f"there is no file {name!r}; {FLIGHT_FILE}, {TABLE_FILE} and {PICTURE_FILE} are"
+        )
+
+    def page(self, given: Given, live: bool) -> Page:
+        """Controls, the ground, the error map, the table; a live page asks for them itself, since
+        the first answer compiles programs."""
+        values = self.values(given)
+        controls = [_with_value(control, values[control.key]) for control in self.controls]
+        image = self.image
+        if self.flight is not None:
+            against = "the true trajectory of the flight"
+        else:
+            against = "the given truth" if self.known else "the image as its file has it"
+        exports = {
+            "Flight file (zip)": FLIGHT_FILE,
+            "Table (CSV)": TABLE_FILE,
+            "Picture (PNG)": PICTURE_FILE,
+        }
+        sections = [
+            Section(
+                "choices",
+                "Trajectory and attitude",
+                "".join(
+                    [
+                        paragraph(
+                            f"{image.lines} lines of {image.pixels} pixels; errors are against "
+                            f"{against}."
+                        ),
+                        draw_controls(controls, live),
+                        draw_tools(live, exports),
+                    ]
+                ),
+            ),
+            Section("accuracy-section", "Accuracy", place("accuracy"), "Accuracy"),
+            Section("errors-section", "Error map", place("errors"), "Error map"),
+            Section("ground-section", "Ground track and footprint", place("ground"), "Ground"),
+        ]
+        title = f"{clean(self.name)}: explorer"
+        rows = [(key.replace("_", " "), value) for key, value in values.items()]
+        return make_page(
+            title,
+            sections,
+            self.origin,
+            live,
+            "scanner",
+            {} if live else self.answer(given),
+            rows,
+            given=values,
+        )
+
+    # --- numbers ----------------------------------------------------------------------------
+
+    @cached_property
+    def positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lines and pixels at which errors are computed, cell after cell of the error map."""
+        lines, pixels = spread_positions(self.image.lines, self.image.pixels, self.cells)
+        return lines.ravel(), pixels.ravel()
+
+    def _errors(self, chosen: Chosen) -> Float[np.ndarray, "n 2"]:
+        return ground_errors(chosen.image, chosen.truth, chosen.surface, *self.positions)
+
+    def _rms_of_cells(self, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, "rows columns"]:
+        return np.sqrt(np.mean(length.reshape(*self.cells, -1) ** 2, axis=2))
+
+    def _expected_accuracy(
+        self, chosen: Chosen, levels: Sequence[float] = (0.01, 0.1)
+    ) -> list[dict[str, float]]:
+        """RMS and CE90 of attitudes with given σ about every axis, degrees, one error an image."""
+        image, surface = chosen.image, chosen.surface
+        altitude, view = altitude_and_view(image, surface)
+        # a constant error has no structure that a few positions could miss
+        spread = spread_positions(image.lines, image.pixels, self.cells, 1)
+        line, pixel = (v.ravel() for v in spread)
+        rows = []
+        for level in levels:
+            sigma = np.radians(level)
+            exact = propagate_accuracy(image, surface, line, pixel, Noise(attitude_bias=sigma))
+            rms = closed_form(altitude, view, sigma, sigma, sigma)
+            rows.append(
+                {
+                    "sigma": level,
+                    "rms": exact.overall,
+                    "ce90": exact.overall_ce90,
+                    "closed_rms": rms,
+                    "closed_ce90": circular_error(np.eye(2) * rms**2 / 2),
+                }
+            )
+        return rows
+
+    def _draw_ground(self, chosen: Chosen) -> str:
+        image, earth, surface, truth = chosen
+        # The last place is the middle of the image, from which east and north are counted.
+        size = self.image.lines, self.image.pixels
+        outline = [np.append(v, (n - 1) / 2) for v, n in zip(_outline(self.image), size)]
+        reference = np.asarray(_locate(truth, surface, *outline))
+        O = reference[:, -1]
+        axes = np.asarray(_east_north(surface, tuple(O)))
+
+        def curve(label: str, X: ArrayLike, kind: str) -> Curve:
+            east, north = 1e-3 * axes @ (np.asarray(X) - O[:, None])
+            return Curve(label, east, north, None, kind)
+
+        curves = [
+            curve(label, X[:, :-1], kind)
+            for X, label, kind in (
+                (reference, "footprint, reference", "second"),
+                (np.asarray(_locate(image, surface, *outline)), "footprint", "first"),
+            )
+        ]
+        # as many places as the outline has
+        lines = np.linspace(0, image.lines - 1, len(outline[0]) - 1)
+        P = np.array(_positions(image, jnp.asarray(lines))).T
+        if earth is None:
+            P[2] = 0.0
+            curves.append(curve("track, from above", P, "given"))
+        elif earth.a == earth.b:
+            curves.append(curve("ground track, below the platform", _below(earth, P), "given"))
+        return figure(
+            draw_plan(curves, "east [km]", "north [km]"),
+            "Relative to the image centre; both axes at one scale",
+        )
+
+    def _draw_errors(
+        self, field: Float[np.ndarray, "rows columns"], told: Mapping[str, float]
+    ) -> str:
+        return figure(
+            draw_field(field, 3),
+            f"Error on the ground in metres, RMS of each part of the image, line 0 at the top: RMS "
+            f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
+        )
+
+    def _list(
+        self,
+        told: Mapping[str, float],
+        errors: Float[np.ndarray, "n 2"],
+        expected: Sequence[Mapping[str, float]],
+    ) -> str:
+        east, north = np.sqrt(np.mean(errors**2, 0))
+        rows = [
+            ("RMS", told["rms"]),
+            ("RMS east", east),
+            ("RMS north", north),
+            ("CE90", told["ce90"]),
+            ("largest", told["largest"]),
+        ]
+        first = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
+        header = (
+            "σ of the attitude, each axis",
+            "RMS [m]",
+            "CE90 [m]",
+            "RMS, level camera",
+            "CE90, level camera",
+        )
+        names = ("rms", "ce90", "closed_rms", "closed_ce90")
+        table = [
+            (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names))
+            for row in expected
+        ]
+        return (
+            first
+            + "<h3>Expected accuracy for a constant error over the image</h3>\n"
+            + grid(header, table)
+        )
+
+    # --- files ------------------------------------------------------------------------------
+
+    def _zip(self, chosen: Chosen) -> bytes:
+        """`scanner.toml` with its tables."""
+        data = io.BytesIO()
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(data, "w") as archive:
+            write_scanner_image(
+                folder, "scanner", chosen.image, chosen.earth, prefix="", angle_unit="deg"
+            )
+            for path in sorted(Path(folder).iterdir()):
+                archive.write(path, path.name, zipfile.ZIP_DEFLATED)
+        return data.getvalue()
+
+    def _csv(self, chosen: Chosen) -> str:
+        lines, pixels = self.positions
+        errors = self._errors(chosen)
+        rows = ["line,pixel,east,north,error"]
+        rows += [
+            f"{line!r},{pixel!r},{e!r},{n!r},{float(np.hypot(e, n))!r}"
+            for line, pixel, (e, n) in zip(lines.tolist(), pixels.tolist(), errors.tolist())
+        ]
+        rows += ["", "sigma_degrees,rms,ce90,closed_rms,closed_ce90"]
+        expected = self._expected_accuracy(chosen)
+        rows += [",".join(repr(float(v)) for v in row.values()) for row in expected]
+        return "\n".join(rows) + "\n"
+
+    def _picture(self, chosen: Chosen) -> bytes:
+        size = self.image.lines, self.image.pixels
+        lines, pixels = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(self.cells, size))
+        length = np.hypot(*self._errors(chosen).T)
+        told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
+        try:
+            return png(
+                (7.5, 6),
+                None,
+                lambda ax: image_map(
+                    lines, pixels, self._rms_of_cells(length), "Error on the ground", "m", told, ax
+                ),
+            )
+        except ImportError as error:
+            raise InputError(str(error)) from None
+
+
+def _surface_at(height: float, earth: Ellipsoid | None) -> GroundSurface:
+    if earth is None:
+        return Plane(level=height)
+    if height == 0 or earth.a != earth.b:
+        return Ground(earth)
+    return Height(level=height, earth=earth)
+
+
+def _in_pieces(chosen: Chosen) -> Chosen:
+    """An image and its truth with trajectories in pieces, whose interpolation is data: another
+    method needs no other program."""
+    image, truth = (
+        eqx.tree_at(lambda i: i.trajectory, image, _pieces(image.trajectory))
+        for image in (chosen.image, chosen.truth)
+    )
+    return chosen._replace(image=image, truth=truth)
+
+
+def _table_with(table: TimeTable, method: str) -> TimeTable:
+    """Positions with another interpolation."""
+    if method == table.method:
+        return table
+    return position_table(
+        np.asarray(table.times),
+        np.asarray(table.values),
+        None if table.rates is None else np.asarray(table.rates),
+        method=method,
+        order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None,
+        extrapolate=table.extrapolate,
+    )
+
+
+def _attitude_with(attitude: AttitudeTable, method: str) -> AttitudeTable:
+    """Attitudes with another interpolation."""
+    table = attitude.table
+    if method == ("slerp" if attitude.slerp else table.method):
+        return attitude
+    return attitude_table(
+        np.asarray(table.times),
+        np.asarray(table.values),
+        method=method,
+        order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None,
+        extrapolate=table.extrapolate,
+        reference=attitude.reference,
+    )
+
+
+def _outline(image: PushbroomImage, places: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Lines and pixels around the image, closed, at so many places of each side."""
+    s, zero, one = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
+    down = np.concatenate([zero, s, one, s[::-1]])
+    across = np.concatenate([s, one, s[::-1], zero])
+    return down * (image.lines - 1), across * (image.pixels - 1)
+
+
+def _with_value(control: Control, value: Any) -> Control:
+    if isinstance(control, Number) and control.low is not None and control.high is not None:
+        low, high = min(control.low, value), max(control.high, value)
+        return control._replace(value=value, low=low, high=high)
+    return control._replace(value=value)
+
+
+def _control(controls: list[Control], key: str) -> Control:
+    return next(one for one in controls if one.key == key)
+
+
+def _largest(sigma: Sigma) -> float:
+    """A σ of three axes as one number, the largest."""
+    return float(np.max(sigma))
+
+
+def _degrees(sigma: Sigma) -> float:
+    return shorten_number(np.degrees(_largest(sigma)))
+
+
+_locate = jax.jit(locate_points)
+_east_north = jax.jit(east_north)
+_pieces = jax.jit(trajectory_in_pieces)
+_positions = jax.jit(
+    lambda image, lines: jax.vmap(lambda line: pose_at(image, image.times.time(line)).P)(lines)
+)
+
+
+@jax.jit
+def _below(earth: Ellipsoid, P: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    longitude, latitude, _ = geodetic(earth, tuple(P))
+    return jnp.stack(earth_fixed(earth, (longitude, latitude, 0 * longitude)))

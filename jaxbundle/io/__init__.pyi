@@ -1,0 +1,87 @@
+# Written by `make stubs` from the names in __init__.py.
+# ruff: noqa: I001
+from jaxbundle.io import boards as boards
+from jaxbundle.io import cameras as cameras
+from jaxbundle.io import networks as networks
+from jaxbundle.io import rasters as rasters
+from jaxbundle.io import results as results
+from jaxbundle.io import scanner as scanner
+from jaxbundle.io import text as text
+from jaxbundle.io import writing as writing
+from jaxbundle.io.boards.corners import read_corners as read_corners
+from jaxbundle.io.boards.corners import write_corners as write_corners
+from jaxbundle.io.boards.targets import read_target as read_target
+from jaxbundle.io.boards.targets import write_target as write_target
+from jaxbundle.io.cameras.camera_files import read_cameras as read_cameras
+from jaxbundle.io.cameras.camera_files import write_cameras as write_cameras
+from jaxbundle.io.cameras.opencv_file import read_opencv as read_opencv
+from jaxbundle.io.cameras.opencv_file import write_opencv as write_opencv
+from jaxbundle.io.cameras.opencv_file import write_ros as write_ros
+from jaxbundle.io.exchange import Converted as Converted
+from jaxbundle.io.exchange import convert as convert
+from jaxbundle.io.formats import FORMATS as FORMATS
+from jaxbundle.io.formats import Format as Format
+from jaxbundle.io.formats import OutputFormat as OutputFormat
+from jaxbundle.io.formats import TARGETS as TARGETS
+from jaxbundle.io.formats import read_network as read_network
+from jaxbundle.io.networks.bal import write_bal as write_bal
+from jaxbundle.io.networks.bundler import write_bundler as write_bundler
+from jaxbundle.io.networks.colmap import write_colmap as write_colmap
+from jaxbundle.io.networks.colmap import write_colmap_cameras as write_colmap_cameras
+from jaxbundle.io.networks.jaicov import write_jaicov as write_jaicov
+from jaxbundle.io.networks.kalibr import write_kalibr as write_kalibr
+from jaxbundle.io.networks.micmac import write_micmac as write_micmac
+from jaxbundle.io.networks.micmac_camera import write_autocal as write_autocal
+from jaxbundle.io.networks.mrcal import write_cameramodel as write_cameramodel
+from jaxbundle.io.networks.mrcal import write_mrcal as write_mrcal
+from jaxbundle.io.networks.openmvg import write_openmvg as write_openmvg
+from jaxbundle.io.networks.opensfm import write_opensfm as write_opensfm
+from jaxbundle.io.networks.photo_list import read_photo_list as read_photo_list
+from jaxbundle.io.networks.project import read_project as read_project
+from jaxbundle.io.networks.project import write_project as write_project
+from jaxbundle.io.networks.transforms import write_transforms as write_transforms
+from jaxbundle.io.results.coordinates import write_coordinates as write_coordinates
+from jaxbundle.io.results.dxf import write_dxf as write_dxf
+from jaxbundle.io.results.ply import write_ply as write_ply
+from jaxbundle.io.results.result_project import adjusted_network as adjusted_network
+from jaxbundle.io.results.result_project import readjustable_network as readjustable_network
+
+__all__ = [
+    "Converted",
+    "FORMATS",
+    "Format",
+    "OutputFormat",
+    "TARGETS",
+    "adjusted_network",
+    "convert",
+    "read_cameras",
+    "read_corners",
+    "read_network",
+    "read_opencv",
+    "read_photo_list",
+    "read_project",
+    "read_target",
+    "readjustable_network",
+    "write_autocal",
+    "write_bal",
+    "write_bundler",
+    "write_cameramodel",
+    "write_cameras",
+    "write_colmap",
+    "write_colmap_cameras",
+    "write_coordinates",
+    "write_corners",
+    "write_dxf",
+    "write_jaicov",
+    "write_kalibr",
+    "write_micmac",
+    "write_mrcal",
+    "write_opencv",
+    "write_openmvg",
+    "write_opensfm",
+    "write_ply",
+    "write_project",
+    "write_ros",
+    "write_target",
+    "write_transforms",
+]

@@ -1,0 +1,186 @@
+"""Simulation: a true trajectory, its records by instruments, and the image.
+
+The true angles are sums of signals (`signals`) on a circular orbit about the rotating Earth, or on
+a straight line above a plane. Instruments sample position and attitude at their rates, with errors
+(`noise`). The image processing uses only these samples: its trajectory is interpolated from them.
+Without errors only the interpolation error remains.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.choices import Resampling
+from jaxbundle.errors import InputError
+from jaxbundle.pushbroom.ancillary import attitude_table, position_table
+from jaxbundle.pushbroom.earth_frames import circular_orbit
+from jaxbundle.pushbroom.image import PushbroomImage, make_image
+from jaxbundle.pushbroom.image_to_ground import locate_lines
+from jaxbundle.pushbroom.interpolation import TimeTable
+from jaxbundle.pushbroom.noise import Errors, Noise, add_errors, draw, sigmas
+from jaxbundle.pushbroom.orbit import state_orbit
+from jaxbundle.pushbroom.resample import resample
+from jaxbundle.pushbroom.scanner import LineTimes, Optics
+from jaxbundle.pushbroom.signals import signal
+from jaxbundle.pushbroom.surfaces import GroundSurface
+from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory
+from jaxbundle.system.programs import compile_once
+from jaxbundle.types import AnyArray
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """A simulated flight; angles in radians, lengths in metres, times in seconds.
+
+    - `lines`, `pixels`, `period`, `optics`, `mounting`: the scanner.
+    - `track`: `{"height", "inclination", "node", "argument"}` of a circular orbit, or
+      `{"state", "at", "j2"}` of one Earth-fixed state vector (`orbit`), or
+      `{"start", "velocity"}` of a straight line in a local frame.
+    - `angles`: signals of pitch, roll, yaw, in the orbital frame or the local one.
+    - `position_rate`, `attitude_rate`: of the instruments, in Hz; `noise`: their errors.
+    - `position_interpolation`, `attitude_interpolation`: of the samples.
+    - `seed`: of all random numbers.
+    """
+
+    lines: int
+    pixels: int
+    period: float
+    optics: Optics
+    track: Mapping[str, Any]
+    angles: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position_rate: float = 2.0
+    attitude_rate: float = 4.0
+    position_interpolation: str = "lagrange"
+    attitude_interpolation: str = "spline"
+    noise: Noise = Noise()  # noqa: RUF009
+    seed: int = 0
+
+
+def true_image(flight: Flight) -> PushbroomImage:
+    """The image with the true trajectory."""
+    # so dense that its own interpolation is not seen beside that of the instrument's rows
+    rate = max(20.0, 5 * flight.attitude_rate)
+    return _image(flight, _position(flight, 2.0, "lagrange"), _attitude(flight, rate, "spline"))
+
+
+def measured_image(flight: Flight) -> PushbroomImage:
+    """The image with the trajectory recorded by its instruments: sampled, with noise."""
+    image = _image(
+        flight,
+        _position(flight, flight.position_rate, flight.position_interpolation),
+        _attitude(flight, flight.attitude_rate, flight.attitude_interpolation),
+    )
+    if not any(np.any(sigma) for sigma in flight.noise):
+        return image
+    return _measure(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
+
+
+def with_errors_in_rows(image: PushbroomImage, errors: Errors) -> PushbroomImage:
+    """Like `add_errors`, with bias and drift in the rows of the tables, as written by
+    instruments."""
+    # The rows of `add_errors` can hold all of it: bias and drift are linear in time. The difference
+    # is what the interpolation makes of them, which acts on written rows.
+    t0 = image.middle_time
+
+    def rows(
+        table: TimeTable,
+        bias: Float[AnyArray, "3"],
+        drift: Float[AnyArray, "3"],
+        white: Float[AnyArray, "rows 3"],
+    ) -> Float[AnyArray, "rows 3"]:
+        return white + bias + (table.times[:, None] - t0) * drift
+
+    zero = jax.tree.map(jnp.zeros_like, errors)
+    attitude, position = image.trajectory.attitude.table, image.trajectory.position
+    return add_errors(
+        image,
+        zero._replace(
+            attitude_white=rows(
+                attitude, errors.attitude_bias, errors.attitude_drift, errors.attitude_white
+            ),
+            position_white=rows(
+                position, errors.position_bias, errors.position_drift, errors.position_white
+            ),
+        ),
+    )
+
+
+_measure = compile_once(lambda image, sigma, key: with_errors_in_rows(image, draw(sigma, key)), ())
+
+
+def take_image(
+    image: PushbroomImage,
+    surface: GroundSurface,
+    scene: Float[AnyArray, "bands rows columns"],
+    to_scene: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    lines: Float[np.ndarray, " lines"],
+    resampling: Resampling = "bilinear",
+) -> Float[np.ndarray, "bands lines pixels"]:
+    """Lines of the image of a scene; NaN outside the scene.
+
+    **Arguments:** `to_scene(X)` gives row and column in the scene of points X [3, lines, pixels].
+    """
+    X = np.asarray(_ground(image, surface, lines, np.arange(image.pixels, dtype=float)))
+    row, column = to_scene(X)
+    return np.asarray(_resample(scene, row, column, resampling))
+
+
+_ground = compile_once(locate_lines, ())
+_resample = compile_once(resample, 3)
+
+
+def _image(flight: Flight, position: TimeTable, attitude: AttitudeTable) -> PushbroomImage:
+    times = LineTimes(jnp.zeros(()), jnp.asarray(float(flight.period)))
+    return make_image(
+        Trajectory(position, attitude),
+        times,
+        flight.optics,
+        flight.lines,
+        flight.pixels,
+        flight.mounting,
+    )
+
+
+def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
+    """Times of rows a whole number of steps from the first line, six before it and after the last.
+
+    Lagrange's polynomial of degree 7 takes four on either side; two more keep the edges of the
+    image away from the ends of a spline.
+    """
+    last, margin = flight.period * (flight.lines - 1), 6
+    return np.arange(-margin, np.ceil(last * rate) + margin + 1) / rate
+
+
+def _position(flight: Flight, rate: float, method: str) -> TimeTable:
+    t, track = _samples(flight, rate), dict(flight.track)
+    if "start" in track:
+        # a straight line is interpolated exactly
+        start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
+        return position_table(
+            t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)), method="linear"
+        )
+    if "state" in track:
+        state = np.asarray(track.pop("state"), float)
+        return position_table(t, *state_orbit(t, state[:3], state[3:], **track), method=method)
+    if "height" not in track:
+        raise InputError("track: give height, inclination, … of an orbit, or start and velocity")
+    P, V = circular_orbit(t, **track)
+    return position_table(t, P, V, method=method)
+
+
+def _attitude(flight: Flight, rate: float, method: str) -> AttitudeTable:
+    """The table of angles, sums of signals, each with random numbers of its own."""
+    t, angles = _samples(flight, rate), []
+    for axis, name in enumerate(("pitch", "roll", "yaw")):
+        parts = flight.angles.get(name, 0.0)
+        parts = parts if isinstance(parts, list | tuple) else [parts]
+        rng = [np.random.default_rng([flight.seed, axis, k]) for k in range(len(parts))]
+        angles.append(sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng)))
+    reference = "earth" if "start" in flight.track else "orbit"
+    return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)

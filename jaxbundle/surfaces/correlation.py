@@ -1,0 +1,245 @@
+"""Normalised cross-correlation along segments, in many images at once.
+
+Both windows are sampled on grids with the epipolar line as first axis. Then all windows along a
+segment are parts of one strip, and column k + x of row y is sampled once:
+
+    ρ(k) = Σ t(x, y)·s(k + x, y)/√(Σt²·Σ(s − s̄ₖ)²),    Σt = 0
+
+Positions are one window pixel apart; between them ρ is a parabola. Subpixel positions are left to
+least squares matching.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Shaped
+
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.surfaces.segments import Segments, Windows, positions
+from jaxbundle.surfaces.views import Grey, OrientedImage, Places
+from jaxbundle.system.configuration import available_cores
+
+
+@dataclasses.dataclass(frozen=True)
+class Pyramid:
+    """An image, and its means over 2 × 2, 4 × 4, … pixels, as float32."""
+
+    levels: tuple[Shaped[np.ndarray, "rows columns"], ...]
+
+    def sample(
+        self, level: int, uv: Float[np.ndarray, "rows columns 2"]
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Grey values at positions in pixels of the full image; NaN outside."""
+        cv2 = need_opencv()
+        place = (uv + 0.5) / 2**level - 0.5
+        grey = self.levels[level]
+        # only a part of large images: OpenCV's remap has coordinates of 15 bits
+        low, high = _find_extent(place, grey.shape)
+        part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+        place = (place - low).astype(np.float32)
+        return cv2.remap(
+            part,
+            place[..., 0],
+            place[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )
+
+
+def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyramid:
+    """The image and the coarser ones."""
+    found = [np.asarray(grey)]
+    for _ in range(levels):
+        found.append(_halve(found[-1]))
+    return Pyramid(tuple(found))
+
+
+def _halve(a: Grey) -> Float32[np.ndarray, "half_rows half_columns"]:
+    """Means over 2 × 2 pixels, by strips."""
+    rows, columns = (max(n // 2, 1) for n in a.shape)
+    out = np.empty((rows, columns), np.float32)
+    high, wide = (2 if n > 1 else 1 for n in a.shape)
+    # by strips: a whole image of 16 bits would be held as floating point, too
+    strip = 512
+    for first in range(0, rows, strip):
+        last = min(first + strip, rows)
+        part = a[high * first : high * last, : wide * columns].astype(np.float32)
+        part = part.reshape(last - first, high, columns, wide)
+        out[first:last] = part.mean((1, 3))
+    return out
+
+
+def _find_extent(
+    place: Float[np.ndarray, "*n 2"], shape: tuple[int, ...]
+) -> tuple[Int[np.ndarray, "2"], Int[np.ndarray, "2"]]:
+    """The corner (u, v) of the used part of an image, and the one after its last."""
+    finite = np.where(np.isfinite(place), place, 0.0).reshape(-1, 2)
+    size = np.array(shape[::-1])
+    low = np.clip(np.floor(finite.min(0)).astype(int) - 1, 0, size - 1)
+    high = np.clip(np.ceil(finite.max(0)).astype(int) + 2, low + 1, size)
+    return low, high
+
+
+def correlate(
+    pair: tuple[OrientedImage, OrientedImage],
+    pyramids: tuple[Pyramid, Pyramid],
+    uv: Float[np.ndarray, "n 2"],
+    segment: Segments,
+    shape: Windows,
+    *,
+    level: int,
+    half: int,
+    steps: int,
+) -> tuple[Float[np.ndarray, "n steps"], Float[np.ndarray, "n steps"]]:
+    """ρ at positions along segments around their middle, and q of the positions.
+
+    **Arguments:** base and other image, and their pyramids; `uv`: points in the base; `level` of
+    the pyramids; windows of 2·`half` + 1 pixels of it, and `steps` positions with the spacing
+    of the window pixels. ρ is NaN outside the other image.
+    """
+    scale = 2.0**level
+    spacing = scale * np.linalg.norm(shape.other_axis, axis=1)
+    k = np.arange(steps) - (steps - 1) / 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # in the order of q, though the epipolar axis may be opposite
+        length = segment.length[:, None] / 2 + k * spacing[:, None]
+        q = segment.parameter(length)
+    place = positions(*pair, uv, q)
+    forward = np.sum((place[:, -1] - place[:, 0]) * shape.other_axis, axis=1) >= 0
+    sign = np.where(forward, 1.0, -1.0)[:, None]
+
+    # the strips of 256 points fit into a processor's cache
+    together = 256
+
+    def correlate_rows(first: int) -> Float[np.ndarray, "m steps"]:
+        rows = slice(first, first + together)
+        template = _sample_templates(
+            pyramids[0], uv[rows], sign[rows] * shape.axis[rows], np.sign(sign[rows]), half, level
+        )
+        strip = _sample_strips(
+            pyramids[1],
+            place[rows],
+            sign[rows] * scale * shape.other_axis[rows],
+            scale * shape.other_cross_axis[rows],
+            half,
+            level,
+        )
+        return slide(template, strip)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        parts = list(pool.map(correlate_rows, range(0, len(uv), together)))
+    rho = np.concatenate(parts) if parts else np.zeros((0, steps), np.float32)
+    return np.where(shape.usable[:, None], rho, np.nan), q
+
+
+def slide(
+    template: Float[np.ndarray, "n w w"], strip: Float[np.ndarray, "n w columns"]
+) -> Float[np.ndarray, "n steps"]:
+    """ρ of a window with all windows of a strip; −1 if one has no contrast."""
+    n, w, columns = strip.shape
+    steps = columns - w + 1
+    t = template - template.mean((1, 2), keepdims=True)
+    norm = np.sqrt(np.einsum("nyx,nyx->n", t, t))
+    outside = np.isnan(strip)
+    lost = _sliding_sum(np.asarray(outside.any(1), np.float64), w) > 0
+    # without the mean of the strip: the sums of squares below would lose digits
+    s = np.where(outside, 0, strip)
+    s -= s.sum((1, 2), keepdims=True) / np.maximum((~outside).sum((1, 2), keepdims=True), 1)
+    s[outside] = 0
+    # Pixel of the window by pixel, for all windows and positions at once: windows are not copied,
+    # and all arrays stay in the cache.
+    cross, product = np.zeros((n, steps), np.float32), np.empty((n, steps), np.float32)
+    for y in range(w):
+        for x in range(w):
+            np.multiply(s[:, y, x : x + steps], t[:, y, x, None], out=product)
+            cross += product
+    total, square = (_sliding_sum(np.asarray(a.sum(1, dtype=np.float64)), w) for a in (s, s * s))
+    spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
+    # a standard deviation of 0.001 grey values is the rounding of float32, no texture;
+    # half and double: no difference
+    flat = (norm[:, None] <= 1e-3 * w) | (spread <= 1e-3 * w)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = np.where(flat, -1.0, cross / (norm[:, None] * spread))
+    return np.where(lost | ~np.isfinite(norm)[:, None], np.nan, rho)
+
+
+def find_peaks(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The largest ρ of each row, its fractional index, and the largest of the others except
+    neighbours; NaN if there is none."""
+    filled = np.where(np.isfinite(rho), rho, -np.inf)
+    best = filled.argmax(1)
+    rows, last = np.arange(len(rho)), rho.shape[1] - 1
+    peak = filled[rows, best]
+    left, right = filled[rows, np.maximum(best - 1, 0)], filled[rows, np.minimum(best + 1, last)]
+    with np.errstate(invalid="ignore"):
+        bend = left - 2 * peak + right
+        inner = (best > 0) & (best < last) & np.isfinite(bend) & (bend < 0)
+        # the vertex of the parabola through the largest value and its neighbours
+        shift = np.where(inner, 0.5 * (left - right) / np.where(inner, bend, 1.0), 0.0)
+    # a peak of correlation is up to two positions wide on each side
+    away = np.abs(np.arange(rho.shape[1]) - best[:, None]) > 2
+    second = np.where(away, filled, -np.inf).max(1)
+    none = lambda a: np.where(np.isfinite(a), a, np.nan)
+    return none(peak), np.where(np.isfinite(peak), best + shift, np.nan), none(second)
+
+
+def combine(
+    curves: Sequence[Float[np.ndarray, "n k"]],
+) -> Float[np.ndarray, "n k"]:
+    """ρ of several images at common positions: the mean of the better half, rounded up, so
+    that an image with a hidden point does not spoil the others; NaN: in no image."""
+    if len(curves) == 1:
+        return curves[0]
+    stacked = np.sort(np.where(np.isfinite(curves), curves, -2.0), axis=0)[::-1]
+    there = stacked > -2
+    number = there.sum(0)
+    used = there & (np.arange(len(curves))[:, None, None] < (number + 2) // 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(used, stacked, 0).sum(0) / used.sum(0)
+
+
+def _sample_templates(
+    pyramid: Pyramid,
+    uv: Places,
+    along: Places,
+    sign: Float[np.ndarray, "n 1"],
+    half: int,
+    level: int,
+) -> Float32[np.ndarray, "n w w"]:
+    """Windows around positions in the base, axes e and e⊥; `sign` −1 if e is reversed."""
+    offset = 2.0**level * np.arange(-half, half + 1)
+    across = sign * np.stack([-along[:, 1], along[:, 0]], 1)
+    grid = (
+        uv[:, None, None]
+        + offset[None, None, :, None] * along[:, None, None]
+        + offset[None, :, None, None] * across[:, None, None]
+    )
+    n, w = len(uv), len(offset)
+    return pyramid.sample(level, grid.reshape(n * w, w, 2)).reshape(n, w, w)
+
+
+def _sample_strips(
+    pyramid: Pyramid,
+    place: Float[np.ndarray, "n steps 2"],
+    along: Places,
+    across: Places,
+    half: int,
+    level: int,
+) -> Float32[np.ndarray, "n w columns"]:
+    """All windows along segments: rows across, columns along, half a window more at both ends."""
+    n, steps = place.shape[:2]
+    beyond = np.arange(1, half + 1)
+    before = place[:, :1] - beyond[::-1, None] * along[:, None]
+    after = place[:, -1:] + beyond[:, None] * along[:, None]
+    middle = np.concatenate([before, place, after], axis=1)
+    grid = middle[:, None] + np.arange(-half, half + 1)[:, None, None] * across[:, None, None]
+    w = 2 * half + 1
+    return pyramid.sample(level, grid.reshape(n * w, -1, 2)).reshape(n, w, -1)
+
+
+def _sliding_sum(a: Float[np.ndarray, "n columns"], w: int) -> Float[np.ndarray, "n steps"]:
+    total = np.cumsum(np.pad(a, ((0, 0), (1, 0))), axis=1)
+    return total[:, w:] - total[:, :-w]

@@ -1,0 +1,236 @@
+"""A digital surface model of a cloud: heights on a grid with the σ of every cell.
+
+A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without those that differ
+from their median by more than three times its spread. Its σ is that of the mean, enlarged by the
+scatter of the points: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ from the
+points around and the distance to them; beside a wall from the lower surface, since hidden parts
+are low (Hirschmüller 2008).
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from jaxbundle.arguments import positive
+from jaxbundle.display import data_set, print_in_one_screen
+from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.writing import write_raster
+from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.scatter import NORMAL_SIGMA_BY_MAD
+
+if TYPE_CHECKING:
+    import xarray
+
+NO_DATA = -9999.0
+"""The value of cells without height in files: the one most programs for height models expect."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DsmSettings:
+    """How the cells of a model are averaged and filled."""
+
+    max_deviation: float = 3.0
+    """Heights farther from the median of their cell are left out; robust σ. The usual limit: 0.3 %
+    of normal errors are lost."""
+    min_spread: float = 0.3
+    """Least σ for `max_deviation`, in cell sizes: on a slope of 45° the heights of a cell have a
+    standard deviation of 1/√12 of its size, and are all good."""
+    slope: float = 0.3
+    """σ of a filled cell, in cell sizes for each cell of distance: the slope of the surface that is
+    not known in a gap, 17°. To be larger for steep terrain; no measurement stands behind it."""
+    wall: float = 1.0
+    """Scatter of the heights around a gap, in cell sizes, above which they are of two surfaces:
+    larger, walls less than twice as high are filled by means; smaller, steep slopes are filled from
+    below."""
+    max_cells: float = 2e9
+    """A larger grid is refused: the three grids of so many cells take 48 GB."""
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class Dsm:
+    """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
+    numbers of points; coordinate system, or None."""
+
+    height: Float[np.ndarray, "rows columns"]
+    sigma: Float[np.ndarray, "rows columns"]
+    count: Int[np.ndarray, "rows columns"]
+    x: float
+    y: float
+    size: float
+    system: str | None = None
+
+    def place(self, X: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column, whole numbers at the centres of cells, of points."""
+        return (self.y - X[:, 1]) / self.size - 0.5, (X[:, 0] - self.x) / self.size - 0.5
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Height, σ and number of points over x and y (centres of cells), as an `xarray.Dataset`
+        (extra `grids`)."""
+        rows, columns = self.height.shape
+        x = self.x + (np.arange(columns) + 0.5) * self.size
+        y = self.y - (np.arange(rows) + 0.5) * self.size
+        dims = ("y", "x")
+        return data_set(
+            {
+                "height": (dims, self.height, ""),
+                "sigma": (dims, self.sigma, ""),
+                "count": (dims, self.count, "1"),
+            },
+            {"y": (y, ""), "x": (x, "")},
+            crs=self.system,
+            cell_size=self.size,
+        )
+
+    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+        """x and y of all cells."""
+        rows, columns = self.height.shape
+        return np.meshgrid(
+            self.x + (np.arange(columns) + 0.5) * self.size,
+            self.y - (np.arange(rows) + 0.5) * self.size,
+        )
+
+
+def make_dsm(
+    cloud: Cloud, size: float, fill: int = 2, settings: DsmSettings = DsmSettings()
+) -> Dsm:
+    """The model with square cells of `size`, their edges at multiples of it; gaps of up to `fill`
+    cells from the next height are filled.
+
+    **Raises:** `InputError` for an empty cloud, or too many cells.
+    """
+    size = positive("size of the cells", size)
+    if not len(cloud):
+        raise InputError("a DSM needs points; the cloud is empty")
+    column, row = np.floor(cloud.X[:, 0] / size), np.floor(-cloud.X[:, 1] / size)
+    left, top = column.min(), row.min()
+    columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
+    if rows * columns > settings.max_cells:
+        raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a larger size")
+    cell = ((row - top) * columns + (column - left)).astype(np.int64)
+    Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
+    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, settings)
+    shape = rows, columns
+    found = Dsm(
+        height.reshape(shape),
+        sigma.reshape(shape),
+        count.reshape(shape),
+        float(left * size),
+        float(-top * size),
+        size,
+        cloud.system,
+    )
+    return _fill(found, fill, settings) if fill else found
+
+
+def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
+    """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`."""
+    from rasterio.transform import Affine
+
+    profile = {
+        "transform": Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y),
+        "nodata": NO_DATA,
+        "crs": dsm.system,
+        "compress": "deflate",
+    }
+    rows, columns = dsm.height.shape
+    given = ((path, dsm.height, "height"), (sigma_path, dsm.sigma, "sigma of height"))
+    for target, values, name in given:
+        if target is not None:
+            with write_raster(target, columns, rows, 1, "float32", **profile) as raster:
+                raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32)[None])
+                raster.describe([name])
+
+
+def _average_cells(
+    cell: Int[np.ndarray, " n"],
+    Z: Float[np.ndarray, " n"],
+    sigma: Float[np.ndarray, " n"],
+    size: float,
+    number: int,
+    settings: DsmSettings,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted means by cell, their σ and numbers of points."""
+    order = np.lexsort((Z, cell))
+    cell, Z, sigma = cell[order], Z[order], sigma[order]
+    cells, first, count = np.unique(cell, return_index=True, return_counts=True)
+    group = np.repeat(np.arange(len(cells)), count)
+    middle = _sorted_medians(Z, first, count)
+    away = np.abs(Z - middle[group])
+    again = np.lexsort((away, group))
+    spread = NORMAL_SIGMA_BY_MAD * _sorted_medians(away[again], first, count)
+    least = settings.min_spread * size
+    keep = away <= settings.max_deviation * np.maximum(spread, least)[group]
+    weight = np.where(np.isfinite(sigma) & (sigma > 0), 1 / sigma**2, np.nan)
+    known = np.isfinite(weight)
+    # a point without σ counts as one of the median σ
+    weight = np.where(known, weight, np.nanmedian(weight) if known.any() else 1.0) * keep
+    total = np.bincount(group, weight)
+    mean = np.bincount(group, weight * Z) / total
+    n = np.bincount(group, keep)
+    square = np.bincount(group, weight * (Z - mean[group]) ** 2)
+    ratio = np.maximum(1.0, square / np.maximum(n - 1, 1))
+    out = np.full((2, number), np.nan)
+    out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if known.any() else np.nan
+    numbers = np.zeros(number, int)
+    numbers[cells] = n
+    return out[0], out[1], numbers
+
+
+def _sorted_medians(
+    values: Float[np.ndarray, " n"],
+    first: Int[np.ndarray, " groups"],
+    count: Int[np.ndarray, " groups"],
+) -> Float[np.ndarray, " groups"]:
+    """Medians of sorted, consecutive groups."""
+    low, high = first + (count - 1) // 2, first + count // 2
+    return (values[low] + values[high]) / 2
+
+
+def _fill(dsm: Dsm, reach: int, settings: DsmSettings) -> Dsm:
+    """Gaps near heights filled by the mean of those around, weighted by distance."""
+    known = np.isfinite(dsm.height)
+    if known.all():
+        return dsm
+    distance = np.asarray(ndimage.distance_transform_edt(~known))
+    k = np.arange(-2 * reach, 2 * reach + 1)
+    # inverse squares of distances; a cell itself, at distance 0, has no height where this is used
+    kernel = 1 / np.maximum(np.hypot(k[:, None], k), 0.5) ** 2
+    weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
+    weight = weigh(1.0 * known)
+    gap = ~known & (distance <= reach) & (weight > 0)
+    # only cells with heights on opposite sides, not the outer edge
+    around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
+    gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    safe = np.where(weight > 0, weight, 1.0)
+    # heights above their mean: squares of large heights would lose the digits of their scatter
+    level = np.nanmean(dsm.height)
+    mean, square = weigh(dsm.height - level) / safe, weigh((dsm.height - level) ** 2) / safe
+    height = np.where(gap, level + mean, dsm.height)
+    at_wall = gap & (square - mean**2 > (settings.wall * dsm.size) ** 2)
+    height[at_wall] = _mean_lower_heights(dsm.height, kernel, at_wall, height[at_wall])
+    sigma = np.hypot(weigh(dsm.sigma) / safe, settings.slope * dsm.size * distance)
+    return dataclasses.replace(dsm, height=height, sigma=np.where(gap, sigma, dsm.sigma))
+
+
+def _mean_lower_heights(
+    height: Float[np.ndarray, "rows columns"],
+    kernel: Float[np.ndarray, "w w"],
+    at: Bool[np.ndarray, "rows columns"],
+    bound: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " k"]:
+    """The weighted means of the heights around some cells that are not above a bound each."""
+    reach = len(kernel) // 2
+    wide = np.pad(height, reach, constant_values=np.nan)
+    rows, columns = np.nonzero(at)
+    total, weight = np.zeros((2, len(rows)))
+    for (i, j), w in np.ndenumerate(kernel):
+        found = wide[rows + i, columns + j]
+        low = found <= bound
+        total += np.where(low, w * found, 0.0)
+        weight += w * low
+    return total / weight

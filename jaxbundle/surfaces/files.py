@@ -1,0 +1,134 @@
+"""Clouds as files: CSV with σ and the pixel of the base image; the report as a dictionary."""
+
+import csv
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.io.text.csv_tables import read_csv, write_text
+from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points
+from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.reconstruct import SurfaceResult
+
+COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
+REQUIRED_COLUMNS = COLUMNS[:3]
+
+
+def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
+    """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
+    names = np.array([*map(_quote, cloud.images), ""], dtype=object)
+    # 65 536 lines at once, about 8 MB of text, whatever the size of the cloud
+    together = 1 << 16
+    starts = range(0, len(cloud), together)
+    lines = (_format_rows(cloud, names, slice(k, k + together)) for k in starts)
+    write_text(Path(path), itertools.chain([",".join(COLUMNS) + "\n"], lines))
+
+
+def _format_rows(cloud: Cloud, names: np.ndarray, part: slice) -> str:
+    """Some points as lines of text: much faster than the csv library."""
+    # repr is the shortest text that reads back as the same number; σ need no more than 8 digits
+    exact = lambda a: ("" if x != x else repr(x) for x in a.tolist())
+    short = lambda a: ("" if x != x else f"{x:.8g}" for x in a.tolist())
+    C = cloud.covariance[part]
+    columns = [
+        *map(exact, cloud.X[part].T),
+        *(short(np.sqrt(C[:, k, k])) for k in range(3)),
+        map(str, cloud.rays[part].tolist()),
+        names[cloud.image[part]].tolist(),
+        *map(exact, cloud.uv[part].T),
+    ]
+    return "".join(",".join(row) + "\n" for row in zip(*columns))
+
+
+def _quote(name: str) -> str:
+    """A name in the form of csv."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="").writerow([name])
+    return text.getvalue()
+
+
+def read_cloud_csv(path: str | Path) -> Cloud:
+    """A cloud from a table X,Y,Z[,sX,sY,sZ,rays,image,u,v]; other columns are ignored.
+
+    **Raises:** `InputError` naming file, line and column.
+    """
+    table = read_csv(Path(path))
+    X = np.stack([table.numbers(name, required=True) for name in REQUIRED_COLUMNS], axis=1)
+    n = len(X)
+    column = lambda name, default: (
+        table.numbers(name) if name in table.values else np.full(n, default)
+    )
+    sigma = np.stack([column(name, np.nan) for name in COLUMNS[3:6]], axis=1)
+    covariance = np.zeros((n, 3, 3))
+    covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
+    ids = list(table.values["image"]) if "image" in table.values else [""] * n
+    names = tuple(dict.fromkeys(ids)) or ("",)
+    index = {name: k for k, name in enumerate(names)}
+    image = np.array([index[i] for i in ids], int).reshape(n)
+    uv = np.stack([column("u", np.nan), column("v", np.nan)], axis=1)
+    rays = np.nan_to_num(column("rays", 0)).astype(int)
+    return Cloud(X, covariance, rays, image, uv, names)
+
+
+def report_of(
+    surface: SurfaceResult,
+    warnings: Sequence[str] = (),
+    check: Float[np.ndarray, "n 3"] | None = None,
+) -> dict[str, Any]:
+    """Counts and accuracy, for JSON; RMS at check points, if there are any."""
+    cloud = surface.cloud
+    number = np.bincount(cloud.rays) if len(cloud) else np.zeros(0, int)
+    return {
+        "points": len(cloud),
+        "rays": {str(k): int(n) for k, n in enumerate(number) if n},
+        "images": [dict(row) for row in surface.bases],
+        "system": cloud.system,
+        "sigma_includes": ["matching", *(["orientation"] if surface.orientation else [])],
+        "accuracy": accuracy_of(cloud),
+        **(
+            {}
+            if check is None or not len(check)
+            else {"check_points": at_check_points(cloud, check)}
+        ),
+        "warnings": [*warnings, *surface.messages],
+    }
+
+
+def text_of(report: Mapping[str, Any]) -> str:
+    """The report in lines."""
+    found = report["accuracy"]
+    lines = [
+        f"{report['points']} points, by rays: "
+        + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())
+    ]
+    for row in report["images"]:
+        factor = row["variance_factor"]
+        said = "" if factor is None else f", variance factor {factor:.3g}"
+        lines.append(
+            f"{row['image']} with {', '.join(row['with'])}: {row['matched']} of "
+            f"{row['points']} points{said}"
+        )
+        lines += [f"    {n:8} {reason}" for reason, n in row["rejected"].items()]
+    for axis in "XYZ":
+        s = found[f"s{axis}"]
+        if s:
+            lines.append(
+                f"σ{axis}  mean {s['mean']:.4g}  smallest {s['smallest']:.4g}  "
+                f"largest {s['largest']:.4g}"
+            )
+    for c in found["classes"]:
+        upper = "∞" if c["to"] is None else f"{c['to']:g}"
+        lines.append(f"σ from {c['from']:g} to {upper}: {c['points']} points")
+    lines.append(f"σ contains: {', '.join(report['sigma_includes'])}")
+    check = report.get("check_points", {})
+    if check.get("points"):
+        lines.append(
+            f"{check['points']} check points: RMS of heights {check['rms_Z']:.4g}, "
+            f"mean {check['mean_Z']:.4g}, largest {check['largest_Z']:.4g}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,374 @@
+"""Matching and intersection of points of a base image: from pixels to points with covariance.
+
+    guide → position in all images at once → least squares matching in each → bending corrected
+    → checks → intersection
+
+The residuals across the epipolar lines are errors of the same matching that gives the heights: the
+median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
+multiplied. It includes error sources unknown to the matching, such as small errors of orientation.
+Below 1 it means that the differences of the windows are finer than those that shift them. But the
+shape of the surface within the windows shifts all matches of a point along its line of sight, which
+no residual shows. The scatter of the points (`scatter.py`) does: what it has beyond their
+covariances is added, the same for all points in pixels. Where it is not known, the factor is at
+least 1.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import stats
+
+from jaxbundle.display import print_in_one_screen
+from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surfaces.bending import BendingSettings, correct_bending, sharpen
+from jaxbundle.surfaces.guide import Guide, GuideSettings, ImagePyramids, search
+from jaxbundle.surfaces.intersection import IntersectedPoints, intersect
+from jaxbundle.surfaces.orientation import orientation_covariance
+from jaxbundle.surfaces.scatter import missing_sigma
+from jaxbundle.surfaces.segments import positions, windows
+from jaxbundle.surfaces.subpixel_matching import (
+    SubpixelMatches,
+    WindowSettings,
+    has_texture,
+    refine,
+)
+from jaxbundle.surfaces.views import OrientedImage, Places, is_inside, line_of_sight
+
+
+@dataclasses.dataclass(frozen=True)
+class MatchingSettings:
+    """How points are matched in the other images, and which are kept; pixels are those of the full
+    images.
+
+    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --sparse` with
+    every fifth pixel: 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
+    """
+
+    edge_margin: int = 8
+    """Minimum distance of a point from the edge of its image, pixels: at least the `half_window` of
+    the guide and `half_fine_window`."""
+    half_fine_window: int = 6
+    """Half the side of the windows of least squares matching, whose plane a bent surface leaves in
+    large ones, pixels."""
+    min_rays: int = 2
+    """Minimum rays of a point."""
+    min_angle: float = np.radians(1.0)
+    """Minimum of the widest angle between the rays of a point, radians: there σ along the line of
+    sight is 80 times that across it (√2/tan 1°)."""
+    search_margin: float = 2.0
+    """Pixels searched beyond the range of the guide. Half: a third of the points; double: 9 more,
+    and more time."""
+    min_correlation: float = 0.6
+    """Minimum ρ, of the search and of least squares matching. 0.3: no difference, since other tests
+    reject the same points; 0.8: 12 points fewer."""
+    min_sigma: float = 0.012
+    """σ added to a match by interpolation and sampling, pixels. Half: 99.5 % of the errors within 3
+    σ (99.6); double: RMS 1.01, since the scatter adds less."""
+    max_sigma: float = 0.5
+    """σ of a match above which the texture does not determine it, pixels. Half: 4 points fewer, the
+    only one wrong by a pixel among them; double: 1 more."""
+    max_second_ratio: float = 0.95
+    """Maximum ratio of ρ of the second best separate position to that of the best. 0.9: 10 points
+    fewer; 0.98: 7 more."""
+    max_guide_distance: float = 1.5
+    """Maximum distance of a point from the guide of the other image, pixels: of hidden points it is
+    larger. Half and double: no difference for two photographs."""
+    max_shift: float = 2.5
+    """Maximum distance of least squares matching from the position of the correlation, pixels. Half
+    and double: no difference."""
+    block_side: int = 16
+    """Points per side of a block for the scatter. Half: blocks have fewer than 100 values, the
+    scatter is not known, and σ is too large (RMS 0.77); double: no difference."""
+    scatter_quantile: float = 0.45
+    """Quantile of the blocks that is used, in the smoother direction. Half: no difference, since
+    the scatter adds up to a limit; 0.9: RMS 0.87."""
+    significance: float = 1e-3
+    """Level of the test of a point's residuals. Half: 3 points more; double: 1 fewer."""
+    windows: WindowSettings = WindowSettings()
+    """Least squares matching of single windows."""
+    bending: BendingSettings = BendingSettings()
+    """The correction for curved surfaces."""
+
+
+@print_in_one_screen
+@dataclasses.dataclass(frozen=True)
+class SurfaceMatches:
+    """Points from a base image: their pixels, points, and rejected ones by reason.
+
+    `factor`: the variance factor of the covariances.
+    """
+
+    uv: Float[np.ndarray, "n 2"]
+    X: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+    rays: Int[np.ndarray, " n"]
+    angle: Float[np.ndarray, " n"]
+    rho: Float[np.ndarray, " n"]
+    places: Float[np.ndarray, "n others 2"]
+    factor: float
+    rejected: dict[str, int]
+
+
+def match_points(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    pyramids: ImagePyramids,
+    guide: Guide,
+    uv: Places,
+    guides: Sequence[Guide | None],
+    guide_settings: GuideSettings,
+    settings: MatchingSettings = MatchingSettings(),
+) -> SurfaceMatches:
+    """Match whole pixels of the base in the others, from its guide; `guides` of the others, if
+    any, identify hidden points."""
+    lost: Counter[str] = Counter()
+    inner = is_inside(base, uv, settings.edge_margin)
+    lost["at the edge"] += int((~inner).sum())
+    uv = uv[inner]
+    _, reach, normal, _ = guide.look_up(uv, settings.search_margin)
+    q, rho, second = search(base, others, pyramids, uv, reach, normal, 0, guide_settings)
+    with np.errstate(invalid="ignore"):
+        found = np.isfinite(q) & (rho >= settings.min_correlation)
+        double = found & (second > settings.max_second_ratio * rho)
+    lost["low correlation"] += int((~found).sum())
+    lost["not unique"] += int(double.sum())
+    rows = np.flatnonzero(found & ~double)
+    uv, q, normal = uv[rows], q[rows], normal[rows]
+    X = base.points(uv, q)
+    found = _match_windows(base, others, guide, (uv, q, normal), guides, settings)
+    enough = found.is_used.sum(1) + 1 >= settings.min_rays
+    lost["not confirmed by least squares matching"] += int((~enough).sum())
+    uv, X = uv[enough], X[enough]
+    places, used, covariance, in_base, rhos = (a[enough] for a in found)
+    mean = in_base.sum(1) / np.maximum(used.sum(1), 1)[:, None, None]
+    seen = np.where(used[..., None, None], covariance, 1)
+    table = _Rays(
+        (base, *others),
+        np.concatenate([uv[:, None], places], 1),
+        # half of a match's variance is of the window in the base, half of that in the other image
+        np.concatenate([mean[:, None], seen], 1) / 2,
+        np.concatenate([np.ones((len(uv), 1), bool), used], 1),
+    )
+    return _accept(table, X, rhos, settings, lost)
+
+
+class WindowMatches(NamedTuple):
+    """Positions of points in the other images, which are good, their covariances, these as
+    displacements in the base image, ρ."""
+
+    places: Float[np.ndarray, "n others 2"]
+    is_used: Bool[np.ndarray, "n others"]
+    covariance: Float[np.ndarray, "n others 2 2"]
+    in_base: Float[np.ndarray, "n others 2 2"]
+    rho: Float[np.ndarray, "n others"]
+
+
+def _match_windows(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    guide: Guide,
+    start: tuple[Places, Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]],
+    guides: Sequence[Guide | None],
+    settings: MatchingSettings,
+) -> WindowMatches:
+    """Least squares matching in each of the other images, from pixels, their q and normals."""
+    uv, q, normal = start
+    X, half = base.points(uv, q), settings.half_fine_window
+    nodes = sharpen(base, others, guide, half, settings.bending, settings.windows)
+    n, m = len(uv), len(others)
+    out = WindowMatches(
+        np.full((n, m, 2), np.nan),
+        np.zeros((n, m), bool),
+        np.zeros((n, m, 2, 2)),
+        np.zeros((n, m, 2, 2)),
+        np.full((n, m), np.nan),
+    )
+    for k, other in enumerate(others):
+        window = windows(base, other, X, normal)
+        begin = positions(base, other, uv, q[:, None])[:, 0]
+        match = refine(base, other, uv, begin, window.A, half, settings.windows)
+        pair = base, other
+        place, uncertain = correct_bending(pair, nodes, uv, q, match, half, settings.bending)
+        uncertain = uncertain + settings.min_sigma**2 * np.eye(2)
+        good = window.usable & _is_confirmed(match, begin, settings)
+        good &= _agrees(other, guides[k], X, settings.max_guide_distance)
+        good &= has_texture(base.grey, uv, match.sigma0, half, settings.windows.min_texture)
+        back = np.linalg.inv(np.where(good[:, None, None], match.A, np.eye(2)))
+        safe = np.where(good[:, None, None], uncertain, 0)
+        shifted = back @ safe @ np.swapaxes(back, 1, 2)
+        out.places[:, k], out.is_used[:, k], out.rho[:, k] = place, good, match.rho
+        out.covariance[:, k] = uncertain
+        out.in_base[:, k] = np.where(good[:, None, None], shifted, 0)
+    return out
+
+
+def _is_confirmed(
+    match: SubpixelMatches, start: Places, settings: MatchingSettings
+) -> Bool[np.ndarray, " n"]:
+    """Whether least squares matching has converged near its start, to a similar window."""
+    good = match.status == int(MatchingStatus.CONVERGED)
+    good &= match.rho >= settings.min_correlation
+    good &= np.linalg.norm(match.uv - start, axis=1) <= settings.max_shift
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.trace(match.covariance, axis1=1, axis2=2))
+        return good & (sigma < settings.max_sigma)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rays:
+    """Positions of points in the base image and the others, with their covariances."""
+
+    views: tuple[OrientedImage, ...]
+    uv: Float[np.ndarray, "n views 2"]
+    covariance: Float[np.ndarray, "n views 2 2"]
+    is_used: Bool[np.ndarray, "n views"]
+
+    def intersect(self, start: Float[np.ndarray, "n 3"]) -> IntersectedPoints:
+        return intersect(self.views, self.uv, self.covariance, self.is_used, start)
+
+
+def _accept(
+    table: _Rays,
+    X: Float[np.ndarray, "n 3"],
+    rhos: Float[np.ndarray, "n others"],
+    settings: MatchingSettings,
+    lost: Counter[str],
+) -> SurfaceMatches:
+    """Intersect; inconsistent rays are left out, inconsistent points are rejected."""
+    found = table.intersect(X)
+    factor = variance_factor(found.vtpv, found.redundancy)
+    shape = _shape_variance(table, found, factor, settings) if factor < 1 else None
+    if shape is None:
+        factor, shape = max(factor, 1.0), np.zeros_like(found.covariance)
+    bad = _find_misfits(found, factor, settings.significance)
+    # with two rays it cannot be told which is wrong
+    several = bad & (found.rays > max(settings.min_rays, 2))
+    if several.any():
+        table, found = _drop_worst_rays(table, found, several)
+        bad = _find_misfits(found, factor, settings.significance)
+    narrow = ~(found.angle >= settings.min_angle)
+    undetermined = ~np.isfinite(found.covariance).all((1, 2)) | ~np.isfinite(found.X).all(1)
+    lost["undetermined"] += int(undetermined.sum())
+    lost["narrow angle"] += int((narrow & ~undetermined).sum())
+    lost["rays do not meet"] += int((bad & ~narrow & ~undetermined).sum())
+    good = ~(bad | narrow | undetermined)
+    matched = table.is_used[good][:, 1:]
+    with np.errstate(invalid="ignore"):
+        rho = (
+            np.nanmin(np.where(matched, rhos[good], np.nan), axis=1) if good.any() else np.zeros(0)
+        )
+    covariance = factor * found.covariance[good] + shape[good]
+    covariance += orientation_covariance(table.views, found.X[good], table.is_used[good])
+    return SurfaceMatches(
+        table.uv[good, 0],
+        found.X[good],
+        covariance,
+        found.rays[good],
+        found.angle[good],
+        rho,
+        np.where(matched[..., None], table.uv[good][:, 1:], np.nan),
+        factor,
+        {reason: number for reason, number in lost.items() if number},
+    )
+
+
+def variance_factor(
+    vtpv: Float[np.ndarray, " n"], redundancy: Int[np.ndarray, " n"], min_points: int = 30
+) -> float:
+    """The median of vᵀPv over that of its distribution, 1 for fewer than `min_points`: of 30 values
+    of χ²₁ the median has a standard deviation of 40 %, and a factor from fewer says nothing."""
+    good = np.isfinite(vtpv) & (redundancy > 0)
+    if good.sum() < min_points:
+        return 1.0
+    return float(np.median(vtpv[good] / stats.chi2.median(redundancy[good])))
+
+
+def _shape_variance(
+    table: _Rays, found: IntersectedPoints, factor: float, settings: MatchingSettings
+) -> Float[np.ndarray, "n 3 3"] | None:
+    """The variance along the lines of sight that points on a grid have, by their scatter, beyond
+    the covariances of their matches; None if it is not known."""
+    good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
+    if good.sum() < settings.block_side**2:
+        return None
+    base, *others = table.views
+    X, place = found.X[good], table.uv[good, 0].astype(int)
+    step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
+    column, row = ((place - place.min(0)) // step).T
+    # along the line of sight d: σ of each point, and the length of one pixel of the other images
+    d = line_of_sight(base.derivative(X))
+    along = np.sqrt(factor * np.einsum("ni,nij,nj->n", d, found.covariance[good], d))
+    moved = [np.linalg.norm(o.derivative(X) @ d[:, :, None], axis=(1, 2)) for o in others]
+    pixel = 1 / np.max(np.where(table.is_used[good, 1:], np.stack(moved, 1), 0), 1)
+    q = base.parameter(X)
+    rate = np.abs(base.parameter(X + along[:, None] * d) - q) / along
+
+    def on_grid(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "r c"]:
+        grid = np.full((row.max() + 1, column.max() + 1), np.nan)
+        grid[row, column] = values
+        return grid
+
+    # points whose windows do not overlap
+    apart = -(-(2 * settings.half_fine_window + 1) // step)
+    missing = missing_sigma(
+        on_grid(q),
+        on_grid(rate * along),
+        on_grid(rate * pixel),
+        apart,
+        settings.block_side,
+        settings.scatter_quantile,
+    )
+    if missing is None:
+        return None
+    # what is more than the matches have without a factor is the surface itself
+    missing = min(missing, np.sqrt(1 / factor - 1) * np.median(along / pixel))
+    C = np.zeros_like(found.covariance)
+    C[good] = ((missing * pixel) ** 2)[:, None, None] * d[:, :, None] * d[:, None]
+    return C
+
+
+def _find_misfits(
+    found: IntersectedPoints, factor: float, significance: float
+) -> Bool[np.ndarray, " n"]:
+    """Points whose rays do not meet: vᵀPv beyond its distribution, or not known."""
+    limit = stats.chi2.isf(significance, np.maximum(found.redundancy, 1))
+    return ~(found.vtpv <= limit * factor)
+
+
+def _drop_worst_rays(
+    table: _Rays, found: IntersectedPoints, several: Bool[np.ndarray, " n"]
+) -> tuple[_Rays, IntersectedPoints]:
+    """The points again without the ray with the largest residual, other than the base ray."""
+    used = table.is_used.copy()
+    rows = np.flatnonzero(several)
+    misfit = np.where(used[rows][:, 1:], found.misfit[rows][:, 1:], -1)
+    used[rows, 1 + misfit.argmax(1)] = False
+    table = dataclasses.replace(table, is_used=used)
+    again = dataclasses.replace(
+        table, uv=table.uv[rows], covariance=table.covariance[rows], is_used=used[rows]
+    ).intersect(found.X[rows])
+    fields = {}
+    for field in dataclasses.fields(found):
+        values = getattr(found, field.name).copy()
+        values[rows] = getattr(again, field.name)
+        fields[field.name] = values
+    return table, IntersectedPoints(**fields)
+
+
+def _agrees(
+    other: OrientedImage, guide: Guide | None, X: Float[np.ndarray, "n 3"], max_distance: float
+) -> Bool[np.ndarray, " n"]:
+    """Whether the guide of the other image has its surface at X, within pixels of its partners."""
+    if guide is None:
+        return np.ones(len(X), bool)
+    uv = other.project(X)
+    there = is_inside(other, uv)
+    safe = np.where(there[:, None], uv, 0.0)
+    _, reach, _, _ = guide.look_up(safe, max_distance)
+    with np.errstate(invalid="ignore"):
+        q = other.parameter(X)
+        return there & (q >= reach[:, 0]) & (q <= reach[:, 1])

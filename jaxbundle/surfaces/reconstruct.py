@@ -1,0 +1,331 @@
+"""From oriented images to a cloud: pairs, guides, points, matches, base image by base image."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.surfaces.bounds import Bounds, bounds_from_geometry, bounds_from_points
+from jaxbundle.surfaces.cloud import Cloud, merge
+from jaxbundle.surfaces.correlation import Pyramid, make_pyramid
+from jaxbundle.surfaces.dense import DenseSettings
+from jaxbundle.surfaces.dense_cloud import dense_cloud
+from jaxbundle.surfaces.dense_ground import dense_ground_cloud
+from jaxbundle.surfaces.ground import RpcView
+from jaxbundle.surfaces.guide import (
+    Guide,
+    GuideSettings,
+    ImagePyramids,
+    coarsest_level,
+    make_guide,
+)
+from jaxbundle.surfaces.interest import interest_points, sample_percentiles, to_eight_bits
+from jaxbundle.surfaces.matching import MatchingSettings, match_points
+from jaxbundle.surfaces.orientation import is_uncertain
+from jaxbundle.surfaces.pairs import choose_partners
+from jaxbundle.surfaces.segments import segments, visible_range
+from jaxbundle.surfaces.views import FrameView, OrientedImage, Places
+from jaxbundle.types import Progress
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceSettings:
+    """The stages of a surface."""
+
+    guide: GuideSettings = GuideSettings()
+    matching: MatchingSettings = MatchingSettings()
+    dense: DenseSettings = DenseSettings()
+    points: int = 40_000
+    """Points of a base image by default. Time and memory grow with it; σ of the points does not
+    depend on it."""
+    max_pyramids: int = 6
+    """Maximum pyramids in memory, each of a third of the pixels of its image more, in 4 bytes:
+    those of a base image with its three partners, and two that the next may share. With fewer,
+    pyramids are made again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceResult:
+    """A cloud, statistics of the points of each base image, and messages; `orientation`: whether
+    the σ of the orientations are included in those of the points."""
+
+    cloud: Cloud
+    bases: tuple[Mapping[str, Any], ...]
+    messages: tuple[str, ...]
+    orientation: bool = False
+
+
+def find_bounds(
+    views: Sequence[FrameView],
+    tie: Float[np.ndarray, "n 3"],
+    heights: tuple[float, float] | None = None,
+) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
+    """The bounds of every image: heights, if given; tie points; else the geometry, with a
+    message."""
+    found, messages = [], []
+    low, high = heights or (None, None)
+    guessed = []
+    for view in views:
+        others = [o for o in views if o is not view]
+        # a view between the heights is not bounded by them
+        between = heights is not None and low <= view.X0[2] <= high
+        q = bounds_from_points(view, tie) if len(tie) and (heights is None or between) else None
+        if q is None:
+            wide = bounds_from_geometry(view, others)
+            if wide is None:
+                raise InputError(
+                    f"{view.name}: all images are at one position: a surface needs a base"
+                )
+            # given heights are searched at any distance: q of the geometry says only the order
+            bounded = heights is not None and not between
+            q = (1e-2 * wide[0], 1e2 * wide[1]) if bounded else wide
+            if not bounded:
+                guessed.append((view.name, q))
+        found.append(Bounds(view, q, low, high))
+    if guessed:
+        name, q = guessed[0]
+        messages.append(
+            f"no tie points in {len(guessed)} image(s): distances from {1 / q[1]:.4g} to "
+            f"{1 / q[0]:.4g} are searched ({name})"
+            + ("; give --zmin and --zmax" if heights is None else ", the heights are all around it")
+        )
+    return tuple(found), tuple(messages)
+
+
+def ground_bounds(
+    views: Sequence[OrientedImage], heights: tuple[float, float] | None
+) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
+    """The bounds of scanner and RPC images: heights, else the range of the polynomials.
+
+    **Raises:** `InputError` for scanner images without heights."""
+    messages: tuple[str, ...] = ()
+    if heights is None:
+        ranges = [view.range() for view in views if isinstance(view, RpcView)]
+        if not ranges:
+            raise InputError("line scanner images need --zmin and --zmax, heights of the surface")
+        heights = max(low for low, _ in ranges), min(high for _, high in ranges)
+        messages = (
+            f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, the range of the "
+            "coefficients; give --zmin and --zmax",
+        )
+    return tuple(Bounds(view, heights) for view in views), messages
+
+
+class _Pyramids:
+    """Pyramids of the images, the last few kept in memory."""
+
+    def __init__(self, views: Sequence[OrientedImage], levels: int, number: int) -> None:
+        self.views, self.levels, self.number = views, levels, number
+        self.cache: dict[int, Pyramid] = {}
+
+    def __getitem__(self, k: int) -> Pyramid:
+        # a dictionary keeps the order of insertion: the first is the one not used for longest
+        pyramid = self.cache.pop(k, None)
+        if pyramid is None:
+            while len(self.cache) >= self.number:
+                self.cache.pop(next(iter(self.cache)))
+            pyramid = make_pyramid(self.views[k].grey, self.levels)
+        self.cache[k] = pyramid
+        return pyramid
+
+    def select(self, base: int, others: Sequence[int]) -> ImagePyramids:
+        """Those of a base image and others."""
+        return self[base], [self[k] for k in others]
+
+
+def reconstruct(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    partners: Mapping[int, Sequence[int]] | None = None,
+    *,
+    points: str = "grid",
+    step: int | None = None,
+    dense: bool = False,
+    settings: SurfaceSettings = SurfaceSettings(),
+    progress: Progress | None = None,
+) -> SurfaceResult:
+    """The cloud of all base images.
+
+    **Arguments:** `partners`: indices of the matching partners of each base, by default selected;
+    `points`, `step`: see `interest_points`; `dense`: every pixel (or every `step`-th), by rectified
+    pairs; `progress(stage, done, total)`.
+
+    **Raises:** `NotSolvedError` if no images overlap, or nothing matches.
+    """
+    partners = dict(partners or choose_partners(views, bounds))
+    if not partners:
+        raise NotSolvedError(
+            "no two images show the same part of the surface from different directions: check the "
+            "orientation and its units, --zmin and --zmax"
+        )
+    tell = progress or (lambda *_: None)
+    levels = max(_level(views, bounds, i, others, settings.guide) for i, others in partners.items())
+    pyramids = _Pyramids(views, levels, settings.max_pyramids)
+    guides = _make_guides(views, bounds, partners, pyramids, tell, dense, settings)
+    # pixels between the points of a dense cloud, so that those of all base images fit into memory
+    pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
+    every = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
+    thinned = f"every {every}th pixel in both directions, to limit memory; --step 1 takes all"
+    messages = [thinned] if dense and not step and every > 1 else []
+    clouds, told = [], []
+    for done, (i, others) in enumerate(partners.items()):
+        tell("matching", done, len(partners))
+        base, used = views[i], [views[j] for j in others]
+        counts = {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
+        if i in guides and dense:
+            cloud, counts, more = _match_every_pixel(
+                base, used, guides[i], bounds[i], every, settings.dense
+            )
+            clouds.append(cloud)
+            messages += more
+        elif i in guides:
+            group, others_guides = pyramids.select(i, others), [guides.get(j) for j in others]
+            cloud, counts = _match_interest_points(
+                base, used, group, guides[i], others_guides, points, step, settings
+            )
+            clouds.append(cloud)
+        told.append({"image": base.name, "with": [view.name for view in used], **counts})
+    tell("matching", len(partners), len(partners))
+    if not any(len(c) for c in clouds):
+        raise NotSolvedError(
+            "no point was matched: the photographs have too little common texture, or the "
+            "orientation or the bounds of the heights are wrong"
+        )
+    uncertain = any(is_uncertain(views[j]) for i, others in partners.items() for j in (i, *others))
+    return SurfaceResult(merge(clouds), tuple(told), tuple(messages), uncertain)
+
+
+def _match_interest_points(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    pyramids: ImagePyramids,
+    guide: Guide,
+    guides: Sequence[Guide | None],
+    points: str,
+    step: int | None,
+    settings: SurfaceSettings,
+) -> tuple[Cloud, dict[str, Any]]:
+    """The cloud of some pixels of an image, and its counts."""
+    columns, rows = base.size
+    spacing = step or max(2, int(np.ceil(np.sqrt(columns * rows / settings.points))))
+    uv = interest_points(base.grey, points, spacing)
+    found = match_points(
+        base, others, pyramids, guide, uv, guides, settings.guide, settings.matching
+    )
+    n = len(found.X)
+    cloud = Cloud(
+        found.X,
+        found.covariance,
+        found.rays,
+        np.zeros(n, int),
+        found.uv,
+        (base.name,),
+        _colour(base, found.uv),
+    )
+    return cloud, {
+        "points": len(uv),
+        "matched": n,
+        "variance_factor": found.factor,
+        "rejected": found.rejected,
+    }
+
+
+def _match_every_pixel(
+    base: OrientedImage,
+    others: Sequence[OrientedImage],
+    guide: Guide,
+    bounds: Bounds,
+    step: int,
+    settings: DenseSettings,
+) -> tuple[Cloud, dict[str, Any], list[str]]:
+    """The cloud of most pixels of an image, its counts, messages on images left out."""
+    if isinstance(base, FrameView):
+        photographs = [view for view in others if isinstance(view, FrameView)]
+        cloud, used, left_out = dense_cloud(base, photographs, guide, bounds, step, settings)
+    else:
+        cloud, used, left_out = dense_ground_cloud(base, others, guide, bounds, step, settings)
+    cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
+    columns, rows = base.size
+    number = -(-columns // step) * -(-rows // step)
+    factor = float(np.mean([f for _, f in used])) if used else None
+    reason = "no disparity, or not confirmed by least squares"
+    if len(used) > 1:
+        reason += ", or pairs disagree"
+    return (
+        cloud,
+        {
+            "points": number,
+            "matched": len(cloud),
+            "variance_factor": factor,
+            "rejected": {reason: number - len(cloud)},
+        },
+        [f"{base.name} with {name}: cannot be rectified, left out" for name in left_out],
+    )
+
+
+def _make_guides(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    partners: Mapping[int, Sequence[int]],
+    pyramids: _Pyramids,
+    tell: Progress,
+    dense: bool,
+    settings: SurfaceSettings,
+) -> dict[int, Guide]:
+    """Guides of every base and its partners; dense matching needs only those of the
+    bases, coarser ones."""
+    with_whom = {i: list(others) for i, others in partners.items()}
+    for i, others in partners.items():
+        for j in others:
+            if j not in partners and not dense:
+                with_whom.setdefault(j, []).append(i)
+    nodes = settings.dense.max_guide_nodes if dense else settings.guide.max_nodes
+    guide_settings = dataclasses.replace(settings.guide, max_nodes=nodes)
+    guides = {}
+    for done, (i, others) in enumerate(with_whom.items()):
+        tell("depths", done, len(with_whom))
+        guide = make_guide(
+            views[i],
+            [views[j] for j in others],
+            pyramids.select(i, others),
+            bounds[i],
+            guide_settings,
+        )
+        if guide is not None:
+            guides[i] = guide
+    tell("depths", len(with_whom), len(with_whom))
+    return guides
+
+
+def _level(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    i: int,
+    others: Sequence[int],
+    settings: GuideSettings,
+) -> int:
+    """The coarsest level required for a base image."""
+    # 5 × 5 lines of sight: lengths of segments change slowly over an image
+    u, v = (np.linspace(0.1, 0.9, 5) * (n - 1) for n in views[i].size)
+    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    q = bounds[i](uv)
+    lengths = [
+        segments(views[i], views[j], uv, visible_range(views[i], views[j], uv, q)).length
+        for j in others
+    ]
+    seen = np.concatenate(lengths)
+    seen = seen[np.isfinite(seen)]
+    return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0, settings)
+
+
+def _colour(view: OrientedImage, uv: Places) -> UInt8[np.ndarray, "n 3"]:
+    place = np.rint(uv).astype(int)
+    if isinstance(view, FrameView) and view.colours is not None:
+        return view.colours()[place[:, 1], place[:, 0]]
+    grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
+    if grey.dtype != np.uint8:
+        grey = to_eight_bits(grey, sample_percentiles(view.grey, 0.5, 99.5))
+    return np.repeat(grey[:, None], 3, axis=1)

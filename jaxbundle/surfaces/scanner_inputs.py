@@ -1,0 +1,245 @@
+"""Scanner and RPC images from files, in one neighbourhood; and their coordinates in a map system.
+
+An image is given by a raster with RPC tags, by a raster with coefficients beside it
+(`NAME_RPC.TXT`, `NAME.RPB`, `NAME.geom`, `NAME.xml`), by the file of the coefficients, or by a
+scanner file; the raster of the last two has the same name and is beside them, or in the folder of
+--photos.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, geodetic
+from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.image_to_ground import locate_point
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.surfaces import Ground
+from jaxbundle.surfaces.cloud import Cloud
+from jaxbundle.surfaces.ground import (
+    GroundView,
+    Neighbourhood,
+    RpcView,
+    ScannerView,
+    neighbourhood,
+)
+from jaxbundle.surfaces.views import Grey
+from jaxbundle.system.file_content import missing
+
+if TYPE_CHECKING:
+    import pyproj
+
+IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
+COMPANION_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
+ENDINGS = ("_rpc", "_RPC")
+Orientation = Rpc | tuple[PushbroomImage, Ellipsoid | None]
+"""The polynomials; or the scanner's image, and its Earth, None in a local frame."""
+
+
+def read_ground_views(
+    files: Sequence[Path], folder: Path | None
+) -> tuple[tuple[GroundView, ...], Neighbourhood | None]:
+    """The oriented images and the origin of their coordinates, None in a local frame.
+
+    **Raises:** `InputError` for another kind of file, a missing raster, or another size.
+    """
+    found = [_orientation(path, folder) for path in files]
+    earths = [None if isinstance(o, Rpc) else o[1] for o, _ in found]
+    local = [not isinstance(o, Rpc) and o[1] is None for o, _ in found]
+    if any(local) and not all(local):
+        raise InputError(
+            f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
+        )
+    around = None if all(local) else _central_neighbourhood(found[0][0])
+    names = [raster.name for _, raster in found]
+    if len({*names}) < len(names):
+        names = [str(raster) for _, raster in found]
+    views = []
+    for name, (orientation, raster), earth in zip(names, found, earths):
+        grey = read_grey(raster)
+        if isinstance(orientation, Rpc):
+            assert around is not None, "an RPC is not in a local frame"
+            views.append(RpcView(name, grey, orientation, around))
+            continue
+        image = orientation[0]
+        if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
+            raise InputError(
+                f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
+                f"{image.pixels} × {image.lines}"
+            )
+        views.append(ScannerView(name, grey, image, earth, around))
+    return tuple(views), around
+
+
+def is_ground_image(path: Path) -> bool:
+    """Whether a file may be a scanner image or one with rational polynomials."""
+    name = path.name
+    if path.suffix.lower() in IMAGES or any(name.endswith(end) for end in COMPANION_ENDINGS):
+        return True
+    if path.suffix.lower() in (".json", ".dim", ".imd"):
+        return True
+    return path.suffix == ".toml" and path.is_file() and b"[scanner]" in path.read_bytes()
+
+
+def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
+    """The grey values of a raster; for colours their luminance. No-data is 0.
+
+    One band of 8 or 16 bits keeps its type, all else becomes float32; so large rasters, which are
+    read by blocks of lines of `pixels_at_once`, need no more memory than their pixels.
+
+    **Raises:** `InputError` if it cannot be read.
+    """
+    package = rasterio()
+    try:
+        with open_plain(path) as source:
+            bands = list(range(1, min(source.count, 3) + 1))
+            plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
+            out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
+            # red, green and blue in the luminance (ITU-R BT.601, two digits)
+            weights = np.array([0.3, 0.59, 0.11], np.float32)
+            rows = max(1, pixels_at_once // source.width)
+            for first in range(0, source.height, rows):
+                window = package.windows.Window(
+                    0, first, source.width, min(rows, source.height - first)
+                )
+                values = source.read(bands, window=window, masked=True).filled(0)
+                if not plain:
+                    values = np.nan_to_num(values.astype(np.float32))
+                colour = len(values) == 3
+                out[first : first + rows] = (
+                    np.tensordot(weights, values, 1) if colour else values[0]
+                )
+            return out
+    except package.errors.RasterioError as error:
+        raise unreadable(path, error) from None
+
+
+def system_of(around: Neighbourhood, crs: str | None) -> str:
+    """A map coordinate system: the given one, or the UTM zone.
+
+    **Raises:** `InputError` for a system unknown to pyproj."""
+    if crs is not None:
+        return crs
+    longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
+    # zones of 6° from 180° W; EPSG 32601 to 32660 are those of the north, 32701 on of the south
+    zone = int((longitude + 180) // 6) % 60 + 1
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def to_map(cloud: Cloud, around: Neighbourhood, crs: str) -> Cloud:
+    """The cloud in a map system, with its covariance rotated and scaled.
+
+    **Raises:** `InputError` for a system unknown to pyproj."""
+    X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
+    # the arrays of 262 144 points take about 50 MB
+    together = 1 << 18
+    for first in range(0, len(cloud), together):
+        part = slice(first, first + together)
+        X[part], J = _with_derivative(cloud.X[part], around, crs)
+        covariance[part] = J @ cloud.covariance[part] @ np.swapaxes(J, 1, 2)
+    return dataclasses.replace(cloud, X=X, covariance=covariance, system=crs)
+
+
+def _with_derivative(
+    X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    """Points in a map system, and their derivatives by the coordinates of the neighbourhood."""
+    # differences over one metre: a map's curvature within it is 1e-7
+    x, y = map_coordinates(X, around, crs)
+    columns = []
+    for axis in range(2):
+        dx, dy = map_coordinates(X + np.eye(3)[axis], around, crs)
+        columns.append(np.stack([dx - x, dy - y, np.zeros_like(x)], 1))
+    J = np.stack([*columns, np.broadcast_to([0.0, 0, 1], X.shape)], 2)
+    return np.stack([x, y, X[:, 2]], 1), J
+
+
+def map_coordinates(
+    X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of points in a map system."""
+    degrees = np.degrees(np.stack([np.asarray(a) for a in around.geographic(X.T)[:2]]))
+    x, y = _transformer(crs).transform(*degrees)
+    return np.asarray(x), np.asarray(y)
+
+
+def from_map(
+    x: Float[np.ndarray, " n"],
+    y: Float[np.ndarray, " n"],
+    h: Float[np.ndarray, " n"],
+    around: Neighbourhood,
+    crs: str,
+) -> Float[np.ndarray, "n 3"]:
+    """Points of map coordinates."""
+    degrees = _transformer(crs).transform(x, y, direction="INVERSE")
+    east, north = np.radians(degrees)
+    return np.asarray(around.local(east, north, np.asarray(h, float))).T
+
+
+def _transformer(crs: str) -> "pyproj.Transformer":
+    try:
+        import pyproj
+        import pyproj.exceptions
+    except ImportError:
+        raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
+    try:
+        return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
+
+
+def _orientation(path: Path, folder: Path | None) -> tuple[Orientation, Path]:
+    """The polynomials, or the scanner's image and Earth; and the raster."""
+    if not path.is_file():
+        raise missing(path, "a raster with RPC, or a scanner file")
+    if path.suffix.lower() in IMAGES:
+        beside = [path.with_name(path.stem + end) for end in COMPANION_ENDINGS]
+        source = next((p for p in beside if p.is_file()), path)
+        if source is path and path.suffix.lower() not in RASTERS:
+            raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
+        return read_rpc(source), path
+    scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")
+    if path.suffix.lower() == ".xml":
+        try:
+            return read_rpc(path), _raster_of(path, folder)
+        except InputError:
+            scanner = True
+    if scanner:
+        file = read_scanner(path)
+        return (file.image, file.earth), _raster_of(path, folder)
+    return read_rpc(path), _raster_of(path, folder)
+
+
+def _raster_of(path: Path, folder: Path | None) -> Path:
+    stem = path.stem
+    for end in ENDINGS:
+        stem = stem.removesuffix(end)
+    places = [path.parent, *([folder] if folder else [])]
+    for place in places:
+        for suffix in (*IMAGES, *(s.upper() for s in IMAGES)):
+            if (place / (stem + suffix)).is_file():
+                return place / (stem + suffix)
+    where = f"beside it or in {folder}" if folder else "beside it; --photos names its folder"
+    raise InputError(f"{path}: no raster {stem}.tif {where}")
+
+
+def _central_neighbourhood(orientation: Orientation) -> Neighbourhood:
+    """The neighbourhood of the middle of the first image."""
+    if isinstance(orientation, Rpc):
+        return neighbourhood(
+            np.radians(float(orientation.longitude_offset)),
+            np.radians(float(orientation.latitude_offset)),
+        )
+    image: PushbroomImage = orientation[0]
+    earth = orientation[1] or WGS84
+    X = locate_point(image, Ground(earth), (image.lines - 1) / 2, (image.pixels - 1) / 2)
+    longitude, latitude, _ = geodetic(earth, X)
+    return neighbourhood(float(longitude), float(latitude), earth)

@@ -1,0 +1,173 @@
+"""Subpixel matches: least squares matching of many windows, from many starts.
+
+Both photographs are smoothed first: aliasing and noise shift matches
+towards the middle between pixels, and cause false gradients (Schreier et al., 2000).
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int
+
+from jaxbundle.measure.least_squares_matching import (
+    LeastSquaresMatch,
+    MatchingStatus,
+    match_least_squares,
+)
+from jaxbundle.surfaces.views import Grey, OrientedImage, is_inside
+from jaxbundle.system.programs import compile_once
+
+BLUR = 0.7
+"""σ of the Gaussian that smooths both windows, pixels: at the Nyquist frequency exp(−π²·0.7²/2) =
+9 % are left of the detail that interpolation falsifies. Half: RMS of errors over σ 1.06 (0.999),
+only 99.2 % of them within 3 σ (99.6); double: 0.96, and two points instead of one wrong by a pixel
+(the scene is that of `WindowSettings`). It is compiled in."""
+BLUR_EXTENT = 3
+"""Extent of the Gaussian in pixels, 4 σ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowSettings:
+    """Least squares matching of single windows.
+
+    Figures "half …, double …" are of `benchmarks/surface_accuracy.py "no texture" --sparse` with
+    every fifth pixel: 2251 points, RMS of errors over σ 0.999, 0.04 % wrong by more than a pixel.
+    """
+
+    search_margin: int = 5
+    """Margin of the part of the other image around the window at the start, pixels: windows may
+    move in it. Half: 65 points more, near the edge of the other image; double: 150 fewer."""
+    max_stretch: float = 1.4
+    """Maximum ratio of lengths of a window in the other image, for the size of that part: √2, a
+    window turned by 45°. Half: 77 points more, near the edge; double: 227 fewer, and more time."""
+    min_texture: float = 1.5
+    """Minimum ratio of the squared gradients of half a window to those of noise: three standard
+    deviations above 1, √(2/78) for the 78 pixels of a side of 13 × 13. Half: 0.31 % of the points
+    wrong by more than a pixel instead of 0.04 %; double: none, and 9 points fewer."""
+
+
+class SubpixelMatches(NamedTuple):
+    """Positions [n, 2] in the other image, A [n, 2, 2], covariance [n, 2, 2] of the position
+    relative to the window, pixels²; ρ; σ0 of a grey value; statuses, `MatchingStatus`."""
+
+    uv: Float[np.ndarray, "n 2"]
+    A: Float[np.ndarray, "n 2 2"]
+    covariance: Float[np.ndarray, "n 2 2"]
+    rho: Float[np.ndarray, " n"]
+    sigma0: Float[np.ndarray, " n"]
+    status: Int[np.ndarray, " n"]
+
+
+def refine(
+    base: OrientedImage,
+    other: OrientedImage,
+    uv: Float[np.ndarray, "n 2"],
+    start: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "n 2 2"],
+    half: int,
+    settings: WindowSettings = WindowSettings(),
+) -> SubpixelMatches:
+    """Match windows of 2·`half` + 1 pixels around whole pixels of the base.
+
+    **Arguments:** `start`: positions in the other image, within a few pixels; `A`: start of the
+    affine transformation, from the base to the other image.
+    """
+    n, margin = len(uv), int(np.ceil(settings.max_stretch * half)) + settings.search_margin
+    usable = is_inside(base, uv, half)
+    usable &= is_inside(other, start, margin + 1)
+    usable &= np.isfinite(A).all((1, 2))
+    rows = np.flatnonzero(usable)
+    out = SubpixelMatches(
+        start.astype(float),
+        A.astype(float),
+        np.full((n, 2, 2), np.inf),
+        np.full(n, np.nan),
+        np.full(n, np.nan),
+        np.full(n, int(MatchingStatus.OUTSIDE)),
+    )
+    # 256 windows a call: all iterate until the last has converged
+    together = 256
+    for first in range(0, len(rows), together):
+        part = rows[first : first + together]
+        lanes = part[np.minimum(np.arange(together), len(part) - 1)]
+        origin = np.rint(start[lanes]).astype(int) - margin
+        template = _cut_out(base.grey, np.rint(uv[lanes]).astype(int) - half, 2 * half + 1)
+        piece = _cut_out(other.grey, origin, 2 * margin + 1)
+        begin = np.concatenate([A[lanes], (start[lanes] - origin)[:, :, None]], 2)
+        found: LeastSquaresMatch = _match(template, piece, begin.astype(np.float32))
+        k = len(part)
+        affine = np.asarray(found.affine, float)[:k]
+        out.uv[part] = affine[:, :, 2] + origin[:k]
+        out.A[part] = affine[:, :, :2]
+        out.covariance[part] = np.asarray(found.covariance)[:k]
+        out.rho[part] = np.asarray(found.correlation)[:k]
+        out.sigma0[part] = np.asarray(found.sigma0)[:k]
+        out.status[part] = np.asarray(found.status)[:k]
+    return out
+
+
+def has_texture(
+    grey: Grey,
+    uv: Float[np.ndarray, "n 2"],
+    sigma0: Float[np.ndarray, " n"],
+    half: int,
+    min_texture: float = WindowSettings.min_texture,
+) -> Bool[np.ndarray, " n"]:
+    """Whether windows have texture on all sides of their points, by the squares of its gradients
+    relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof. The row
+    and the column of a point belong to no side: the edge itself may be there.
+
+    Smoothed noise of variance σ² has σ²/4πs², twice this is σ0²; central differences of it
+    have σ²/2 on each axis.
+    """
+    k = np.arange(-half - 1, half + 2)
+    rows, columns = grey.shape
+    noise = 2 * np.pi * BLUR**2 * sigma0**2
+    good = np.zeros(len(uv), bool)
+    together = 4096
+    for first in range(0, len(uv), together):
+        part = slice(first, first + together)
+        u, v = np.rint(uv[part]).astype(int).T
+        r = np.clip(v[:, None] + k, 0, rows - 1)
+        c = np.clip(u[:, None] + k, 0, columns - 1)
+        a = grey[r[:, :, None], c[:, None]].astype(np.float32)
+        gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
+        square = (gx * gx + gy * gy) / 4
+        near, far = slice(0, half), slice(half + 1, None)
+        sides = square[:, near], square[:, far], square[:, :, near], square[:, :, far]
+        least = np.min([side.mean((1, 2)) for side in sides], axis=0)
+        with np.errstate(invalid="ignore"):
+            good[part] = least > min_texture * noise[part]
+    return good
+
+
+def _cut_out(
+    grey: Grey, corner: Int[np.ndarray, "n 2"], side: int
+) -> Float32[np.ndarray, "n wide wide"]:
+    """Pieces from their upper-left pixels (u, v), with `BLUR_EXTENT` pixels more on all sides."""
+    k = np.arange(-BLUR_EXTENT, side + BLUR_EXTENT)
+    rows, columns = (np.clip(c[:, None] + k, 0, n - 1) for c, n in zip(corner.T[::-1], grey.shape))
+    return grey[rows[:, :, None], columns[:, None]].astype(np.float32)
+
+
+@partial(compile_once, static=())
+def _match(
+    template: Float32[Array, "n side side"],
+    piece: Float32[Array, "n other_side other_side"],
+    start: Float32[Array, "n 2 3"],
+) -> LeastSquaresMatch:
+    match = lambda *arrays: match_least_squares(*arrays, blur=BLUR)
+    return jax.vmap(match)(_smooth(template), _smooth(piece), start)
+
+
+def _smooth(pieces: Float32[Array, "n wide wide"]) -> Float32[Array, "n side side"]:
+    """Smoothed pieces, without pixels beyond them."""
+    side = pieces.shape[-1] - 2 * BLUR_EXTENT
+    away = np.arange(side + 2 * BLUR_EXTENT) - np.arange(side)[:, None] - BLUR_EXTENT
+    weight = np.where(np.abs(away) <= BLUR_EXTENT, np.exp(-(away**2) / (2 * BLUR**2)), 0.0)
+    S = jnp.asarray(weight / weight.sum(1, keepdims=True), pieces.dtype)
+    return jnp.einsum("ab,cd,nbd->nac", S, S, pieces)

@@ -1,0 +1,205 @@
+"""Clouds: filters against counting by hand, files that read back equal, a DSM of a known plane."""
+
+import dataclasses
+
+import ezdxf
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import rasterio
+from surface_scenes import hills, photographs, two_shapes
+
+from jaxbundle import plotting
+from jaxbundle.errors import InputError
+from jaxbundle.planning.texture import Texture
+from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
+from jaxbundle.surfaces.cloud import Cloud, merge
+from jaxbundle.surfaces.compare import compare
+from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
+from jaxbundle.surfaces.files import text_of
+from jaxbundle.surfaces.filtering import drop_isolated, drop_weak, thin
+from jaxbundle.surfaces.orthophoto import orthophoto
+from jaxbundle.surfaces.point_files import read_cloud, write_cloud
+
+
+def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
+    """Points of Z = 0.2·X − 0.1·Y + 30 with noise of twice the σ at every second point."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, 40, (n, 2)) + [500_000, 5_000_000]
+    sigma = np.column_stack([np.full((n, 2), noise / 5), noise * (1 + np.arange(n) % 2)])
+    Z = 0.2 * (xy[:, 0] - 500_000) - 0.1 * (xy[:, 1] - 5_000_000) + 30
+    X = np.column_stack([xy, Z + sigma[:, 2] * rng.standard_normal(n)])
+    C = np.eye(3) * sigma[:, :, None] ** 2
+    colour = rng.integers(0, 256, (n, 3)).astype(np.uint8)
+    return Cloud(X, C, 2 + np.arange(n) % 3, np.arange(n) % 2, rng.uniform(0, 99, (n, 2)),
+                 ("a.jpg", "b.jpg"), colour, system)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return cloud_on_plane(system="EPSG:32633")
+
+
+def test_a_cube_gives_its_corner_or_mean_where_it_has_enough_points():
+    X = np.array([[0.1, 0.1, 0.1], [0.2, 0.6, 0.3], [1.5, 0, 0], [-0.1, 0.5, 0.5]])
+    C = np.broadcast_to(np.eye(3), (4, 3, 3)) * np.array([1.0, 4, 1, 1])[:, None, None]
+    cloud = Cloud(X, C, np.full(4, 2), np.zeros(4, int), np.zeros((4, 2)), ("a",))
+    corners = thin(cloud, 1.0, place="corner")
+    assert corners.X.tolist() == [[-1, 0, 0], [0, 0, 0], [1, 0, 0]]
+    mean = thin(cloud, 1.0, least=2)
+    np.testing.assert_allclose(mean.X, [(4 * X[0] + X[1]) / 5])
+    np.testing.assert_allclose(mean.covariance[0], np.eye(3) * 2 / (1 + 1 / 4))
+    np.testing.assert_allclose(thin(cloud, 1.0, least=2, place="best").X, X[:1])
+
+
+def test_lonely_and_weak_points_go(plane):
+    far = plane.take([0])
+    lost = Cloud(far.X + [0, 0, 50], *(getattr(far, n) for n in
+                 ("covariance", "rays", "image", "uv", "images", "colour")))  # fmt: skip
+    both = merge([plane, lost])
+    kept = drop_isolated(both, limit=6.0)
+    assert len(kept) > 0.97 * len(plane) and kept.X[:, 2].max() < 45
+    assert len(drop_weak(plane, 0.06)) == len(plane) // 2
+    assert set(drop_weak(plane, least_rays=3).rays) == {3, 4}
+
+
+@pytest.mark.parametrize("kind", ["csv", "ply", "las", "laz"])
+def test_files_read_back_equal(plane, tmp_path, kind):
+    path = tmp_path / f"cloud.{kind}"
+    write_cloud(plane, path)
+    back = read_cloud(path)
+    rounded = 1e-4 if kind in ("las", "laz") else 0
+    np.testing.assert_allclose(back.X, plane.X, rtol=0, atol=rounded)
+    np.testing.assert_allclose(back.sigma, plane.sigma, rtol=1e-6)
+    assert (back.rays == plane.rays).all()
+    if kind == "csv":
+        assert [back.images[k] for k in back.image] == [plane.images[k] for k in plane.image]
+        np.testing.assert_array_equal(back.uv, plane.uv)
+    else:
+        np.testing.assert_array_equal(back.colour, plane.colour)
+    if kind in ("las", "laz"):
+        assert back.system == "EPSG:32633"
+
+
+def test_a_drawing_passes_the_audit(plane, tmp_path):
+    few = plane.take(np.arange(50))
+    write_cloud(few, tmp_path / "cloud.dxf")
+    drawing = ezdxf.readfile(tmp_path / "cloud.dxf")
+    assert not drawing.audit().errors
+    found = np.array([tuple(p.dxf.location) for p in drawing.modelspace().query("POINT")])
+    np.testing.assert_allclose(found, few.X, rtol=1e-12)
+
+
+def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
+    dsm = make_dsm(plane, 2.0)
+    x, y = dsm.centres()
+    assert dsm.height.shape == (20, 20)
+    # the points of a cell are not spread evenly about its middle
+    truth = 0.2 * (x - 500_000) - 0.1 * (y - 5_000_000) + 30
+    assert np.sqrt(np.mean((dsm.height - truth) ** 2)) < 0.1
+    level = plane.X[:, 2] - (0.2 * (plane.X[:, 0] - 500_000) - 0.1 * (plane.X[:, 1] - 5_000_000))
+    X = np.column_stack([plane.X[:, :2], level])
+    model = make_dsm(dataclasses.replace(plane, X=X), 2.0)
+    w = (model.height - 30) / model.sigma
+    assert 0.8 < np.sqrt(np.mean(w**2)) < 1.2
+    path = tmp_path / "dsm.tif"
+    write_dsm(dsm, path, tmp_path / "sigma.tif")
+    with rasterio.open(path) as raster:
+        assert raster.crs.to_epsg() == 32633 and raster.nodata == NO_DATA
+        row, column = raster.index(500_007.0, 5_000_013.0)
+        np.testing.assert_allclose(raster.read(1)[row, column], dsm.height[row, column])
+        assert abs(dsm.height[row, column] - (30 + 1.4 - 1.3)) < 0.3
+        assert raster.descriptions == ("height",)
+    with rasterio.open(tmp_path / "sigma.tif") as raster:
+        assert raster.descriptions == ("sigma of height",)
+
+
+def test_gaps_of_a_dsm_are_filled_inside_only(plane):
+    hole = ((plane.X[:, :2] - [500_000, 5_000_000] > 9.9) &
+            (plane.X[:, :2] - [500_000, 5_000_000] < 12.1)).all(1)  # fmt: skip
+    left = plane.take(~hole & ~((plane.X[:, 0] > 500_030) & (plane.X[:, 1] > 5_000_030)))
+    plain, filled = make_dsm(left, 2.0, fill=0), make_dsm(left, 2.0)
+    gap = np.isnan(plain.height) & np.isfinite(filled.height)
+    assert gap.sum() >= 1 and np.isnan(filled.height).sum() > 15
+    assert (filled.sigma[gap] > np.nanmedian(plain.sigma)).all()
+
+
+def test_a_gap_beside_a_wall_is_filled_from_below(plane):
+    X = plane.X.copy()
+    east = X[:, 0] - X[:, 0].min()
+    X[:, 2] = np.where(east > 20, 9.0, 0.0) + 0.01 * X[:, 1] % 0.05
+    walled = dataclasses.replace(plane, X=X).take((east < 19.0) | (east > 22.5))
+    plain, filled = make_dsm(walled, 1.0, fill=0), make_dsm(walled, 1.0)
+    gap = np.isnan(plain.height) & np.isfinite(filled.height)
+    inside = np.abs(filled.x + np.arange(gap.shape[1]) + 0.5 - X[:, 0].min() - 20.7) < 1.5
+    assert (gap & inside).sum() > 20
+    assert (filled.height[gap] < 1e-3 + 0.05)[inside[None].repeat(len(gap), 0)[gap]].all()
+
+
+def test_the_report_counts_by_classes(plane):
+    found = accuracy_of(plane)
+    assert [c["points"] for c in found["classes"]] == [2000, 2000, 0, 0, 0, 0] or (
+        sum(c["points"] for c in found["classes"]) == len(plane)
+    )
+    assert found["sZ"]["smallest"] == pytest.approx(0.05)
+    assert found["sZ"]["mean"] == pytest.approx(0.075)
+    check = np.array([[500_010, 5_000_010, 31.0], [500_020, 5_000_010, 33.0]])
+    at = at_check_points(plane, check, 2.0)
+    assert at["points"] == 2 and at["rms_Z"] < 0.05
+    assert to_plane(plane.X)["rms"] == pytest.approx(0.05 * np.sqrt(2.5) / np.sqrt(1.05), rel=0.05)
+
+
+def test_the_report_says_what_its_sigma_contains(plane):
+    told = text_of({
+        "points": len(plane), "rays": {}, "images": [], "accuracy": accuracy_of(plane),
+        "sigma_includes": ["matching", "orientation"],
+    })  # fmt: skip
+    assert "σ contains: matching, orientation" in told.splitlines() and "holds" not in told
+
+
+def test_clouds_are_compared_along_normals(plane):
+    other = cloud_on_plane(seed=1)
+    raised = Cloud(plane.X + [0, 0, 0.5], *(getattr(plane, n) for n in
+                   ("covariance", "rays", "image", "uv", "images")))  # fmt: skip
+    found = compare(raised, other)
+    assert found["median"] == pytest.approx(0.5 / np.sqrt(1.05), abs=0.02)
+    assert compare(plane, other)["normalised_rms"] < 1.2
+    with pytest.raises(InputError, match="nothing in common"):
+        compare(Cloud(plane.X + 1e4, *(getattr(plane, n) for n in
+                ("covariance", "rays", "image", "uv", "images"))), other)  # fmt: skip
+
+
+def test_pictures_show_all_points_and_cells(plane):
+    ax = plotting.cloud_perspective(plane)
+    low, high = ax.get_xlim()
+    assert low < plane.X[:, 0].min() and plane.X[:, 0].max() < high
+    dsm = make_dsm(plane, 2.0)
+    picture = plotting.dsm_relief(dsm).images[0]
+    assert picture.get_extent() == [500_000, 500_040, 5_000_000, 5_000_040]
+    # falls to the north-west, away from the light: darker than a plane that rises there
+    rising = dataclasses.replace(dsm, height=-dsm.height)
+    lit = plotting.dsm_relief(rising).images[0].get_array()[..., :3]
+    assert lit.mean() != picture.get_array()[..., :3].mean()
+    plt.close("all")
+
+
+def test_an_orthophoto_shows_what_the_image_sees_and_nothing_behind_a_roof():
+    views, _ = photographs(two_shapes(), [(3.0, 0, 10)], noise=0)
+    x, y = np.meshgrid(np.arange(-3, 3, 0.05) + 0.025, -(np.arange(-3, 3, 0.05) + 0.025))
+    roof = (np.abs(x + 0.2) < 1) & (np.abs(y + 0.2) < 1)
+    dsm = Dsm(np.where(roof, 2.0, hills(x, y)), 0 * x, 0 * x.astype(int), -3.0, 3.0, 0.05)
+    grey, steep = orthophoto(views[0], dsm)
+    texture = Texture(0.02, seed=1, side=512)
+    ground = np.isfinite(grey) & ~roof
+    expected = texture(x[ground], y[ground], np.full(ground.sum(), 0.05)) * 255
+    assert np.corrcoef(grey[ground], expected)[0, 1] > 0.9
+    # the roof's shadow: beyond its edge as seen from X = 3
+    behind = (x < -1.35) & (x > -1.7) & (np.abs(y + 0.2) < 0.8)
+    assert np.isnan(grey[behind]).mean() > 0.9 and np.isfinite(grey[x > 1]).mean() > 0.95
+    assert np.nanmax(steep) <= 1 and steep[20, 110] > steep[20, 30]
+
+
+def test_a_folder_where_a_cloud_is_expected(tmp_path, command):
+    told = command("cloud", tmp_path)
+    assert told.status == 2
+    assert told.err.startswith(f"jaxbundle: {tmp_path}: is a folder; expected a cloud, .csv")

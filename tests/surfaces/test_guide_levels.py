@@ -1,0 +1,30 @@
+"""How fine a guide becomes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxbundle.surfaces import guide
+
+
+@pytest.mark.parametrize("max_nodes, finest", [(10**9, 0), (2000, 2), (1, 4)])
+def test_a_guide_has_at_most_so_many_nodes(monkeypatch, max_nodes, finest):
+    """On the coarsest level it begins, whatever their number; each finer one has four times as
+    many, and those beyond the limit are left to the points."""
+    levels, numbers = [], []
+
+    def smooth(base, level, uv, shape, found, settings):
+        levels.append(level)
+        numbers.append(len(uv))
+        return SimpleNamespace()
+
+    monkeypatch.setattr(guide, "_search_all", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(guide, "_search_near", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(guide, "_smooth", smooth)
+    base, pyramid = SimpleNamespace(size=(1280, 960)), SimpleNamespace(levels=[None] * 5)
+    settings = guide.GuideSettings(spacing=8, max_nodes=max_nodes)
+    guide.make_guide(base, [], [pyramid], lambda uv: np.zeros((len(uv), 2)), settings)
+    assert levels == list(range(4, finest - 1, -1))
+    assert max(numbers[1:], default=0) <= max_nodes
+    assert finest == 0 or 4 * numbers[-1] > 0.9 * max_nodes

@@ -1,0 +1,57 @@
+"""Which images form pairs: by overlap and angle of intersection, known for two vertical ones."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxbundle.surfaces.pairs import score
+
+HEIGHT = 100.0
+
+
+@dataclasses.dataclass
+class Vertical:
+    """A vertical image of 200 × 200 pixels with q = Z, from a height of 100 m, with pixels of 1 m
+    on the ground."""
+
+    x: float
+    size: tuple[int, int] = (201, 201)
+
+    def points(self, uv, q):
+        away = (HEIGHT - q)[:, None] / HEIGHT
+        return np.column_stack([(uv - 100) * away + [self.x, 0], q])
+
+    def project(self, X):
+        return (X[:, :2] - [self.x, 0]) * (HEIGHT / (HEIGHT - X[:, 2]))[:, None] + 100
+
+    def derivative(self, X):
+        away = HEIGHT - X[:, 2]
+        along = np.zeros((len(X), 2, 3))
+        along[:, 0, 0] = along[:, 1, 1] = HEIGHT / away
+        along[:, :, 2] = (X[:, :2] - [self.x, 0]) * (HEIGHT / away**2)[:, None]
+        return along
+
+
+@pytest.mark.parametrize("base", [0.1, 10.0, 25.0, 60.0, 150.0])
+def test_the_score_is_overlap_times_the_weight_of_the_angle(base):
+    """Of 9 × 9 points between 0.05 and 0.95 of the sides, on flat ground: the weight grows up to
+    14° and falls from 28° to 0 at 60°; less than 1° is no pair."""
+    flat = lambda uv: np.zeros((len(uv), 2))
+    x = np.linspace(-90, 90, 9)
+    x = x[x - base >= -100]
+    y = np.linspace(-90, 90, 9)[:, None]
+    d, f = (np.stack(np.broadcast_arrays(x - b, y, -HEIGHT), -1) for b in (0.0, base))
+    cosine = (d * f).sum(-1) / np.linalg.norm(d, axis=-1) / np.linalg.norm(f, axis=-1)
+    angle = np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    worth = min(angle / 14, 1) * min((60 - angle) / 32, 1) if 1 <= angle <= 60 else 0.0
+    assert score(Vertical(0.0), flat, Vertical(base)) == pytest.approx(len(x) / 9 * worth)
+
+
+def test_of_depths_the_best_counts_and_images_far_apart_are_no_pair():
+    hills = lambda uv: np.tile([-400.0, 60.0], (len(uv), 1))
+    flat = lambda uv: np.full((len(uv), 2), -55.0)  # the middle of the three depths
+    at_depths = [score(Vertical(0.0), lambda uv, q=q: np.full((len(uv), 2), q), Vertical(60.0))
+                 for q in (-285.0, -170.0, -55.0)]  # fmt: skip
+    assert score(Vertical(0.0), hills, Vertical(60.0)) == max(at_depths) > min(at_depths)
+    assert score(Vertical(0.0), flat, Vertical(300.0)) == 0.0

@@ -1,0 +1,172 @@
+"""Rendered pairs: matches agree with the truth, heights with their σ, and nothing is found where
+nothing is visible."""
+
+import numpy as np
+import pytest
+from surface_scenes import CAMERA, F, hills, photographs, two_shapes
+
+from jaxbundle.surfaces.correlation import find_peaks, slide
+from jaxbundle.surfaces.dense_cloud import combine
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.rectification import rectify
+from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
+from jaxbundle.types import present
+
+NONE = np.zeros((0, 3))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    views, truth = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
+    bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
+    return views, truth, reconstruct(views, bounds, {0: [1]}, step=4)
+
+
+def errors(cloud, truth):
+    v, u = cloud.uv.astype(int).T[::-1]
+    true = truth[v, u]
+    # along the line of sight: the pixel's true point is where the surface is seen
+    return cloud.X[:, 2] - true[:, 2], cloud.sigma[:, 2], true
+
+
+def test_heights_are_as_good_as_their_sigma_says(pair):
+    _, truth, found = pair
+    e, s, _ = errors(found.cloud, truth[0])
+    assert len(e) > 1200
+    outlier = np.abs(e) > 10 * s
+    assert outlier.mean() < 0.01
+    w = e[~outlier] / s[~outlier]
+    assert 0.85 < np.sqrt(np.mean(w**2)) < 1.15
+    assert (np.abs(w) < 3).mean() > 0.985
+    assert np.median(s) < 0.1 * 10 * 10 / (F * 2)  # 0.1 pixel of parallax: s·Z/(f·b/Z)
+
+
+def test_matches_are_within_a_fifth_of_a_pixel(pair):
+    views, truth, found = pair
+    e, _, true = errors(found.cloud, truth[0])
+    off = np.linalg.norm(views[1].project(found.cloud.X) - views[1].project(true), axis=1)
+    assert (off < 0.2).mean() > 0.95
+
+
+def test_nothing_is_found_where_there_is_no_texture():
+    blank = lambda s, t: s > 0.5
+    views, truth = photographs(two_shapes(blank=blank), [(-1.0, 0, 10), (1.0, 0, 10)])
+    bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
+    cloud = reconstruct(views, bounds, {0: [1]}, step=4).cloud
+    assert len(cloud) > 300
+    on_ground = cloud.X[cloud.X[:, 2] < 1.5]
+    assert (on_ground[:, 0] > 0.5 + 9 * 10 / F).sum() == 0  # but for the windows at its edge
+    e, s, _ = errors(cloud, truth[0])
+    assert (np.abs(e) > 10 * s).mean() < 0.02
+
+
+def test_bounds_are_found_without_heights():
+    views, truth = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
+    X = truth[0][::20, ::20].reshape(-1, 3)
+    bounds, told = find_bounds(views, X)
+    q = 1 / np.linalg.norm(truth[0].reshape(-1, 3) - views[0].X0, axis=1)
+    assert not told and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
+    bounds, told = find_bounds(views, NONE)
+    assert "--zmin" in told[0] and bounds[0].q[0] < q.min() and q.max() < bounds[0].q[1]
+
+
+def test_the_bounds_of_heights_are_those_along_the_ray(pair):
+    views, _, _ = pair
+    uv = np.array([[10.0, 20], [200, 100]])
+    q = views[0].bounds(uv, -1.0, 2.0)
+    for k, Z in enumerate((-1.0, 2.0)):
+        np.testing.assert_allclose(views[0].points(uv, q[:, k])[:, 2], Z, atol=1e-9)
+
+
+def test_the_plane_carries_windows_from_one_image_to_the_other(pair):
+    views, _, _ = pair
+    X = np.array([[0.3, 0.4, 0.5], [1.0, -2.0, 0.1]])
+    normal = np.array([[0.1, 0.2, 1.0], [0.0, 0.0, 1.0]])
+    J, K = (view.derivative(X) for view in views)
+    T = steps_on_plane(J, normal)
+    np.testing.assert_allclose(np.einsum("ni,nij->nj", normal, T), 0, atol=1e-12)
+    step = 1e-4 * np.array([0.6, -0.8])
+    there = X + T @ step
+    np.testing.assert_allclose(views[0].project(there) - views[0].project(X), [step] * 2,
+                               atol=1e-8)  # fmt: skip
+    moved = views[1].project(there) - views[1].project(X)
+    np.testing.assert_allclose(moved, K @ T @ step, atol=1e-8)
+    d = line_of_sight(J)
+    away = (X - views[0].X0) / np.linalg.norm(X - views[0].X0, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs(np.sum(d * away, 1)), 1, atol=1e-9)
+
+
+def test_correlation_along_a_strip_is_that_of_every_window():
+    rng = np.random.default_rng(0)
+    template, strip = rng.random((2, 5, 5)), rng.random((2, 5, 12))
+    strip[1, :, 9:] = np.nan
+    rho = slide(template.astype(np.float32), strip.astype(np.float32))
+    for n in range(2):
+        for k in range(8):
+            window = strip[n, :, k : k + 5]
+            if np.isnan(window).any():
+                assert np.isnan(rho[n, k])
+            else:
+                expected = np.corrcoef(template[n].ravel(), window.ravel())[0, 1]
+                np.testing.assert_allclose(rho[n, k], expected, atol=1e-5)
+    peak, best, second = find_peaks(np.array([[0.1, 0.5, 0.9, 0.5, 0.1, 0.3], [np.nan] * 6]))
+    np.testing.assert_allclose([peak[0], best[0], second[0]], [0.9, 2.0, 0.3])
+    assert np.isnan([peak[1], best[1], second[1]]).all()
+
+
+def test_hidden_points_are_not_found(pair):
+    """Ground that the roof hides from the second photograph."""
+    views, truth, found = pair
+    cloud = found.cloud
+    e, s, true = errors(cloud, truth[0])
+    uv = views[1].project(true)
+    inside = is_inside(views[1], uv)
+    v, u = np.rint(np.where(inside[:, None], uv, 0)).astype(int).T[::-1]
+    hidden = inside & (np.linalg.norm(truth[1][v, u] - true, axis=1) > 0.5)
+    assert hidden.sum() < 0.005 * len(cloud)
+    np.testing.assert_allclose(true[true[:, 2] < 1.9][:, 2],
+                               hills(*true[true[:, 2] < 1.9].T[:2]), atol=1e-6)  # fmt: skip
+
+
+def test_dense_matching_finds_most_pixels_with_honest_sigma(pair):
+    views, truth, _ = pair
+    bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
+    cloud = reconstruct(views, bounds, {0: [1]}, dense=True).cloud
+    e, s, _ = errors(cloud, truth[0])
+    seen = is_inside(views[1], views[1].project(truth[0].reshape(-1, 3))).sum()
+    assert len(cloud) > 0.85 * seen
+    w = e / s
+    assert (np.abs(w) > 10).mean() < 0.01
+    assert 0.8 < np.sqrt(np.mean(w[np.abs(w) < 10] ** 2)) < 1.2
+    off = np.linalg.norm(views[1].project(cloud.X) - views[1].project(truth[0][
+        cloud.uv[:, 1].astype(int), cloud.uv[:, 0].astype(int)]), axis=1)  # fmt: skip
+    assert (off < 0.25).mean() > 0.95
+
+
+def test_rectified_points_are_where_they_are(pair):
+    views, truth, _ = pair
+    X = truth[0][::16, ::16].reshape(-1, 3)
+    found, span = present(rectify(*views, X))
+    place, d = found.places(X), found.disparity(X)
+    assert (d > 0).all() and (d < span).all()
+    np.testing.assert_allclose(found.points(place, d), X, atol=1e-9)
+    # the same point is as bright in both rectified images, on one row
+    row, column = np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)
+    assert present(rectify(*views[::-1], X))[0].base == found.base
+    assert np.isfinite(found.left[row, column]).all()
+
+
+def test_one_camera_before_the_other_cannot_be_rectified(pair):
+    views, truth, _ = pair
+    below = FrameView("below", views[0].grey, CAMERA, views[0].X0 - [0, 0, 2], np.eye(3))
+    assert rectify(views[0], below, truth[0].reshape(-1, 3)) is None
+
+
+def test_pairs_that_disagree_are_left_out_where_no_third_decides():
+    q = np.array([[1.0, 1.0, 1.0, np.nan], [1.01, 2.0, 2.0, 1.5], [np.nan, np.nan, 1.01, np.nan]])
+    sigma = np.full(q.shape, 0.01)
+    mean, variance, number = combine(q, sigma)
+    np.testing.assert_allclose(mean, [1.005, np.nan, 1.005, 1.5])
+    assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
+    # one pair: its σ; of two, the half that is the base image's stays
+    np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])

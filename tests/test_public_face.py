@@ -1,0 +1,78 @@
+"""Every command is a function of `jaxbundle` of the same name, which takes what the command takes
+and returns a result."""
+
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+import stubs
+
+import jaxbundle
+from jaxbundle import cli
+
+ROOT = Path(__file__).parents[1]
+PROJECT = ROOT / "examples" / "convergent4" / "project.toml"
+SHELL_ONLY = {"completion"}
+"""A script for a shell has no meaning in Python."""
+PRESENTATION = {
+    "brief", "browser", "csv", "force", "html", "json", "out", "plot", "plots", "quiet", "save",
+    "verbose",
+}  # fmt: skip
+"""Options about files and screen, for which a result has methods."""
+
+
+@pytest.mark.parametrize("command", sorted({*cli.COMMANDS} - SHELL_ONLY - {"pushbroom"}))
+def test_every_command_is_a_function(command):
+    function = getattr(jaxbundle, command)
+    assert inspect.isfunction(function)
+    assert command in jaxbundle.__all__
+    assert "return" in inspect.get_annotations(function)
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["camera", "cloud", "explore", "orient", "plan", "reconstruct", "stability", "surface"],
+)
+def test_a_function_takes_the_options_of_its_command(command):
+    module = importlib.import_module(f"jaxbundle.cli.{command}")
+    called = getattr(module, command, None) or getattr(module, f"{command}_command")
+    options = {*inspect.signature(called).parameters} - PRESENTATION
+    # the settings of a project have one name in all functions; the rest is about the output
+    names = {"set": "overrides", "files": {"camera": "camera"}.get(command, "calibrations"),
+             "file": "cloud", "input": "network" if command == "orient" else "input",
+             "dsm": "size" if command == "cloud" else "dsm"}  # fmt: skip
+    expected = {names.get(name, name) for name in options}
+    if command == "reconstruct":
+        expected -= {"surface"}  # another function
+    assert expected <= {*inspect.signature(getattr(jaxbundle, command)).parameters}
+
+
+@pytest.mark.parametrize(
+    "command", ["locate", "project", "correct", "simulate", "accuracy", "refine"]
+)
+def test_every_command_of_line_scanners_is_a_function(command):
+    function = getattr(jaxbundle.pushbroom, command)
+    assert inspect.isfunction(function)
+    assert command in jaxbundle.pushbroom.__all__
+
+
+def test_functions_take_the_path_of_a_network_with_the_settings_of_its_command():
+    given = jaxbundle.read_network(PROJECT, overrides=["sigma_image=0.5"])
+    for path in (PROJECT, str(PROJECT)):
+        found = jaxbundle.adjust(path, overrides=["sigma_image=0.5"])
+        assert found.sigma0 == jaxbundle.adjust(given).sigma0
+    assert len(jaxbundle.orient(PROJECT).network.images) == 4
+    with pytest.raises(jaxbundle.InputError, match="overrides.*of a file"):
+        jaxbundle.adjust(given, overrides=["sigma_image=0.5"])
+    with pytest.raises(jaxbundle.InputError, match="nowhere.toml: no such file"):
+        jaxbundle.orient("nowhere.toml")
+    with pytest.raises(jaxbundle.InputError, match="network must be a Network or the path"):
+        jaxbundle.adjust(3)
+
+
+@pytest.mark.parametrize("package", stubs.PACKAGES)
+def test_types_for_editors_are_those_of_the_names(package):
+    assert stubs.path_of(package).read_text() == stubs.stub_of(package), "run `make stubs`"
+    for name in importlib.import_module(package).__all__:
+        assert getattr(importlib.import_module(package), name) is not None
