@@ -88,6 +88,14 @@ class WeightedAdjustment:
         """The largest factor."""
         return max(self.factors.values(), default=1.0)
 
+    def __post_init__(self) -> None:
+        # σ estimated from the residuals are not confirmed by them: no χ² test, also not of the
+        # adjustment to control that takes the place of this one
+        if self.adjustment.converged:
+            factors = {f"image points {name}": f for name, f in self.factors.items()}
+            changed = self.adjustment.with_changes(sigma_factors=factors)
+            object.__setattr__(self, "adjustment", changed)
+
 
 def adjust_weighted(
     network: Network,
@@ -265,11 +273,6 @@ def _weight(
     factors = {
         name: float(np.median(total[kinds == k])) for k, name in names.items() if (kinds == k).any()
     }
-    if result.converged:
-        # σ estimated from the residuals are not confirmed by them: no χ² test
-        result = result.with_changes(
-            sigma_factors={f"image points {name}": factor for name, factor in factors.items()}
-        )
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
 
