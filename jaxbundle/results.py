@@ -1,5 +1,6 @@
 """What every result offers, whatever was computed."""
 
+import abc
 import json
 import math
 import os
@@ -45,7 +46,7 @@ class ReportedResult(Protocol):
         ...
 
 
-class ResultMethods:
+class ResultMethods(abc.ABC):
     """Methods of a `ReportedResult` that follow from `__str__` and `to_dict`."""
 
     @property
@@ -57,9 +58,9 @@ class ResultMethods:
         """The result as text."""
         return str(self)
 
+    @abc.abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON."""
-        raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
         """Write the result as JSON; what is not finite is null.

@@ -20,13 +20,18 @@ from jaxbundle.adjustment.far_points import (
     join_legs,
     minimise_at_any_distance,
     minimise_with_infinity,
-    noise_of_rays,
+)
+from jaxbundle.adjustment.likely_causes import (
+    largest_sigma0,
+    likely_causes,
+    name_conventions,
+    noise_factor,
+    sigma0_at_end,
 )
 from jaxbundle.adjustment.minimum import (
     adjusted_cameras,
     inspect_solution,
     is_misjudged,
-    name_inseparable,
     names_of_defects,
     start_with,
     weakness_without_solution,
@@ -36,7 +41,7 @@ from jaxbundle.adjustment.orient import orient, orient_again, screen
 from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect
 from jaxbundle.adjustment.quality.inspection import Inspection
-from jaxbundle.adjustment.quality.misfit import contradicts, doubt_of_robust
+from jaxbundle.adjustment.quality.misfit import doubt_of_robust
 from jaxbundle.adjustment.readjust import (
     Minimise,
     adjust_robustly,
@@ -60,18 +65,14 @@ from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import UNIT, Network, Observations, Points
+from jaxbundle.network.tables import Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
-    name_lengths,
     name_pixels,
-    name_sigma_unit,
     name_unit_of_positions,
 )
-from jaxbundle.orientation.angle_units import name_angle_unit
-from jaxbundle.orientation.conventions import name_image_convention, name_image_extent
-from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL, name_contradiction
+from jaxbundle.orientation.conventions import name_image_extent
+from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
 from jaxbundle.orientation.network import Oriented, lacks_start_values, without_placeholders
-from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.types import AnyArray, Progress, present
 
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
@@ -80,20 +81,8 @@ UNNAMED = ("a combination of unknowns that spreads over many of them",)
 
 @dataclasses.dataclass(frozen=True)
 class RoundSettings:
-    """When the rounds of an adjustment look for causes, exclude and bring back.
+    """When the rounds of an adjustment exclude and bring back.
 
-    - `max_sigma0`: σ0 above which the fit is called bad, and the largest by which the a priori σ
-      of rays are multiplied where points are judged: what is beyond comes from blunders, a wrong
-      camera, unit or axis, not from the rays. Smaller: causes are named for networks that only
-      have optimistic σ; larger: a mirrored image of a nearly plane object, which fits almost as
-      well, is not looked for.
-    - `max_ray_misfit`: radians, RMS; takes the place of `max_sigma0` where σ are only units of
-      weight: a pixel of cameras with 1000 pixels in the principal distance. A search that finds
-      nothing costs time only.
-    - `max_start_misfit`: radians, RMS of the residuals of the start values: no start values in the
-      right convention predict image points so badly that an adjustment from them settles by
-      itself. 0.1 is 6°. Smaller: rough start values are suspected of another convention; larger:
-      a mirrored network that settles is not named.
     - `evaluations_before_look`: evaluations before points that rays may not determine are looked
       for: the images are then nearly where they end. More: such points drift away meanwhile and
       slow the iterations; fewer: images that still move make points look weak that are not.
@@ -102,9 +91,6 @@ class RoundSettings:
       warning.
     """
 
-    max_sigma0: float = 5.0
-    max_ray_misfit: float = 1e-3
-    max_start_misfit: float = 0.1
     evaluations_before_look: int = 6
     max_retries: int = 5
 
@@ -187,7 +173,7 @@ def adjust(
     )
     options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
     try_again = partial(_try_mirrored, reduction, options)
-    mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, _largest_sigma0(given))
+    mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
     oriented = None
     if lacks_start_values(given):
         try:
@@ -220,16 +206,16 @@ def adjust(
         if eliminate:
             found.eliminate_parameters(again, critical_t)
     result = found.adjustment(checked)
-    sigma0 = _sigma0(found.problem, found.minimum) if found.inspection else None
+    sigma0 = sigma0_at_end(found.problem, found.minimum) if found.inspection else None
     if found.inspection:
         result = result.with_changes(
             findings=(*result.findings, *_compare_with_start(given, result))
         )
-    misfit = sigma0 is None or sigma0 > _largest_sigma0(given)
+    misfit = sigma0 is None or sigma0 > largest_sigma0(given)
     # The causes named so far are guesses from the start values, which fit a mirrored network as
     # well as a true one: only adjusting the mirror image shows it. It costs a second adjustment,
     # so it is tried last, and only when nothing simpler explains the misfit.
-    if misfit and not also and not _name_conventions(problem, minimum, found.inspection):
+    if misfit and not also and not name_conventions(problem, minimum, found.inspection):
         if mirrored := mirror(sigma0):
             result = result.with_changes(findings=(mirrored,))
     return result
@@ -254,7 +240,7 @@ def _try_mirrored(
         network, outliers=False
     )
     solved = inspect_solution(with_factor(problem), minimum)
-    return _sigma0(problem, minimum) if solved else None
+    return sigma0_at_end(problem, minimum) if solved else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,7 +292,7 @@ class _FirstMinimum:
             # In the first round they may only be weak because others were still missing.
             if rounds:
                 final += gone
-            part, factor = final.leave_out(given), _noise_factor(problem, minimum)
+            part, factor = final.leave_out(given), noise_factor(problem, minimum)
             try:
                 whole = take_back(part, current, problem, minimum.values, factor)
                 whole = check_network(whole)
@@ -369,7 +355,7 @@ class _FirstMinimum:
                 }
                 legs, look = [find_minimum(problem, start, **options)], False
                 left -= int(legs[0].iterations)
-                factor, start = _noise_factor(problem, legs[0]), legs[0].values
+                factor, start = noise_factor(problem, legs[0]), legs[0].values
                 more = find(problem, start, factor)
                 begin = partial(carry, before=problem, values=start)
             if not more:
@@ -379,7 +365,7 @@ class _FirstMinimum:
                     found, last = minimise_at_any_distance(problem, start, make, **options)
                     legs.append(last)
                 minimum = join_legs(legs)
-                factor = _noise_factor(found, minimum)
+                factor = noise_factor(found, minimum)
                 more = find(found, minimum.values, factor)
                 begin = partial(carry, before=found, values=minimum.values)
                 if not more:
@@ -457,7 +443,7 @@ class _AdjustmentState:
             reduction=self.reduction,
             inspection=inspection,
             weakness=weakness_without_solution(problem, minimum) if unnamed else None,
-            findings=_likely_causes(problem, minimum, inspection),
+            findings=likely_causes(problem, minimum, inspection),
             **self.said,
         )
 
@@ -502,82 +488,6 @@ def check_options(
     truth("estimate_components", estimate_components)
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function, but is {show(progress)}")
-
-
-def _likely_causes(
-    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
-) -> tuple[str, ...]:
-    """Likely causes of a missing solution or a bad fit, in words."""
-    network = problem.network
-    tried = int(minimum.iterations)
-    accepted = np.asarray(minimum.history.accepted)[:tried]
-    vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
-    largest = _largest_sigma0(network)
-    if inspection and not (vtpv > largest**2 * problem.counts.redundancy).any():
-        # A good fit may still be wrong: settled far from its start it may be a mirror image, and
-        # σ in a larger unit fit everything.
-        start = np.sqrt(
-            2 * np.asarray(minimum.history.cost)[0] / problem.rows_and_unknowns.observations
-        )
-        far = start * noise_of_rays(problem.network) > ROUNDS.max_start_misfit
-        sigma0 = _sigma0(problem, minimum)
-        poor = sigma0 > 1 and contradicts(sigma0, problem.counts.redundancy)
-        causes = (
-            name_image_convention(network) if far else "",
-            name_image_extent(network) if poor else "",
-            name_sigma_unit(network, sigma0),
-        )
-        return tuple(filter(None, causes))
-    told = any(CONTRADICTORY_CONTROL in line for line in network.warnings)
-    conventions = _name_conventions(problem, minimum, inspection)
-    causes = (
-        *conventions,
-        # Control fits no mirrored image, and its points would be blamed for it: conventions
-        # first.
-        "" if told or conventions else name_contradiction(network),
-        "" if inspection else name_one_place(network),
-        "" if inspection else name_inseparable(problem, minimum),
-    )
-    return tuple(filter(None, causes))
-
-
-def _name_conventions(
-    problem: NetworkProblem, minimum: Minimum, inspection: Inspection | None
-) -> tuple[str, ...]:
-    """Units and conventions in which a badly fitting network would fit, in words."""
-    network = problem.network
-    causes = (
-        name_pixels(network),
-        name_angle_unit(network),
-        *name_lengths(network),
-        name_image_convention(network),
-        name_image_extent(network),
-        name_sigma_unit(network, _sigma0(problem, minimum)) if inspection else "",
-    )
-    return tuple(filter(None, causes))
-
-
-def _largest_sigma0(network: Network) -> float:
-    """The largest σ0 of a network without mistakes; it depends on the unit of weight, if σ is no
-    more than that."""
-    if network.observations.sigma_origin != UNIT:
-        return ROUNDS.max_sigma0
-    return ROUNDS.max_ray_misfit / noise_of_rays(network)
-
-
-def _noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
-    """By what the σ of rays are multiplied; a larger σ0 is that of blunders or a wrong camera, not
-    of the rays."""
-    return min(_sigma0(problem, minimum), _largest_sigma0(problem.network))
-
-
-def _sigma0(problem: NetworkProblem, minimum: Minimum) -> float:
-    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy."""
-    cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
-    accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
-    vtpv, redundancy = 2 * cost[accepted][-1:], problem.counts.redundancy
-    known = len(vtpv) and redundancy > 0 and np.isfinite(vtpv[0])
-    return float(np.sqrt(vtpv[0] / redundancy)) if known else 1.0
 
 
 def _place(found: Oriented) -> Oriented:

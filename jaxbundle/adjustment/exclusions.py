@@ -39,10 +39,7 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
-from jaxbundle.orientation.network import (
-    explain_missing,
-    note_missing,
-)
+from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.sights import Sights, sights
 from jaxbundle.types import AnyArray
 

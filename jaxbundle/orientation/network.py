@@ -15,8 +15,7 @@ from which little grows is replaced by the next.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -28,14 +27,13 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.sightings import keep_images, keep_points, leave_out
-from jaxbundle.network.tables import LeftOut, Network
+from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
 from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
 from jaxbundle.orientation.conventions import name_image_extent
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.growth import (
-    RESECTION_DEMANDS,
     Improve,
     Model,
     are_controlled,
@@ -45,10 +43,11 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
+from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
-from jaxbundle.orientation.sights import TOLERANCE, Sights, in_plane, sights
+from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
+from jaxbundle.orientation.start_pairs import all_pairs, good_pairs
 from jaxbundle.results import ResultMethods
-from jaxbundle.types import Index
 
 CONTRADICTION = "that contradict the start values"
 
@@ -318,7 +317,7 @@ def _grow_from_a_pair(
     shared = np.bincount(seen.image, of_new[seen.point], minlength=seen.images)
     old = (shared >= settings.min_common_points) & model.placed
     best, most = None, 0
-    for image, other, first, second, b in _good_pairs(seen, new | old, old, linked, settings):
+    for image, other, first, second, b in good_pairs(seen, new | old, old, linked, settings):
         part = Model.empty(seen)
         part.place(image, np.zeros(3), first)
         part.place(other, b, second)
@@ -330,97 +329,6 @@ def _grow_from_a_pair(
         if most >= settings.sufficient_share * rows.sum():
             break
     return best
-
-
-def _good_pairs(
-    seen: Sights,
-    candidates: Bool[np.ndarray, " images"],
-    old: Bool[np.ndarray, " images"],
-    linked: bool,
-    settings: StartValueSettings,
-) -> Iterator[
-    tuple[
-        Index,
-        Index,
-        Float[np.ndarray, "3 3"],
-        Float[np.ndarray, "3 3"],
-        Float[np.ndarray, "3"],
-    ]
-]:
-    """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
-    of an old image and another."""
-    pairs, common = _pairs_in_common(seen, candidates, old, linked, settings)
-    if not len(pairs):
-        return
-    turned = [_common_points(seen, *pair) for pair in pairs]
-    enough = [len(xy) >= settings.min_common_points for *_, xy, _ in turned]
-    turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
-    if not turned:
-        return
-    R, Q, xy, other_xy = zip(*turned)
-    tolerance = seen.tolerance[pairs].mean(1)
-    M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
-    # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
-    # `good_angle` images differ so much that many points are seen in one only.
-    worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
-    usable = (part >= settings.agreeing_share) & (angle > RESECTION_DEMANDS.angle)
-    for k in [k for k in np.argsort(-worth) if usable[k]][: settings.max_seeds]:
-        yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
-
-
-def _pairs_in_common(
-    seen: Sights,
-    candidates: Bool[np.ndarray, " images"],
-    old: Bool[np.ndarray, " images"],
-    linked: bool,
-    settings: StartValueSettings,
-) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
-    """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
-    others with enough points and wider bases."""
-    pairs, number = _all_pairs(seen, candidates)
-    use = (number >= settings.min_common_points) & (
-        (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
-    )
-    pairs, number = pairs[use], number[use]
-    order = np.argsort(-number, kind="stable")
-    # The pairs with the most points often have the shortest bases. So half of the pairs are spread
-    # over all that have 0.3 of the most points: with 60 % overlap along a strip, the next image but
-    # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
-    enough = order[number[order] >= 0.3 * number.max(initial=0)]
-    half = settings.max_pairs // 2
-    spread = many.spread(len(enough), settings.max_pairs - half)
-    chosen = np.unique(np.concatenate([order[:half], enough[spread]]))
-    return pairs[chosen], number[chosen]
-
-
-def _all_pairs(
-    seen: Sights, candidates: Bool[np.ndarray, " images"]
-) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
-    """Pairs of these images that share points [pairs, 2], and how many."""
-    from scipy.sparse import coo_array, triu
-
-    rows = candidates[seen.image]
-    shape = (seen.images, seen.points)
-    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
-    sees = sees.tocsr()
-    common = triu(sees @ sees.T, k=1)
-    return np.stack([common.row, common.col], 1), common.data
-
-
-def _common_points(
-    seen: Sights, image: Index, other: Index
-) -> tuple[
-    Float[np.ndarray, "3 3"],
-    Float[np.ndarray, "3 3"],
-    Float[np.ndarray, "common 2"],
-    Float[np.ndarray, "common 2"],
-]:
-    """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
-    one, two = seen.rows_of(image), seen.rows_of(other)
-    _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
-    (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
-    there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
-    return R, Q, xy[there], other_xy[there]
 
 
 def _result(
@@ -461,67 +369,11 @@ def _result(
     return Oriented(network, frame, *reasons, names)
 
 
-def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
-    """The network with notes that images or points were left out, by name with the reasons."""
-    if not reasons:
-        return network
-    names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
-    groups = {
-        why: tuple(id for id, reason in reasons.items() if reason == why)
-        for why in dict.fromkeys(reasons.values())
-    }
-    network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
-    notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
-    return network.replace(left_out=(*network.left_out, *notes))
-
-
 def _are_gross(
     seen: Sights, model: Model, settings: StartValueSettings
 ) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
     return misclosures(seen, model) > settings.gross_ratio * seen.tolerance[seen.image]
-
-
-def explain_missing(
-    network: Network,
-    seen: Sights,
-    model: Model,
-    known: Bool[np.ndarray, " points"],
-    settings: StartValueSettings = DEFAULTS,
-) -> tuple[dict[str, str], dict[str, str]]:
-    """By id, why images are not placed, and why points are not `known`."""
-    rays = np.bincount(seen.image, minlength=seen.images)
-    of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
-    images = {}
-    for image in np.flatnonzero(~model.placed):
-        if of_known[image] < settings.min_points:
-            why = (
-                f"it sees {of_known[image]} known points of {rays[image]}; "
-                f"{settings.min_points} are needed"
-            )
-        else:
-            why = (
-                f"fewer than {settings.agreeing_share:.0%} of the {of_known[image]} known "
-                "points it sees agree on a pose: look for wrong point numbers, or a wrong "
-                "principal distance"
-            )
-        images[network.images.id[image]] = why
-    placed = model.placed[seen.image]
-    by_point = np.bincount(seen.point[placed], minlength=seen.points)
-    outside = np.ones(len(network.observations), bool)
-    outside[seen.row] = False
-    no_ray = np.bincount(network.observations.point[outside], minlength=seen.points)
-    points = {}
-    for point in np.flatnonzero(~known):
-        if by_point[point] < 2 and no_ray[point]:
-            number = count(no_ray[point], "image point")
-            why = f"{number} of it outside the range of the camera model, where there are no rays"
-        elif by_point[point] < 2:
-            why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
-        else:
-            why = f"its {by_point[point]} rays do not intersect, or are parallel"
-        points[network.points.id[point]] = why
-    return images, points
 
 
 def _why_nothing(network: Network, seen: Sights, settings: StartValueSettings) -> str:
@@ -535,7 +387,7 @@ def _why_nothing(network: Network, seen: Sights, settings: StartValueSettings) -
         f"{network.images.id[best]!r} at most), and "
     )
     one, other, most = 0, 0, 0
-    pairs, number = _all_pairs(seen, np.ones(seen.images, bool))
+    pairs, number = all_pairs(seen, np.ones(seen.images, bool))
     if len(number):
         most = int(number.max())
         one, other = pairs[number.argmax()]

@@ -1,0 +1,70 @@
+"""Why images and points have no start values, and notes of what is left out for it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.tables import LeftOut, Network
+from jaxbundle.orientation.growth import (
+    Model,
+)
+from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
+from jaxbundle.orientation.sights import Sights
+
+
+def note_missing(network: Network, thing: str, reasons: Mapping[str, str], what: str) -> Network:
+    """The network with notes that images or points were left out, by name with the reasons."""
+    if not reasons:
+        return network
+    names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
+    groups = {
+        why: tuple(id for id, reason in reasons.items() if reason == why)
+        for why in dict.fromkeys(reasons.values())
+    }
+    network = network.note(f"left out {count(len(reasons), thing)} {what}: {names}")
+    notes = (LeftOut(thing, ids, f"{what}: {why}") for why, ids in groups.items())
+    return network.replace(left_out=(*network.left_out, *notes))
+
+
+def explain_missing(
+    network: Network,
+    seen: Sights,
+    model: Model,
+    known: Bool[np.ndarray, " points"],
+    settings: StartValueSettings = DEFAULTS,
+) -> tuple[dict[str, str], dict[str, str]]:
+    """By id, why images are not placed, and why points are not `known`."""
+    rays = np.bincount(seen.image, minlength=seen.images)
+    of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
+    images = {}
+    for image in np.flatnonzero(~model.placed):
+        if of_known[image] < settings.min_points:
+            why = (
+                f"it sees {of_known[image]} known points of {rays[image]}; "
+                f"{settings.min_points} are needed"
+            )
+        else:
+            why = (
+                f"fewer than {settings.agreeing_share:.0%} of the {of_known[image]} known "
+                "points it sees agree on a pose: look for wrong point numbers, or a wrong "
+                "principal distance"
+            )
+        images[network.images.id[image]] = why
+    placed = model.placed[seen.image]
+    by_point = np.bincount(seen.point[placed], minlength=seen.points)
+    outside = np.ones(len(network.observations), bool)
+    outside[seen.row] = False
+    no_ray = np.bincount(network.observations.point[outside], minlength=seen.points)
+    points = {}
+    for point in np.flatnonzero(~known):
+        if by_point[point] < 2 and no_ray[point]:
+            number = count(no_ray[point], "image point")
+            why = f"{number} of it outside the range of the camera model, where there are no rays"
+        elif by_point[point] < 2:
+            why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
+        else:
+            why = f"its {by_point[point]} rays do not intersect, or are parallel"
+        points[network.points.id[point]] = why
+    return images, points

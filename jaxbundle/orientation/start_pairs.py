@@ -1,0 +1,106 @@
+"""The pair of images from which a model starts: many common points, good intersection angles."""
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.orientation import many
+from jaxbundle.orientation.growth import (
+    RESECTION_DEMANDS,
+)
+from jaxbundle.orientation.settings import StartValueSettings
+from jaxbundle.orientation.sights import Sights, in_plane
+from jaxbundle.types import Index
+
+
+def good_pairs(
+    seen: Sights,
+    candidates: Bool[np.ndarray, " images"],
+    old: Bool[np.ndarray, " images"],
+    linked: bool,
+    settings: StartValueSettings,
+) -> Iterator[
+    tuple[
+        Index,
+        Index,
+        Float[np.ndarray, "3 3"],
+        Float[np.ndarray, "3 3"],
+        Float[np.ndarray, "3"],
+    ]
+]:
+    """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
+    of an old image and another."""
+    pairs, common = _pairs_in_common(seen, candidates, old, linked, settings)
+    if not len(pairs):
+        return
+    turned = [_common_points(seen, *pair) for pair in pairs]
+    enough = [len(xy) >= settings.min_common_points for *_, xy, _ in turned]
+    turned, pairs, common = list(itertools.compress(turned, enough)), pairs[enough], common[enough]
+    if not turned:
+        return
+    R, Q, xy, other_xy = zip(*turned)
+    tolerance = seen.tolerance[pairs].mean(1)
+    M, b, part, angle = many.orient_pairs(xy, other_xy, tolerance)
+    # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
+    # `good_angle` images differ so much that many points are seen in one only.
+    worth = np.sqrt(common) * part * np.minimum(angle, settings.good_angle)
+    usable = (part >= settings.agreeing_share) & (angle > RESECTION_DEMANDS.angle)
+    for k in [k for k in np.argsort(-worth) if usable[k]][: settings.max_seeds]:
+        yield *pairs[k], R[k].T, Q[k].T @ M[k], b[k]
+
+
+def _pairs_in_common(
+    seen: Sights,
+    candidates: Bool[np.ndarray, " images"],
+    old: Bool[np.ndarray, " images"],
+    linked: bool,
+    settings: StartValueSettings,
+) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
+    """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
+    others with enough points and wider bases."""
+    pairs, number = all_pairs(seen, candidates)
+    use = (number >= settings.min_common_points) & (
+        (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
+    )
+    pairs, number = pairs[use], number[use]
+    order = np.argsort(-number, kind="stable")
+    # The pairs with the most points often have the shortest bases. So half of the pairs are spread
+    # over all that have 0.3 of the most points: with 60 % overlap along a strip, the next image but
+    # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
+    enough = order[number[order] >= 0.3 * number.max(initial=0)]
+    half = settings.max_pairs // 2
+    spread = many.spread(len(enough), settings.max_pairs - half)
+    chosen = np.unique(np.concatenate([order[:half], enough[spread]]))
+    return pairs[chosen], number[chosen]
+
+
+def all_pairs(
+    seen: Sights, candidates: Bool[np.ndarray, " images"]
+) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
+    """Pairs of these images that share points [pairs, 2], and how many."""
+    from scipy.sparse import coo_array, triu
+
+    rows = candidates[seen.image]
+    shape = (seen.images, seen.points)
+    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
+    sees = sees.tocsr()
+    common = triu(sees @ sees.T, k=1)
+    return np.stack([common.row, common.col], 1), common.data
+
+
+def _common_points(
+    seen: Sights, image: Index, other: Index
+) -> tuple[
+    Float[np.ndarray, "3 3"],
+    Float[np.ndarray, "3 3"],
+    Float[np.ndarray, "common 2"],
+    Float[np.ndarray, "common 2"],
+]:
+    """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
+    one, two = seen.rows_of(image), seen.rows_of(other)
+    _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
+    (R, xy), (Q, other_xy) = in_plane(seen.ray[one][k]), in_plane(seen.ray[two][l])
+    there = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
+    return R, Q, xy[there], other_xy[there]
