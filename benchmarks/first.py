@@ -2,10 +2,10 @@
 
     python benchmarks/first.py [--input PROJECT] [--repeat N] [--json FILE]
 
-`jaxbundle adjust PROJECT` in processes of their own. The first finds an empty (temporary) folder of
-programs; the second, and a third on a pseudo-terminal, find what the first left there. The first
-two are run with `--quiet`, which prints the report alone; the third shows its progress too, as for a
-person.
+`jaxbundle adjust PROJECT` in processes of their own. The first finds an empty (temporary) folder
+of programs; the second, and a third on a pseudo-terminal, find what the first left there. The first
+two are run with `--quiet`, which prints the report alone; the third shows its progress too, as for
+a person.
 Reported are the seconds from the start of a process to its end, on the clock and of the processor,
 the best of the rounds, beside those of a process that only imports JAX. The limits for a small
 network are multiples of its processor time, which depend little on the machine: what was measured
