@@ -28,7 +28,7 @@ from photograph_sets import Shot, arc, camera, write
 
 import jaxbundle
 from jaxbundle.orientation import many
-from jaxbundle.planning.render import Rendered, Scene, Sensor, camera_rays
+from jaxbundle.planning.rendering import Rendered, Scene, Sensor, camera_rays
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.planning.texture import Texture

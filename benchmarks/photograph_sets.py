@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.orientation import many
-from jaxbundle.planning.render import Rendered, Scene, Sensor, render
+from jaxbundle.planning.rendering import Rendered, Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.planning.texture import Texture

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 
 import jaxbundle
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.rendering import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.correlation import correlate, make_pyramid
-from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.segments import segments, windows
 from jaxbundle.surfaces.views import FrameView
 
@@ -85,7 +85,7 @@ def main():
     bounds, _ = find_bounds(views, np.zeros((0, 3)), (-1.5, 1.5))
     for step, name in ((20, "compiling"), (int(np.sqrt(SIZE[0] * SIZE[1] / number)), "")):
         begin = time.perf_counter()
-        found = reconstruct(views, bounds, {0: [1, 2]}, step=step)
+        found = reconstruct_surface(views, bounds, {0: [1, 2]}, step=step)
         taken = time.perf_counter() - begin
         if not name:
             tried = found.bases[0]["points"]

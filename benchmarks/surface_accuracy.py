@@ -14,10 +14,10 @@ import time
 import numpy as np
 
 import jaxbundle
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.rendering import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle, Shape
 from jaxbundle.planning.texture import Texture
-from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.views import FrameView
 
 SIZE, F = (480, 360), 480.0
@@ -104,7 +104,7 @@ def row(views, truth, **options):
     bounds, _ = find_bounds(views, np.zeros((0, 3)), (-1.5, 3.0))
     partners = {0: list(range(1, len(views)))}
     begin = time.perf_counter()
-    found = reconstruct(views, bounds, partners, **options)
+    found = reconstruct_surface(views, bounds, partners, **options)
     taken = time.perf_counter() - begin
     miss, w = figures(views, truth[0], found.cloud)
     good = miss < OUTLIER

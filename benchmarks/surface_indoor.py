@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 
 import jaxbundle
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.rendering import Scene, Sensor, render
 from jaxbundle.planning.shapes import Rectangle
 from jaxbundle.planning.texture import Texture
-from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.views import FrameView
 
 BASE, DEPTH = 0.2, 5.0
@@ -111,7 +111,7 @@ def main():
     begin = time.perf_counter()
     bounds, _ = find_bounds(views, np.zeros((0, 3)))
     options = {"step": 4} if given.sparse else {"dense": True}
-    cloud = reconstruct(views, bounds, {0: [1]}, **options).cloud
+    cloud = reconstruct_surface(views, bounds, {0: [1]}, **options).cloud
     taken = time.perf_counter() - begin
     v, u = cloud.uv.astype(int).T[::-1]
     error = np.full(true.shape, np.nan)

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
-from jaxbundle.planning.render import Scene, Sensor, first_hits, render_rays
+from jaxbundle.planning.rendering import Scene, Sensor, first_hits, render_rays
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom.flight import Flight, true_image
@@ -28,7 +28,7 @@ from jaxbundle.pushbroom.scanner import FocalLine
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.surfaces.dsm import make_dsm
 from jaxbundle.surfaces.ground import RpcView, neighbourhood
-from jaxbundle.surfaces.reconstruct import ground_bounds, reconstruct
+from jaxbundle.surfaces.reconstruct import ground_bounds, reconstruct_surface
 from jaxbundle.surfaces.relative import align_all
 
 GSD, ORBIT, SPEED = 0.5, 650e3, 6.9e3
@@ -136,7 +136,7 @@ def main():
     bounds, _ = ground_bounds(views, HEIGHTS)
     said = align_all(views, bounds)
     options = {"step": 2} if given.sparse else {"dense": True}
-    cloud = reconstruct(views, bounds, {0: [1]}, **options).cloud
+    cloud = reconstruct_surface(views, bounds, {0: [1]}, **options).cloud
     taken = time.perf_counter() - begin
     dsm = make_dsm(cloud, CELL)
     x, y = dsm.centres()

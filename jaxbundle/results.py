@@ -7,10 +7,15 @@ import os
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import temporary
+
+NO_UNITS: Mapping[str, str] = MappingProxyType({})
 
 
 @runtime_checkable
@@ -78,6 +83,18 @@ class ResultMethods(abc.ABC):
         return f"<pre>{escape(str(self))}</pre>"
 
 
+class TableMethods(ResultMethods):
+    """A result with one table."""
+
+    @abc.abstractmethod
+    def table(self) -> Mapping[str, np.ndarray]:
+        """Columns by name."""
+
+    def to_pandas(self) -> Any:
+        """`table` as a pandas data frame (extra `tables`)."""
+        return data_frame(self.table())
+
+
 def finite(value: Any) -> Any:
     """A value with None for NaN and infinity, which do not exist in JSON."""
     if isinstance(value, Mapping):
@@ -92,3 +109,23 @@ def finite(value: Any) -> Any:
 def rows_of(table: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rows of a table of columns (arrays), each by the names of the columns."""
     return finite([dict(zip(table, row)) for row in zip(*(c.tolist() for c in table.values()))])
+
+
+def data_frame(
+    columns: Mapping[str, np.ndarray], units: Mapping[str, str] = NO_UNITS, *, heads: bool = False
+) -> Any:
+    """Columns as a pandas data frame. The units of columns are in its `attrs["units"]`, so that
+    columns keep their names; `heads`: names and units are the two levels of its columns.
+
+    **Raises:** `ImportError` without pandas (extra `tables`)."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+    frame = pandas.DataFrame(columns)
+    if heads:
+        pairs = [(name, units.get(name, "")) for name in columns]
+        frame.columns = pandas.MultiIndex.from_tuples(pairs, names=("quantity", "unit"))
+    elif units:
+        frame.attrs["units"] = dict(units)
+    return frame

@@ -5,7 +5,11 @@ import importlib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("jaxbundle", "jaxbundle.io", "jaxbundle.pushbroom")
+PACKAGES = sorted(
+    ".".join(path.parent.relative_to(ROOT).parts)
+    for path in (ROOT / "jaxbundle").rglob("__init__.py")
+    if "_HOME = {" in path.read_text()
+)
 HEAD = "# Written by `make stubs` from the names in __init__.py.\n# ruff: noqa: I001\n"
 
 

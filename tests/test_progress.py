@@ -15,7 +15,7 @@ from jaxbundle.calibration.choice import compare_models
 from jaxbundle.io.rasters.correction import write_corrected
 from jaxbundle.measure.views import measure_boards
 from jaxbundle.reconstruction.reconstruct import reconstruct
-from jaxbundle.surfaces.reconstruct import reconstruct as reconstruct_surface
+from jaxbundle.surfaces.reconstruct import reconstruct_surface
 
 LONG = [
     jaxbundle.adjust, jaxbundle.calibrate, jaxbundle.calibrate_cameras, jaxbundle.calibrate_batch,

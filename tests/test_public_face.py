@@ -3,6 +3,8 @@ and returns a result."""
 
 import importlib
 import inspect
+import json
+import re
 from pathlib import Path
 
 import pytest
@@ -76,3 +78,57 @@ def test_types_for_editors_are_those_of_the_names(package):
     assert stubs.path_of(package).read_text() == stubs.stub_of(package), "run `make stubs`"
     for name in importlib.import_module(package).__all__:
         assert getattr(importlib.import_module(package), name) is not None
+
+
+def python_of(path):
+    """The Python of a page, a notebook or a script."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return text
+    if path.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        return "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
+    return "\n".join(re.findall(r"^```(?:python|pycon)\n(.*?)^```$", text, re.M | re.S))
+
+
+def is_public(module, name):
+    """Of the `__all__` of a room, or a room or a namespace of functions itself."""
+    room = importlib.import_module(module)
+    if name == "*" or not name:
+        return hasattr(room, "__all__")
+    return name in getattr(room, "__all__", ()) or inspect.ismodule(getattr(room, name, None))
+
+
+USERS = [
+    *ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("notebooks/*.ipynb"),
+    *ROOT.glob("examples/**/*.py"),
+]  # fmt: skip
+
+
+def test_pages_notebooks_and_examples_use_public_names_only():
+    namespaces = {f"jaxbundle.geometry.{name}" for name in ("affine", "ellipsoid", "similarity")}
+    private, seen = [], 0
+    for path in USERS:
+        text = python_of(path)
+        imports = re.findall(
+            r"^ *(?:>>> )?from (jaxbundle[\w.]*) import (\([^)]*\)|[^\n#]*)", text, re.M
+        )
+        used = [
+            (module, name.split(" as ")[0].strip())
+            for module, names in imports
+            for name in names.strip("()").split(",")
+            if name.strip()
+        ]
+        used += [
+            (f"jaxbundle.{room}", name)
+            for room, name in re.findall(r"\bjaxbundle\.([a-z_]+)\.([A-Za-z]\w*)", text)
+            if (ROOT / "jaxbundle" / room).is_dir()
+        ]
+        seen += len(used)
+        private += [
+            f"{path.name}: {module}.{name}"
+            for module, name in used
+            if module not in namespaces and not is_public(module, name)
+        ]
+    assert seen > 50
+    assert not private

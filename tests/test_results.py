@@ -69,6 +69,7 @@ def test_results_say_and_write_what_they_are(convergent4, tmp_path):
             continue
         if isinstance(result, jaxbundle.BatchRun):
             continue  # its population is in the file
+        assert len(result.to_pandas()) == len(next(iter(result.table().values()))) > 0, name
         path = tmp_path / f"{name}.json"
         result.save(path)
         assert json.loads(path.read_text()) == json.loads(json.dumps(result.to_dict())), name

@@ -48,16 +48,13 @@ def add_contents(text: str) -> str:
 
 
 def names_of(room: types.ModuleType) -> list[str]:
-    """What a module offers: what its `__init__` lists, imports as itself, or defines."""
-    tree = inspect.getsource(room)
-    offered = re.findall(r"\b(\w+) as \1\b", tree)
+    """What a module offers: what its `__all__` lists, or a file without one defines."""
     defined = [
         name
         for name, value in vars(room).items()
         if getattr(value, "__module__", None) == room.__name__ and not name.startswith("_")
     ]
-    listed = getattr(room, "__all__", ())
-    return sorted({*listed, *offered, *defined}, key=str.casefold)
+    return sorted(getattr(room, "__all__", defined), key=str.casefold)
 
 
 def list_names(names: list[str]) -> str:

@@ -11,10 +11,15 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.planning.render import Scene, Sensor, render
-from jaxbundle.planning.shapes import HeightField, Rectangle
-from jaxbundle.planning.stations import stations_looking_at
-from jaxbundle.planning.texture import Texture
+from jaxbundle.planning import (
+    HeightField,
+    Rectangle,
+    Scene,
+    Sensor,
+    Texture,
+    render,
+    stations_looking_at,
+)
 
 SIZE, F = (320, 240), 320.0
 CAMERA = jaxbundle.Camera(

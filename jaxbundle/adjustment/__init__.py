@@ -5,9 +5,15 @@ arrays out); `jaxbundle.adjust` (`adjust.py`) adds start values, the rounds of a
 and the `Adjustment` (`result.py`), whose statistics are in `quality`.
 """
 
-from jaxbundle.adjustment.equations import design_matrix as design_matrix
-from jaxbundle.adjustment.equations import residuals as residuals
-from jaxbundle.adjustment.problem import Counts as Counts
-from jaxbundle.adjustment.problem import NetworkProblem as NetworkProblem
-from jaxbundle.adjustment.problem import make_problem as make_problem
-from jaxbundle.adjustment.solve import solve as solve
+from jaxbundle.adjustment.equations import design_matrix, residuals
+from jaxbundle.adjustment.problem import Counts, NetworkProblem, make_problem
+from jaxbundle.adjustment.solve import solve
+
+__all__ = [
+    "Counts",
+    "NetworkProblem",
+    "design_matrix",
+    "make_problem",
+    "residuals",
+    "solve",
+]

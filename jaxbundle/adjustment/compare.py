@@ -41,11 +41,11 @@ from jaxbundle.geometry.similarity import compose, helmert_point
 from jaxbundle.leastsquares.datum.motions import SEVEN
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.distributions import f_tail, level_of_one
-from jaxbundle.network.columns import count, data_frame, list_some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.report.layout import fixed
-from jaxbundle.results import ResultMethods, rows_of
+from jaxbundle.results import TableMethods, rows_of
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -72,7 +72,7 @@ class Congruency:
 
 @print_anywhere
 @dataclasses.dataclass(frozen=True)
-class AdjustmentComparison(ResultMethods):
+class AdjustmentComparison(TableMethods):
     """Two adjustments compared: one row an unknown that both have.
 
     - `kind` (camera, image, point), `id`, `parameter` and `unit` of every row;
@@ -141,10 +141,6 @@ class AdjustmentComparison(ResultMethods):
             "shared": self.shared,
             "significance": self.significance,
         }
-
-    def to_pandas(self):
-        """The table as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
     def __repr__(self) -> str:
         return (

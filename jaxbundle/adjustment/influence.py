@@ -20,9 +20,8 @@ from jaxbundle.adjustment.sensitivity import inspection_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.response import pull_back
-from jaxbundle.network.columns import data_frame
 from jaxbundle.report.layout import significant, table
-from jaxbundle.results import ResultMethods, rows_of
+from jaxbundle.results import ResultMethods, data_frame, rows_of
 
 
 @print_in_one_screen

@@ -58,13 +58,13 @@ from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.leastsquares.quality.reliability import Reliability
 from jaxbundle.leastsquares.quality.robust import Reweighted, residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed, Suspect
-from jaxbundle.network.columns import data_frame, list_some
+from jaxbundle.network.columns import list_some
 from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import ESTIMATED, UNIT, Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTORY_CONTROL
-from jaxbundle.results import finite
+from jaxbundle.results import data_frame, finite
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -619,7 +619,7 @@ class Adjustment:
         differ from row to row, none."""
         return result_tables.units(self, list(self.table(name)), name)
 
-    def to_pandas(self, name: str, *, units: bool = False):
+    def to_pandas(self, name: str, *, units: bool = False) -> Any:
         """A table as a pandas data frame (extra `tables`). The units of its columns are in
         `attrs["units"]`; with `units` they are the second level of its columns."""
         return data_frame(self.table(name), self.units(name), heads=units)

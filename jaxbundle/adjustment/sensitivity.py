@@ -33,18 +33,17 @@ from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.problem import with_data, with_factor
 from jaxbundle.leastsquares.quality.response import follow
-from jaxbundle.network.columns import data_frame
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER
 from jaxbundle.report.layout import significant, table
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 MEASUREMENTS, TOTAL = "measurements", "total"
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Budget(ResultMethods):
+class Budget(TableMethods):
     """Effects of errors of held quantities on results.
 
     **Fields:** `results` and `causes`, with names and descriptions; `sigma` of every result from
@@ -110,10 +109,6 @@ class Budget(ResultMethods):
 
     def __str__(self) -> str:
         return "\n".join(table(HEADER, self.rows(), "llrrr"))
-
-    def to_pandas(self):
-        """`table` as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
 
 def sensitivity(

@@ -21,8 +21,8 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.io.text.stored_rows import StoredRows
 from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.network.build import make_further
-from jaxbundle.network.columns import data_frame, did_you_mean
-from jaxbundle.results import ResultMethods
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
 SECTIONS = ("rolling_shutter", "rig")
@@ -31,7 +31,7 @@ SECTIONS = ("rolling_shutter", "rig")
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class RigBatch(ResultMethods):
+class RigBatch(TableMethods):
     """The rigs of a batch.
 
     **Fields:** `rows`, as the lines of `jaxbundle batch`: status, and the fields of the JSON of a
@@ -57,9 +57,9 @@ class RigBatch(ResultMethods):
         """The rows, as the lines of `jaxbundle batch`."""
         return {"rigs": list(self.rows)}
 
-    def to_pandas(self) -> Any:
-        """One row per rig as a pandas data frame (extra `tables`)."""
-        return data_frame(self.population().table({}))
+    def table(self) -> dict[str, np.ndarray]:
+        """One row per rig."""
+        return self.population().table({})
 
     def __str__(self) -> str:
         names, counts = np.unique(self.status, return_counts=True)

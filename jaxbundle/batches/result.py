@@ -14,13 +14,12 @@ from jaxbundle.batches.population import Population
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import data_frame
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class BatchCalibration(ResultMethods):
+class BatchCalibration(TableMethods):
     """The cameras of a batch; all values of a camera without a solution are NaN.
 
     **Fields:**
@@ -185,10 +184,6 @@ class BatchCalibration(ResultMethods):
         for k, name in enumerate(self.parameters):
             columns |= {name: self.values[:, k], f"sigma_{name}": self.sigma[:, k]}
         return columns
-
-    def to_pandas(self):
-        """`table` as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
     def _repr_html_(self) -> str:
         """The cameras as a table, unconverged ones first."""

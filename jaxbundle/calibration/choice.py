@@ -50,7 +50,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Difference:
     over_sigma: float
 
 
-class ModelComparison(ResultMethods):
+class ModelComparison(TableMethods):
     """Comparison of models. Printing shows the table and the conclusion.
 
     **Attributes:** `candidates`, in the given order; `failed`: model and reason; `folds`; `views`
@@ -174,6 +174,11 @@ class ModelComparison(ResultMethods):
         from jaxbundle.calibration.report import choice_dict
 
         return choice_dict(self)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a model: columns model, free, sigma0, rms, left_out (pixels), aic, bic."""
+        names = ("model", "free", "sigma0", "rms", "left_out", "aic", "bic")
+        return {name: np.array([getattr(one, name) for one in self.candidates]) for name in names}
 
     def __str__(self) -> str:
         return self.report()

@@ -22,7 +22,7 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @print_anywhere
-class Calibration(ResultMethods):
+class Calibration(TableMethods):
     """A calibrated camera. It prints as a summary; `report()` is the full report.
 
     **Attributes:**
@@ -263,6 +263,15 @@ class Calibration(ResultMethods):
         from jaxbundle.calibration.report import as_dict
 
         return as_dict(self, brief)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a parameter: columns parameter, value, sigma (NaN: not estimated)."""
+        names = list(self.parameters)
+        return {
+            "parameter": np.array(names, dtype=object),
+            "value": np.array([self.parameters[name] for name in names], dtype=float),
+            "sigma": np.array([self.sigma.get(name, np.nan) for name in names], dtype=float),
+        }
 
     def __str__(self) -> str:
         if not self.converged:

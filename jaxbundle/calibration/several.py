@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxbundle.arguments import show
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.result import Calibration
@@ -13,12 +15,12 @@ from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
 
 @dataclasses.dataclass(frozen=True)
-class Calibrations(ResultMethods):
+class Calibrations(TableMethods):
     """Calibrations by the name of the camera, and the rig, if any."""
 
     cameras: dict[str, Calibration]
@@ -34,6 +36,16 @@ class Calibrations(ResultMethods):
         from jaxbundle.calibration.report import calibrations_dict
 
         return calibrations_dict(self, brief)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a parameter of a camera: columns camera, parameter, value, sigma."""
+        tables = {name: one.table() for name, one in self.cameras.items()}
+        rows = [len(columns["value"]) for columns in tables.values()]
+        joined = {
+            column: np.concatenate([columns[column] for columns in tables.values()])
+            for column in ("parameter", "value", "sigma")
+        }
+        return {"camera": np.repeat(np.array([*tables], dtype=object), rows), **joined}
 
     def __str__(self) -> str:
         parts = [] if self.rig is None else [str(self.rig)]

@@ -30,7 +30,6 @@ of Research of the NBS 87, 377-385.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -41,10 +40,9 @@ from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import chi2_tail, f_tail
-from jaxbundle.network.columns import data_frame
 from jaxbundle.network.tables import Camera
 from jaxbundle.report.layout import table
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Homogeneity:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Stability(ResultMethods):
+class Stability(TableMethods):
     """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,
     `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
     `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
@@ -105,10 +103,6 @@ class Stability(ResultMethods):
         }
         known = {name: column for name, column in columns.items() if column is not None}
         return {"parameter": np.array(self.names, dtype=object), **known}
-
-    def to_pandas(self) -> Any:
-        """The table as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
     def __str__(self) -> str:
         """Parameters and tests in lines."""

@@ -22,24 +22,49 @@ Batch them with `jax.vmap`. A model is a `CameraModel`: a user's own, or one fou
 | `spline-NXxNY-FOV` | grid of B-splines over stereographic coordinates (mrcal) | px, v down |
 """
 
-from jaxbundle.cameras.catalogue import FAMILIES as FAMILIES
-from jaxbundle.cameras.catalogue import MODEL_NAMES as MODEL_NAMES
-from jaxbundle.cameras.catalogue import get_model as get_model
-from jaxbundle.cameras.catalogue import is_known as is_known
-from jaxbundle.cameras.catalogue import is_own as is_own
-from jaxbundle.cameras.catalogue import key_of as key_of
-from jaxbundle.cameras.compare import Comparison as Comparison
-from jaxbundle.cameras.compare import compare_cameras as compare_cameras
-from jaxbundle.cameras.compare import difference_rings as difference_rings
-from jaxbundle.cameras.convert import Conversion as Conversion
-from jaxbundle.cameras.convert import convert_camera as convert_camera
-from jaxbundle.cameras.inverse import implicit_inverse as implicit_inverse
-from jaxbundle.cameras.model import CameraModel as CameraModel
-from jaxbundle.cameras.model import image_ray as image_ray
-from jaxbundle.cameras.model import project as project
-from jaxbundle.cameras.model import residual as residual
-from jaxbundle.cameras.own import check_own as check_own
-from jaxbundle.cameras.parameters import check_parameters as check_parameters
-from jaxbundle.cameras.parameters import default_parameters as default_parameters
-from jaxbundle.cameras.validity import turning_radius as turning_radius
-from jaxbundle.cameras.validity import validity_message as validity_message
+from jaxbundle.cameras.catalogue import FAMILIES, MODEL_NAMES, get_model, is_known, is_own, key_of
+from jaxbundle.cameras.compare import Comparison, compare_cameras, difference_rings
+from jaxbundle.cameras.convert import Conversion, convert_camera
+from jaxbundle.cameras.distortion_table import distortion_table
+from jaxbundle.cameras.field_of_view import (
+    FieldOfView,
+    equivalent_35mm,
+    field_of_view,
+    field_of_view_of_rays,
+)
+from jaxbundle.cameras.inverse import implicit_inverse
+from jaxbundle.cameras.model import CameraModel, image_ray, project, residual
+from jaxbundle.cameras.own import check_own
+from jaxbundle.cameras.parameters import check_parameters, default_parameters
+from jaxbundle.cameras.pixel_frame import in_pixels
+from jaxbundle.cameras.validity import turning_radius, validity_message
+
+__all__ = [
+    "CameraModel",
+    "Comparison",
+    "Conversion",
+    "FAMILIES",
+    "FieldOfView",
+    "MODEL_NAMES",
+    "check_own",
+    "check_parameters",
+    "compare_cameras",
+    "convert_camera",
+    "default_parameters",
+    "difference_rings",
+    "distortion_table",
+    "equivalent_35mm",
+    "field_of_view",
+    "field_of_view_of_rays",
+    "get_model",
+    "image_ray",
+    "implicit_inverse",
+    "in_pixels",
+    "is_known",
+    "is_own",
+    "key_of",
+    "project",
+    "residual",
+    "turning_radius",
+    "validity_message",
+]

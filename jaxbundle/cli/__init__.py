@@ -14,6 +14,9 @@ from collections.abc import Callable
 
 from jaxbundle.cli.app import run
 
+# Of the shell: `jaxbundle.commands` has what Python calls.
+__all__: list[str] = []
+
 COMMANDS = (
     "reconstruct",
     "orient",

@@ -15,8 +15,7 @@ from jaxbundle.batches.run import result_rows, run_batch
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.measure.boards import Board
-from jaxbundle.network.columns import data_frame
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
 SKIPPED = "skipped"
@@ -25,7 +24,7 @@ SKIPPED = "skipped"
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class BatchRun(ResultMethods):
+class BatchRun(TableMethods):
     """A finished run: its `inputs`, the file of results `json_lines`, and `counts`: the number of
     inputs by status in the file, and of those "skipped" because they were in it before."""
 
@@ -57,9 +56,9 @@ class BatchRun(ResultMethods):
         """The summary of the population; correlations with columns `against`."""
         return without_nan(self.population.summary(against or {}))
 
-    def to_pandas(self) -> Any:
-        """One row per input as a pandas data frame (extra `tables`)."""
-        return data_frame(self.population.table({}))
+    def table(self) -> dict[str, np.ndarray]:
+        """One row per input."""
+        return self.population.table({})
 
     def __str__(self) -> str:
         """Counts by status in a line."""

@@ -25,9 +25,8 @@ from jaxbundle.io.cameras.camera_files import LOOKS, choose_camera, is_camera_fi
 from jaxbundle.io.formats import FORMATS, read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.network.columns import data_frame
 from jaxbundle.network.tables import Camera
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 Pair = tuple[float, float]
 CameraSource = Camera | Calibration | tuple[Camera, Covariance] | str | Path
@@ -87,7 +86,7 @@ def open_calibration(given: CameraSource) -> tuple[Camera, Covariance | None]:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class CameraDescription(ResultMethods):
+class CameraDescription(TableMethods):
     """Field of view and distortion of a camera.
 
     **Fields:** `camera`; its image and pixel size; `extent` of the image and `step` of the radius
@@ -134,10 +133,6 @@ class CameraDescription(ResultMethods):
             )
         except ValueError as error:
             raise InputError(f"--step: {error}") from None
-
-    def to_pandas(self) -> Any:
-        """The table as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
     def to_dict(self) -> dict[str, Any]:
         """The description as plain dicts and numbers; angles in degrees."""

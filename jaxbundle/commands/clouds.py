@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.compare import compare
@@ -20,7 +20,7 @@ from jaxbundle.surfaces.point_files import read_cloud
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class CloudResult(ResultMethods):
+class CloudResult(TableMethods):
     """A filtered cloud: `points_read` before filtering; the `figures` that were asked for, by name:
     "plane", "check_points", "comparison"; the `dsm`, None if not asked for."""
 
@@ -39,9 +39,9 @@ class CloudResult(ResultMethods):
         counts = {"points_read": self.points_read, "points": len(self.cloud)}
         return without_nan({**counts, "accuracy": self.accuracy, **self.figures})
 
-    def to_pandas(self) -> Any:
-        """The points with σ, rays and base image as a pandas data frame (extra `tables`)."""
-        return self.cloud.to_pandas()
+    def table(self) -> dict[str, np.ndarray]:
+        """The points with σ, rays and base image."""
+        return self.cloud.table()
 
     def __str__(self) -> str:
         """Counts and figures in lines."""

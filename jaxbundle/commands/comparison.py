@@ -22,9 +22,8 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.network.columns import data_frame
 from jaxbundle.network.tables import Camera
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.system.file_content import beginning
 
 SAVED_ADJUSTMENT = b"PK\x03\x04"
@@ -33,7 +32,7 @@ SAVED_ADJUSTMENT = b"PK\x03\x04"
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class CalibrationComparison(ResultMethods):
+class CalibrationComparison(TableMethods):
     """Two calibrations of one camera compared.
 
     **Fields:** `a`, `b`: the cameras; `images`: the difference map; `rings` about the image centre,
@@ -73,10 +72,6 @@ class CalibrationComparison(ResultMethods):
     def table(self) -> dict[str, np.ndarray]:
         """The rings, columns by name."""
         return dict(self.rings)
-
-    def to_pandas(self) -> Any:
-        """The table of rings as a pandas data frame (extra `tables`)."""
-        return data_frame(self.rings)
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dicts and numbers."""

@@ -19,7 +19,7 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.planning.planned_block import planned_network
 from jaxbundle.planning.vertical_photographs import BlockDesign, design_block, relief_displacement
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 MAX_PHOTOGRAPHS = 2000
 """Photographs whose covariance is computed: that of 12 000 elements takes 1.2 GB."""
@@ -27,7 +27,7 @@ MAX_PHOTOGRAPHS = 2000
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class PlannedBlock(ResultMethods):
+class PlannedBlock(TableMethods):
     """A planned block: its `design`, and the values it was planned with (mm in the image, metres on
     the ground)."""
 
@@ -68,6 +68,17 @@ class PlannedBlock(ResultMethods):
                 "--no-network, or plan a part of the area"
             )
         return expected_precision(self.network)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a figure of the block: columns quantity, value (object unit; of the pixel on the
+        ground NaN if the pixel is unknown)."""
+        figures: dict[str, Any] = dataclasses.asdict(self.design)
+        figures["footprint_along"], figures["footprint_across"] = figures.pop("footprint")
+        figures["photographs"] = self.design.photographs
+        return {
+            "quantity": np.array([*figures], dtype=object),
+            "value": np.array([*figures.values()], dtype=float),
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """The plan as plain dicts and numbers; angles in degrees. The σ of the simulated block are

@@ -24,7 +24,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.network.columns import data_frame
 from jaxbundle.pushbroom.error_propagation import (
     ground_errors,
     propagate_accuracy,
@@ -35,7 +34,7 @@ from jaxbundle.pushbroom.ground_to_image import ProjectionStatus, make_search, p
 from jaxbundle.pushbroom.image_to_ground import locate_points
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.terrain import Terrain
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.types import Column
 
 GAP_REASON = "found beyond a place without height"
@@ -47,7 +46,7 @@ MIN_DRAWS = 20
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class ScannerTable(ResultMethods):
+class ScannerTable(TableMethods):
     """A table of positions: `columns` by name, and `figures` of the whole."""
 
     columns: Mapping[str, Column]
@@ -56,10 +55,6 @@ class ScannerTable(ResultMethods):
     def table(self) -> dict[str, np.ndarray]:
         """The columns as arrays."""
         return {name: np.asarray(column) for name, column in self.columns.items()}
-
-    def to_pandas(self) -> Any:
-        """The table as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table())
 
     def to_dict(self) -> dict[str, Any]:
         """Figures and rows as plain dicts and numbers, as in JSON."""

@@ -12,7 +12,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.dsm import Dsm, make_dsm
 from jaxbundle.surfaces.files import report_of, text_of
@@ -25,7 +25,7 @@ from jaxbundle.surfaces.reconstruct import (
     SurfaceSettings,
     find_bounds,
     ground_bounds,
-    reconstruct,
+    reconstruct_surface,
 )
 from jaxbundle.surfaces.relative import align_all
 from jaxbundle.surfaces.scanner_inputs import (
@@ -45,7 +45,7 @@ Heights = tuple[float, float]
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Surface(ResultMethods):
+class Surface(TableMethods):
     """A surface from oriented images: `cloud`, `messages`; `matching`: the cloud's statistics by
     base image; the `dsm` and the `orthophoto` on it [rows, columns], None if not asked for; `check`
     points [n, 3]."""
@@ -74,9 +74,9 @@ class Surface(ResultMethods):
         """Counts and accuracy as plain dicts and numbers, as in JSON."""
         return without_nan(self.accuracy)
 
-    def to_pandas(self) -> Any:
-        """The points as a pandas data frame (extra `tables`)."""
-        return self.cloud.to_pandas()
+    def table(self) -> dict[str, np.ndarray]:
+        """The points."""
+        return self.cloud.table()
 
     def __str__(self) -> str:
         """Counts and accuracy in lines."""
@@ -171,7 +171,7 @@ def _match_photographs(
     views, network, messages = read_views(inputs[0], photos)
     bounds, more = find_bounds(views, tie_points(network), heights)
     _say_all(messages + more, say)
-    found = reconstruct(views, bounds, _partners(pairs, views), **options)
+    found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
     cloud = dataclasses.replace(found.cloud, system=crs)
     _say_all(found.messages, say)
     every = (*messages, *more, *found.messages)
@@ -195,7 +195,7 @@ def _match_ground_images(
     bounds, messages = ground_bounds(views, heights)
     messages = (*messages, *align_all(views, bounds))
     _say_all(messages, say)
-    found = reconstruct(views, bounds, _partners(pairs, views), **options)
+    found = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
     _say_all(found.messages, say)
     found = dataclasses.replace(found, messages=(*messages, *found.messages))
     if around is None:

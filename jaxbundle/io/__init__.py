@@ -26,6 +26,12 @@ _HOME = {
     "jaxbundle.io.results.coordinates": ("write_coordinates",),
     "jaxbundle.io.results.dxf": ("write_dxf",),
     "jaxbundle.io.results.ply": ("write_ply",),
+    "jaxbundle.io.rasters.correction": ("map_of",),
+    "jaxbundle.io.rasters.maps": ("MapGrid", "MapSystem"),
+    "jaxbundle.io.scanner.flight": ("FlightFile", "read_flight"),
+    "jaxbundle.io.scanner.read": ("read_scanner",),
+    "jaxbundle.io.scanner.refinement": ("RefineFile", "read_refinement"),
+    "jaxbundle.io.scanner.rpc": ("read_rpc", "write_rpc"),
     "jaxbundle.io.results.result_project": ("adjusted_network", "readjustable_network"),
 }
 __getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)

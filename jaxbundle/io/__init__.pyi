@@ -40,26 +40,45 @@ from jaxbundle.io.networks.photo_list import read_photo_list as read_photo_list
 from jaxbundle.io.networks.project import read_project as read_project
 from jaxbundle.io.networks.project import write_project as write_project
 from jaxbundle.io.networks.transforms import write_transforms as write_transforms
+from jaxbundle.io.rasters.correction import map_of as map_of
+from jaxbundle.io.rasters.maps import MapGrid as MapGrid
+from jaxbundle.io.rasters.maps import MapSystem as MapSystem
 from jaxbundle.io.results.coordinates import write_coordinates as write_coordinates
 from jaxbundle.io.results.dxf import write_dxf as write_dxf
 from jaxbundle.io.results.ply import write_ply as write_ply
 from jaxbundle.io.results.result_project import adjusted_network as adjusted_network
 from jaxbundle.io.results.result_project import readjustable_network as readjustable_network
+from jaxbundle.io.scanner.flight import FlightFile as FlightFile
+from jaxbundle.io.scanner.flight import read_flight as read_flight
+from jaxbundle.io.scanner.read import read_scanner as read_scanner
+from jaxbundle.io.scanner.refinement import RefineFile as RefineFile
+from jaxbundle.io.scanner.refinement import read_refinement as read_refinement
+from jaxbundle.io.scanner.rpc import read_rpc as read_rpc
+from jaxbundle.io.scanner.rpc import write_rpc as write_rpc
 
 __all__ = [
     "Converted",
     "FORMATS",
+    "FlightFile",
     "Format",
+    "MapGrid",
+    "MapSystem",
     "OutputFormat",
+    "RefineFile",
     "TARGETS",
     "adjusted_network",
     "convert",
+    "map_of",
     "read_cameras",
     "read_corners",
+    "read_flight",
     "read_network",
     "read_opencv",
     "read_photo_list",
     "read_project",
+    "read_refinement",
+    "read_rpc",
+    "read_scanner",
     "read_target",
     "readjustable_network",
     "write_autocal",
@@ -82,6 +101,7 @@ __all__ = [
     "write_ply",
     "write_project",
     "write_ros",
+    "write_rpc",
     "write_target",
     "write_transforms",
 ]

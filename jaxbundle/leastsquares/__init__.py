@@ -4,28 +4,58 @@ photographs.
     from jaxbundle import leastsquares as ls
 """
 
-from jaxbundle.leastsquares.adjust import Result as Result
-from jaxbundle.leastsquares.adjust import adjust as adjust
-from jaxbundle.leastsquares.datum.motions import shift as shift
-from jaxbundle.leastsquares.datum.motions import similarity as similarity
-from jaxbundle.leastsquares.datum.motions import similarity_of_plane as similarity_of_plane
-from jaxbundle.leastsquares.declarations import Kind as Kind
-from jaxbundle.leastsquares.declarations import Motions as Motions
-from jaxbundle.leastsquares.declarations import ObservationSet as ObservationSet
-from jaxbundle.leastsquares.declarations import Table as Table
-from jaxbundle.leastsquares.indexing.rows import Data as Data
-from jaxbundle.leastsquares.indexing.rows import Values as Values
-from jaxbundle.leastsquares.indexing.settings import PlanningSettings as PlanningSettings
-from jaxbundle.leastsquares.iterations.search import MarquardtDescent as MarquardtDescent
-from jaxbundle.leastsquares.iterations.search import NielsenTrustRegion as NielsenTrustRegion
-from jaxbundle.leastsquares.iterations.search import RegionSettings as RegionSettings
-from jaxbundle.leastsquares.iterations.stopping import StoppingSettings as StoppingSettings
-from jaxbundle.leastsquares.problem import Problem as Problem
-from jaxbundle.leastsquares.problem import make_problem as make_problem
-from jaxbundle.leastsquares.quality.derivatives import solve as solve
-from jaxbundle.leastsquares.quality.precision import precision as precision
-from jaxbundle.leastsquares.spaces import Direction as Direction
-from jaxbundle.leastsquares.spaces import Pose as Pose
-from jaxbundle.leastsquares.spaces import PoseValue as PoseValue
-from jaxbundle.leastsquares.spaces import Rotation as Rotation
-from jaxbundle.leastsquares.spaces import Vector as Vector
+from jaxbundle.leastsquares.adjust import Result, adjust
+from jaxbundle.leastsquares.bridge import stock_problem, values_of
+from jaxbundle.leastsquares.datum.motions import shift, similarity, similarity_of_plane
+from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
+from jaxbundle.leastsquares.indexing.rows import Data, Values
+from jaxbundle.leastsquares.indexing.settings import PlanningSettings
+from jaxbundle.leastsquares.iterations.search import (
+    MarquardtDescent,
+    NielsenTrustRegion,
+    RegionSettings,
+)
+from jaxbundle.leastsquares.iterations.stopping import StoppingSettings
+from jaxbundle.leastsquares.problem import Problem, make_problem
+from jaxbundle.leastsquares.quality.derivatives import solve
+from jaxbundle.leastsquares.quality.distributions import critical_w, tau_quantile
+from jaxbundle.leastsquares.quality.precision import precision
+from jaxbundle.leastsquares.quality.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.spaces import Direction, Pose, PoseValue, Rotation, Vector
+
+__all__ = [
+    "Data",
+    "Direction",
+    "Kind",
+    "MarquardtDescent",
+    "Motions",
+    "NielsenTrustRegion",
+    "ObservationSet",
+    "PlanningSettings",
+    "Pose",
+    "PoseValue",
+    "Problem",
+    "RegionSettings",
+    "Result",
+    "Rotation",
+    "Solution",
+    "StoppingSettings",
+    "Table",
+    "Values",
+    "Vector",
+    "adjust",
+    "critical_w",
+    "external_reliability",
+    "find_minimum",
+    "make_problem",
+    "minimal_detectable",
+    "precision",
+    "shift",
+    "similarity",
+    "similarity_of_plane",
+    "solve",
+    "stock_problem",
+    "tau_quantile",
+    "values_of",
+]

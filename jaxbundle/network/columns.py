@@ -8,7 +8,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import index
-from types import MappingProxyType
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -24,7 +23,6 @@ from jaxbundle.types import Column
 NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 """Types that Python or NumPy would convert silently: Booleans to 0 and 1, complex numbers to their
 real parts."""
-NO_UNITS: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,23 +248,3 @@ def _plain_numbers(values: Column) -> np.ndarray | None:
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
     return None if odd else numbers
-
-
-def data_frame(
-    columns: Mapping[str, np.ndarray], units: Mapping[str, str] = NO_UNITS, *, heads: bool = False
-):
-    """Columns as a pandas data frame. The units of columns are in its `attrs["units"]`, so that
-    columns keep their names; `heads`: names and units are the two levels of its columns.
-
-    **Raises:** `ImportError` without pandas (extra `tables`)."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
-    frame = pandas.DataFrame(columns)
-    if heads:
-        pairs = [(name, units.get(name, "")) for name in columns]
-        frame.columns = pandas.MultiIndex.from_tuples(pairs, names=("quantity", "unit"))
-    elif units:
-        frame.attrs["units"] = dict(units)
-    return frame

@@ -13,14 +13,15 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import list_some
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.network_design.aims import Aim, smallest_redundancy
 from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.network_design.design_json import design_dict
 from jaxbundle.network_design.proof import Proof, prove
 from jaxbundle.network_design.realise import problem_of
 from jaxbundle.network_design.search import Step
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 from jaxbundle.types import present
 
 
@@ -54,7 +55,7 @@ class DesignState:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Design(ResultMethods):
+class Design(TableMethods):
     """A designed network.
 
     `order`: "zero", "first", "second", "third"; `path`: the aim by iteration, and the projection
@@ -104,6 +105,13 @@ class Design(ResultMethods):
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON; with the proof if it was made."""
         return without_nan(design_dict(self, self.__dict__.get("proof")))
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a photograph: columns image, X0, Y0, Z0, omega, phi, kappa in the units of the
+        network."""
+        images, unit = self.network.images, ANGLE_UNITS[self.network.angle_unit]
+        orientation = np.column_stack([images.position, images.angles / unit])
+        return {"image": np.array(images.id, dtype=object), **dict(zip(EXTERIOR, orientation.T))}
 
     @property
     def board_poses(self) -> Float[np.ndarray, "images 4 4"]:

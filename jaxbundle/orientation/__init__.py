@@ -5,44 +5,76 @@ by a `Status` in the result, not by an exception, so that one bad item does not 
 Image coordinates are ideal ones divided by the principal distance, unless said otherwise.
 """
 
-from jaxbundle.orientation.absolute import AbsoluteOrientation as AbsoluteOrientation
-from jaxbundle.orientation.absolute import absolute_orientation as absolute_orientation
-from jaxbundle.orientation.dlt import CameraWithPose as CameraWithPose
-from jaxbundle.orientation.dlt import RefinedCamera as RefinedCamera
-from jaxbundle.orientation.dlt import decompose as decompose
-from jaxbundle.orientation.dlt import direct_linear_transformation as direct_linear_transformation
-from jaxbundle.orientation.dlt import refine_camera as refine_camera
-from jaxbundle.orientation.essential import eight_points as eight_points
-from jaxbundle.orientation.essential import five_points as five_points
-from jaxbundle.orientation.essential import orientations as orientations
-from jaxbundle.orientation.homography import apply_homography as apply_homography
-from jaxbundle.orientation.homography import homography as homography
+from jaxbundle.orientation.absolute import AbsoluteOrientation, absolute_orientation
+from jaxbundle.orientation.dlt import (
+    CameraWithPose,
+    RefinedCamera,
+    decompose,
+    direct_linear_transformation,
+    refine_camera,
+)
+from jaxbundle.orientation.essential import eight_points, five_points, orientations
 from jaxbundle.orientation.homography import (
-    interior_from_homographies as interior_from_homographies,
+    apply_homography,
+    homography,
+    interior_from_homographies,
+    pose_from_homography,
 )
-from jaxbundle.orientation.homography import pose_from_homography as pose_from_homography
-from jaxbundle.orientation.intersection import Intersection as Intersection
-from jaxbundle.orientation.intersection import intersection as intersection
-from jaxbundle.orientation.planar import PlanarOrientations as PlanarOrientations
-from jaxbundle.orientation.planar import planar_orientations as planar_orientations
-from jaxbundle.orientation.pose import CameraPose as CameraPose
-from jaxbundle.orientation.pose import image_of as image_of
-from jaxbundle.orientation.pose import ray_of as ray_of
-from jaxbundle.orientation.relative import RelativeOrientation as RelativeOrientation
-from jaxbundle.orientation.relative import relative_orientation as relative_orientation
-from jaxbundle.orientation.resection import Resection as Resection
-from jaxbundle.orientation.resection import refine_resection as refine_resection
-from jaxbundle.orientation.resection import resection as resection
-from jaxbundle.orientation.robust import Consensus as Consensus
-from jaxbundle.orientation.robust import consensus as consensus
-from jaxbundle.orientation.robust import robust_absolute_orientation as robust_absolute_orientation
+from jaxbundle.orientation.intersection import Intersection, intersection
+from jaxbundle.orientation.planar import PlanarOrientations, planar_orientations
+from jaxbundle.orientation.pose import CameraPose, image_of, ray_of
+from jaxbundle.orientation.relative import RelativeOrientation, relative_orientation
+from jaxbundle.orientation.resection import Resection, refine_resection, resection
 from jaxbundle.orientation.robust import (
-    robust_direct_linear_transformation as robust_direct_linear_transformation,
+    Consensus,
+    consensus,
+    robust_absolute_orientation,
+    robust_direct_linear_transformation,
+    robust_homography,
+    robust_intersection,
+    robust_relative_orientation,
+    robust_resection,
+    samples_needed,
 )
-from jaxbundle.orientation.robust import robust_homography as robust_homography
-from jaxbundle.orientation.robust import robust_intersection as robust_intersection
-from jaxbundle.orientation.robust import robust_relative_orientation as robust_relative_orientation
-from jaxbundle.orientation.robust import robust_resection as robust_resection
-from jaxbundle.orientation.robust import samples_needed as samples_needed
-from jaxbundle.orientation.status import Status as Status
-from jaxbundle.orientation.three_points import three_points as three_points
+from jaxbundle.orientation.status import Status
+from jaxbundle.orientation.three_points import three_points
+
+__all__ = [
+    "AbsoluteOrientation",
+    "CameraPose",
+    "CameraWithPose",
+    "Consensus",
+    "Intersection",
+    "PlanarOrientations",
+    "RefinedCamera",
+    "RelativeOrientation",
+    "Resection",
+    "Status",
+    "absolute_orientation",
+    "apply_homography",
+    "consensus",
+    "decompose",
+    "direct_linear_transformation",
+    "eight_points",
+    "five_points",
+    "homography",
+    "image_of",
+    "interior_from_homographies",
+    "intersection",
+    "orientations",
+    "planar_orientations",
+    "pose_from_homography",
+    "ray_of",
+    "refine_camera",
+    "refine_resection",
+    "relative_orientation",
+    "resection",
+    "robust_absolute_orientation",
+    "robust_direct_linear_transformation",
+    "robust_homography",
+    "robust_intersection",
+    "robust_relative_orientation",
+    "robust_resection",
+    "samples_needed",
+    "three_points",
+]

@@ -47,14 +47,14 @@ from jaxbundle.orientation.missing import explain_missing, note_missing
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.orientation.start_pairs import all_pairs, good_pairs
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 CONTRADICTION = "that contradict the start values"
 
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Oriented(ResultMethods):
+class Oriented(TableMethods):
     """A network with start values; `images`, `points`: reasons for those that could not be
     oriented; `left_out`: image points that contradict the start values; `frame`: the reference of
     the coordinates; `finding`: contradictory control points, and the correction."""
@@ -77,6 +77,21 @@ class Oriented(ResultMethods):
             "points_not_placed": dict(self.points),
             "left_out": list(self.left_out),
             "finding": self.finding,
+        }
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row an image or a point: columns kind, id, oriented, reason (of those that could not
+        be oriented)."""
+        found = [("image", id, True, "") for id in self.network.images.id]
+        found += [("image", id, False, why) for id, why in self.images.items()]
+        found += [("point", id, True, "") for id in self.network.points.id]
+        found += [("point", id, False, why) for id, why in self.points.items()]
+        kind, id, oriented, reason = zip(*found) if found else ((), (), (), ())
+        return {
+            "kind": np.array(kind, dtype=object),
+            "id": np.array(id, dtype=object),
+            "oriented": np.array(oriented, dtype=bool),
+            "reason": np.array(reason, dtype=object),
         }
 
     def __str__(self) -> str:

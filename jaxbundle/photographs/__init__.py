@@ -1,6 +1,11 @@
 """Photographs as files: pixels, and metadata on camera, position and time."""
 
-from .exif import Exif as Exif
-from .exif import read_exif as read_exif
-from .reading import photograph_size as photograph_size
-from .reading import read_photograph as read_photograph
+from jaxbundle.photographs.exif import Exif, read_exif
+from jaxbundle.photographs.reading import photograph_size, read_photograph
+
+__all__ = [
+    "Exif",
+    "photograph_size",
+    "read_exif",
+    "read_photograph",
+]

@@ -4,21 +4,36 @@ Every function draws on the axes given as `ax`, or on those of a new pyplot figu
 them. `save_figures` writes all of them as PNG files without touching pyplot.
 """
 
-from jaxbundle.plotting.calibrations import difference_map as difference_map
-from jaxbundle.plotting.calibrations import radial_curves as radial_curves
-from jaxbundle.plotting.cameras import correlation_matrix as correlation_matrix
-from jaxbundle.plotting.cameras import distortion_curve as distortion_curve
-from jaxbundle.plotting.distortion import DistortionProfile as DistortionProfile
-from jaxbundle.plotting.distortion import distortion_profile as distortion_profile
-from jaxbundle.plotting.files import save_figures as save_figures
-from jaxbundle.plotting.files import write_figures as write_figures
-from jaxbundle.plotting.image_map import image_map as image_map
-from jaxbundle.plotting.images import residual_histogram as residual_histogram
-from jaxbundle.plotting.images import residual_vectors as residual_vectors
-from jaxbundle.plotting.quality import coverage_map as coverage_map
-from jaxbundle.plotting.quality import uncertainty_curve as uncertainty_curve
-from jaxbundle.plotting.quality import uncertainty_image as uncertainty_image
-from jaxbundle.plotting.surfaces import cloud_perspective as cloud_perspective
-from jaxbundle.plotting.surfaces import dsm_relief as dsm_relief
-from jaxbundle.plotting.views import network_perspective as network_perspective
-from jaxbundle.plotting.views import network_plan as network_plan
+from jaxbundle.plotting.calibrations import difference_map, radial_curves
+from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
+from jaxbundle.plotting.designs import network_view, places_tried
+from jaxbundle.plotting.distortion import DistortionProfile, distortion_profile
+from jaxbundle.plotting.files import save_figures, write_figures
+from jaxbundle.plotting.image_map import image_map
+from jaxbundle.plotting.images import residual_histogram, residual_vectors
+from jaxbundle.plotting.quality import coverage_map, uncertainty_curve, uncertainty_image
+from jaxbundle.plotting.surfaces import cloud_perspective, dsm_relief
+from jaxbundle.plotting.views import network_perspective, network_plan
+
+__all__ = [
+    "DistortionProfile",
+    "cloud_perspective",
+    "correlation_matrix",
+    "coverage_map",
+    "difference_map",
+    "distortion_curve",
+    "distortion_profile",
+    "dsm_relief",
+    "image_map",
+    "network_perspective",
+    "network_plan",
+    "network_view",
+    "places_tried",
+    "radial_curves",
+    "residual_histogram",
+    "residual_vectors",
+    "save_figures",
+    "uncertainty_curve",
+    "uncertainty_image",
+    "write_figures",
+]

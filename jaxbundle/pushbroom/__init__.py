@@ -53,6 +53,7 @@ _HOME = {
     "jaxbundle.pushbroom.flight": (
         "Flight",
         "measured_image",
+        "take_image",
         "true_image",
     ),
     "jaxbundle.pushbroom.ground_to_image": (
@@ -79,6 +80,12 @@ _HOME = {
         "add_errors",
     ),
     "jaxbundle.pushbroom.orbit": ("state_orbit",),
+    "jaxbundle.pushbroom.rectification": ("BLOCK_SIZE", "NODE_STEP", "block_places"),
+    "jaxbundle.pushbroom.resampling": ("resample",),
+    "jaxbundle.pushbroom.rpc_agreement": (
+        "Agreement",
+        "compare_with_rpc",
+    ),
     "jaxbundle.pushbroom.rpc": (
         "Rpc",
         "RpcStatus",

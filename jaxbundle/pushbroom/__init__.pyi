@@ -24,6 +24,7 @@ from jaxbundle.pushbroom.error_propagation import simulate_accuracy as simulate_
 from jaxbundle.pushbroom.error_propagation import spread_positions as spread_positions
 from jaxbundle.pushbroom.flight import Flight as Flight
 from jaxbundle.pushbroom.flight import measured_image as measured_image
+from jaxbundle.pushbroom.flight import take_image as take_image
 from jaxbundle.pushbroom.flight import true_image as true_image
 from jaxbundle.pushbroom.ground_to_image import Projected as Projected
 from jaxbundle.pushbroom.ground_to_image import ProjectionStatus as ProjectionStatus
@@ -41,8 +42,14 @@ from jaxbundle.pushbroom.image_to_ground import locate_points as locate_points
 from jaxbundle.pushbroom.noise import Noise as Noise
 from jaxbundle.pushbroom.noise import add_errors as add_errors
 from jaxbundle.pushbroom.orbit import state_orbit as state_orbit
+from jaxbundle.pushbroom.rectification import BLOCK_SIZE as BLOCK_SIZE
+from jaxbundle.pushbroom.rectification import NODE_STEP as NODE_STEP
+from jaxbundle.pushbroom.rectification import block_places as block_places
+from jaxbundle.pushbroom.resampling import resample as resample
 from jaxbundle.pushbroom.rpc import Rpc as Rpc
 from jaxbundle.pushbroom.rpc import RpcStatus as RpcStatus
+from jaxbundle.pushbroom.rpc_agreement import Agreement as Agreement
+from jaxbundle.pushbroom.rpc_agreement import compare_with_rpc as compare_with_rpc
 from jaxbundle.pushbroom.rpc_bias import apply_bias as apply_bias
 from jaxbundle.pushbroom.rpc_bias import fit_bias as fit_bias
 from jaxbundle.pushbroom.rpc_fit import RpcCheck as RpcCheck
@@ -67,8 +74,10 @@ from jaxbundle.pushbroom.trajectory import Trajectory as Trajectory
 
 __all__ = [
     "AccuracyTable",
+    "Agreement",
     "AnglePolynomial",
     "AngleTable",
+    "BLOCK_SIZE",
     "CorrectedImage",
     "Corrections",
     "EarthOrientation",
@@ -77,6 +86,7 @@ __all__ = [
     "Ground",
     "Height",
     "LineTimes",
+    "NODE_STEP",
     "Noise",
     "Offsets",
     "Plane",
@@ -97,9 +107,11 @@ __all__ = [
     "add_errors",
     "apply_bias",
     "attitude_table",
+    "block_places",
     "check_rpc",
     "circular_orbit",
     "closed_form",
+    "compare_with_rpc",
     "correct",
     "fit_bias",
     "fit_image",
@@ -121,10 +133,12 @@ __all__ = [
     "project_points",
     "propagate_accuracy",
     "refine",
+    "resample",
     "simulate",
     "simulate_accuracy",
     "spread_positions",
     "state_orbit",
+    "take_image",
     "to_earth",
     "true_image",
     "turn_positions",

@@ -24,7 +24,7 @@ from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.interpolation import TimeTable
 from jaxbundle.pushbroom.noise import Errors, Noise, add_errors, draw, sigmas
 from jaxbundle.pushbroom.orbit import state_orbit
-from jaxbundle.pushbroom.resample import resample
+from jaxbundle.pushbroom.resampling import resample
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import GroundSurface

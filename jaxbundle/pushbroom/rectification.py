@@ -31,12 +31,13 @@ from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
-BLOCK = 256
+BLOCK_SIZE = 256
 """Pixels of a block of the map along each side: a usual tile of GeoTIFF, in which maps are written,
 and 0.5 MB a coordinate. The shapes of compiled programs follow from it."""
-STEP = 16
-"""Pixels between the nodes of a block, a divisor of `BLOCK`. The sagitta of the Earth's curvature
-between nodes, (16·10 m)²/8R = 0.5 mm for pixels of 10 m, grows with the square of both."""
+NODE_STEP = 16
+"""Pixels between the nodes of a block, a divisor of `BLOCK_SIZE`. The sagitta of the Earth's
+curvature between nodes, (16·10 m)²/8R = 0.5 mm for pixels of 10 m, grows with the square of the
+distance of nodes and of the size of pixels."""
 
 
 class MapNodes(NamedTuple):
@@ -87,7 +88,7 @@ def block_places(
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
     # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
-    found = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK)
+    found = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():
@@ -217,7 +218,7 @@ def _places(
 
 
 def _ground(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "3 rows columns"]:
-    """The points of all pixels, [3, BLOCK, BLOCK]."""
+    """The points of all pixels, [3, BLOCK_SIZE, BLOCK_SIZE]."""
     X, vertical = _spread(nodes.X), _spread(nodes.up)
     if isinstance(surface, Terrain):
         x, y, _ = surface.grid(tuple(nodes.X))
@@ -228,9 +229,12 @@ def _ground(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "3 rows col
 
 
 def _spread(nodes: Float[AnyArray, "k n n"]) -> Float[Array, "k rows columns"]:
-    """From nodes to all pixels, linear in between: [k, n, n] to [k, BLOCK, BLOCK]."""
+    """From nodes to all pixels, linear in between: [k, n, n] to [k, BLOCK_SIZE, BLOCK_SIZE]."""
     return jnp.einsum("ri,kij,cj->krc", WEIGHTS, nodes, WEIGHTS)
 
 
-WEIGHTS = np.maximum(1 - np.abs(np.arange(BLOCK)[:, None] / STEP - np.arange(BLOCK // STEP + 1)), 0)
-"""Of the nodes along one side, [BLOCK, nodes]: hat functions."""
+WEIGHTS = np.maximum(
+    1 - np.abs(np.arange(BLOCK_SIZE)[:, None] / NODE_STEP - np.arange(BLOCK_SIZE // NODE_STEP + 1)),
+    0,
+)
+"""Of the nodes along one side, [BLOCK_SIZE, nodes]: hat functions."""

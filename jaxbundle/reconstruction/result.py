@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.network.columns import count
@@ -12,7 +14,7 @@ from jaxbundle.reconstruction.adjusting import WRONG_MISFIT
 from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.report.head import count_points
-from jaxbundle.results import ResultMethods
+from jaxbundle.results import TableMethods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +39,7 @@ class ReconstructedPart:
 
 @print_in_one_screen
 @dataclasses.dataclass(frozen=True)
-class Reconstruction(ResultMethods):
+class Reconstruction(TableMethods):
     """`parts`, the largest first; photographs in none of them, with the reason; notes; `warnings`:
     why a result may be wrong, the worst first; verified `pairs`, by the names of their photographs:
     matches, agreeing matches, kind; `photographs`: the examined files, by name;
@@ -78,6 +80,18 @@ class Reconstruction(ResultMethods):
             "left_out": dict(self.left_out),
             "notes": list(self.notes),
             "pairs": len(self.pairs),
+        }
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a part: columns part, photographs, points, sigma0, misfit. The tables of a part
+        are those of its `adjustment`."""
+        parts = [(part, part.adjustment) for part in self.parts]
+        return {
+            "part": np.array([part.name for part in self.parts], dtype=object),
+            "photographs": np.array([len(found.network.images) for _, found in parts], dtype=int),
+            "points": np.array([len(found.network.points) for _, found in parts], dtype=int),
+            "sigma0": np.array([found.sigma0 for _, found in parts], dtype=float),
+            "misfit": np.array([part.misfit for part in self.parts], dtype=float),
         }
 
     def report(self) -> str:

@@ -29,13 +29,13 @@ from jaxbundle.refinement.report import report as describe_refinement
 from jaxbundle.refinement.report import to_json
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
-from jaxbundle.results import ResultMethods, finite
+from jaxbundle.results import TableMethods, finite
 
 TESTS = ("none", "baarda", "pope")
 
 
 @dataclasses.dataclass(frozen=True)
-class Refinement(ResultMethods):
+class Refinement(TableMethods):
     """The result: `inspection` holds its numbers."""
 
     inspection: RefinementInspection
@@ -52,6 +52,17 @@ class Refinement(ResultMethods):
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON."""
         return finite(to_json(self))
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row an unknown shared by points: columns of, parameter, change, sigma, unit."""
+        factor = np.array([name.factor for name in self.names])
+        return {
+            "of": np.array([name.owner for name in self.names], dtype=object),
+            "parameter": np.array([name.parameter for name in self.names], dtype=object),
+            "change": self.estimate * factor,
+            "sigma": np.sqrt(np.diag(self.covariance)) * factor,
+            "unit": np.array([name.unit for name in self.names], dtype=object),
+        }
 
     @property
     def images(self) -> list[ScannerImage]:

@@ -12,16 +12,23 @@ from typing import TYPE_CHECKING
 
 from jaxbundle.report import head, observations, unknowns
 from jaxbundle.report.budget import budget_lines
-from jaxbundle.report.head import unit_of_weight as unit_of_weight
-from jaxbundle.report.summary import html as html
-from jaxbundle.report.summary import one_line as one_line
-from jaxbundle.report.summary import short as short
-from jaxbundle.report.verdict import Verdict as Verdict
-from jaxbundle.report.verdict import conclude as conclude
+from jaxbundle.report.head import unit_of_weight
+from jaxbundle.report.summary import html, one_line, short
+from jaxbundle.report.verdict import Verdict, conclude
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
     from jaxbundle.adjustment.sensitivity import Budget
+
+__all__ = [
+    "Verdict",
+    "conclude",
+    "html",
+    "one_line",
+    "short",
+    "text",
+    "unit_of_weight",
+]
 
 
 def text(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import data_frame
+from jaxbundle.results import data_frame
 
 
 @print_in_one_screen

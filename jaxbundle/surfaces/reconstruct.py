@@ -136,7 +136,7 @@ class _Pyramids:
         return self[base], [self[k] for k in others]
 
 
-def reconstruct(
+def reconstruct_surface(
     views: Sequence[OrientedImage],
     bounds: Sequence[Bounds],
     partners: Mapping[int, Sequence[int]] | None = None,

@@ -12,7 +12,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, image_point
 from jaxbundle.orientation.pose import CameraPose
-from jaxbundle.planning.render import Scene, Sensor, render, visible
+from jaxbundle.planning.rendering import Scene, Sensor, render, visible
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
 

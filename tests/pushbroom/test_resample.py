@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from jaxbundle.pushbroom.resample import resample
+from jaxbundle.pushbroom.resampling import resample
 
 rng = np.random.default_rng(0)
 BANDS = rng.normal(size=(2, 12, 15))

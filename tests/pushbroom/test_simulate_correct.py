@@ -18,7 +18,7 @@ from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.flight import Flight, measured_image, take_image, true_image
 from jaxbundle.pushbroom.ground_to_image import make_search, project_points
 from jaxbundle.pushbroom.noise import Noise
-from jaxbundle.pushbroom.rectification import BLOCK, STEP, block_places
+from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, block_places
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.terrain import make_terrain
@@ -129,8 +129,8 @@ def test_terrain_that_hides_terrain():
     x, y = np.arange(-500.0, -259, 10), np.arange(150.0, 351, 10)
     heights = np.interp(np.abs(x + 385), [0, 20], [60, 0]) + 5 * np.sin(y[:, None] / 15)
     surface = make_terrain(heights, (x[0], y[0]), (10.0, 10.0), None)
-    grid = MapGrid(-475.0, 330.0, 0.7, BLOCK, BLOCK)
-    steps, every = np.arange(0, BLOCK + STEP, STEP), np.arange(BLOCK)
+    grid = MapGrid(-475.0, 330.0, 0.7, BLOCK_SIZE, BLOCK_SIZE)
+    steps, every = np.arange(0, BLOCK_SIZE + NODE_STEP, NODE_STEP), np.arange(BLOCK_SIZE)
     system, search = MapSystem(None, None), make_search(image, None)
     nodes = system.nodes(surface, *grid.centres(steps, steps))
     all_, seen = (block_places(image, search, surface, nodes, o) for o in (False, True))
@@ -218,7 +218,7 @@ def test_a_rough_trajectory_leaves_no_holes():
     ))  # fmt: skip
     system, search = MapSystem(Ground().earth, None), make_search(image)
     grid = map_of(image, Ground(), system, 0.0003)
-    steps = np.arange(0, BLOCK + STEP, STEP)
+    steps = np.arange(0, BLOCK_SIZE + NODE_STEP, NODE_STEP)
     line, pixel = block_places(
         image, search, Ground(), system.nodes(Ground(), *grid.centres(steps, steps))
     )

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.rendering import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from rendered_photographs import CAMERA, scene, stations
 
-from jaxbundle.planning.render import Sensor, render
+from jaxbundle.planning.rendering import Sensor, render
 from jaxbundle.tiepoints.features import Detection, find_features
 from jaxbundle.tiepoints.matching import FeatureMatchingSettings
 from jaxbundle.tiepoints.pairs import CandidateSettings

@@ -3,7 +3,7 @@
 import numpy as np
 
 import jaxbundle
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.rendering import Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.views import FrameView

@@ -11,7 +11,7 @@ import rasterio
 from surface_scenes import CAMERA, SIZE, hills, photographs, two_shapes
 
 from jaxbundle.io.scanner.rpc import write_rpc
-from jaxbundle.planning.render import Scene, Sensor, render_rays
+from jaxbundle.planning.rendering import Scene, Sensor, render_rays
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom.rpc import Rpc

@@ -7,7 +7,7 @@ from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
 from jaxbundle.surfaces.correlation import find_peaks, slide
 from jaxbundle.surfaces.dense_cloud import combine
-from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct
+from jaxbundle.surfaces.reconstruct import find_bounds, reconstruct_surface
 from jaxbundle.surfaces.rectification import rectify
 from jaxbundle.surfaces.views import FrameView, is_inside, line_of_sight, steps_on_plane
 from jaxbundle.types import present
@@ -19,7 +19,7 @@ NONE = np.zeros((0, 3))
 def pair():
     views, truth = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
     bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
-    return views, truth, reconstruct(views, bounds, {0: [1]}, step=4)
+    return views, truth, reconstruct_surface(views, bounds, {0: [1]}, step=4)
 
 
 def errors(cloud, truth):
@@ -52,7 +52,7 @@ def test_nothing_is_found_where_there_is_no_texture():
     blank = lambda s, t: s > 0.5
     views, truth = photographs(two_shapes(blank=blank), [(-1.0, 0, 10), (1.0, 0, 10)])
     bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
-    cloud = reconstruct(views, bounds, {0: [1]}, step=4).cloud
+    cloud = reconstruct_surface(views, bounds, {0: [1]}, step=4).cloud
     assert len(cloud) > 300
     on_ground = cloud.X[cloud.X[:, 2] < 1.5]
     assert (on_ground[:, 0] > 0.5 + 9 * 10 / F).sum() == 0  # but for the windows at its edge
@@ -131,7 +131,7 @@ def test_hidden_points_are_not_found(pair):
 def test_dense_matching_finds_most_pixels_with_honest_sigma(pair):
     views, truth, _ = pair
     bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
-    cloud = reconstruct(views, bounds, {0: [1]}, dense=True).cloud
+    cloud = reconstruct_surface(views, bounds, {0: [1]}, dense=True).cloud
     e, s, _ = errors(cloud, truth[0])
     seen = is_inside(views[1], views[1].project(truth[0].reshape(-1, 3))).sum()
     assert len(cloud) > 0.85 * seen

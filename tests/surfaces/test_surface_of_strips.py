@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from jaxbundle.io.scanner.writing import write_scanner_image
-from jaxbundle.planning.render import Scene, Sensor, render_rays
+from jaxbundle.planning.rendering import Scene, Sensor, render_rays
 from jaxbundle.planning.shapes import HeightField
 from jaxbundle.planning.texture import Texture
 from jaxbundle.pushbroom import Trajectory, attitude_table, make_image, position_table

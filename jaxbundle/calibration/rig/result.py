@@ -26,8 +26,8 @@ from jaxbundle.io.networks.rig_result import network_of_rig
 from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.blunders import Removed, either_of
 from jaxbundle.network.kinds.exterior_orientation import exterior
-from jaxbundle.network.tables import Camera, Network, units_of
-from jaxbundle.results import ResultMethods
+from jaxbundle.network.tables import EXTERIOR, Camera, Network, units_of
+from jaxbundle.results import TableMethods
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import present
 
@@ -61,7 +61,7 @@ class Mounting:
         return np.sqrt(np.diagonal(self.covariance))
 
 
-class RigCalibration(ResultMethods):
+class RigCalibration(TableMethods):
     """Cameras of a rig, calibrated together.
 
     **Attributes:** `cameras`: their separate calibrations; `mountings`, `parameters`,
@@ -317,6 +317,20 @@ class RigCalibration(ResultMethods):
         from jaxbundle.calibration.report import rig_dict
 
         return rig_dict(self, brief)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One row a mounting: columns camera, X0, Y0, Z0 (of the base, object unit), omega,
+        phi, kappa (degrees), their σ (sX0, …), base and sbase (its length)."""
+        mountings = self.mountings
+        values = np.array([[*m.base, *m.angles] for m in mountings.values()]).reshape(-1, POSE)
+        sigma = np.array([m.sigma for m in mountings.values()]).reshape(-1, POSE)
+        return {
+            "camera": np.array([*mountings], dtype=object),
+            **dict(zip(EXTERIOR, values.T)),
+            **{f"s{name}": column for name, column in zip(EXTERIOR, sigma.T)},
+            "base": np.array([m.length for m in mountings.values()]),
+            "sbase": np.array([m.length_sigma for m in mountings.values()]),
+        }
 
     def __str__(self) -> str:
         lines = [

@@ -17,8 +17,8 @@ from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
 from jaxbundle.pushbroom.ground_to_image import Search
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.image_to_ground import locate_lines
-from jaxbundle.pushbroom.rectification import BLOCK, MapNodes, block_places
-from jaxbundle.pushbroom.resample import resample
+from jaxbundle.pushbroom.rectification import BLOCK_SIZE, MapNodes, block_places
+from jaxbundle.pushbroom.resampling import resample
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.pushbroom.terrain import Terrain
 from jaxbundle.system.programs import compile_once
@@ -151,7 +151,7 @@ def _parts(
     pixel: Float[np.ndarray, "rows columns"],
     image: PushbroomImage,
     most: float,
-    part: Part = (slice(0, BLOCK), slice(0, BLOCK)),
+    part: Part = (slice(0, BLOCK_SIZE), slice(0, BLOCK_SIZE)),
 ) -> Iterator[tuple[Part, Window]]:
     """Quarters of a block, quartered again until each covers at most `most` pixels of the image.
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters.reading import as_type, rasterio
 from jaxbundle.io.rasters.writing import write_raster
-from jaxbundle.pushbroom.rectification import BLOCK, STEP, MapNodes
+from jaxbundle.pushbroom.rectification import BLOCK_SIZE, NODE_STEP, MapNodes
 from jaxbundle.pushbroom.surfaces import GroundSurface
 from jaxbundle.types import Progress
 
@@ -27,24 +27,26 @@ def write_map(
 ) -> None:
     """Write the map of `grid`, `count` bands of the type `dtype`.
 
-    `block` computes the values [count, `BLOCK`, `BLOCK`] of a block from its nodes, NaN if
-    missing; None if all are missing. `names` describe the bands.
+    `block` computes the values [count, `BLOCK_SIZE`, `BLOCK_SIZE`] of a block from its nodes, NaN
+    if missing; None if all are missing. `names` describe the bands.
 
     **Raises:** `InputError` if the file cannot be written.
     """
     floating = np.issubdtype(dtype, np.floating)
-    steps = np.arange(0, BLOCK + STEP, STEP)
+    steps = np.arange(0, BLOCK_SIZE + NODE_STEP, NODE_STEP)
 
     def write_block(corner: tuple[int, int]) -> None:
         row, column = corner
         values = block(system.nodes(surface, *grid.centres(row + steps, column + steps)))
         if values is None or not np.isfinite(values).any():
             return
-        rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
+        rows, columns = min(BLOCK_SIZE, grid.rows - row), min(BLOCK_SIZE, grid.columns - column)
         values = as_type(values[:, :rows, :columns], dtype)
         map_.write(values, row, column)
 
-    corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
+    corners = [
+        (r, c) for r in range(0, grid.rows, BLOCK_SIZE) for c in range(0, grid.columns, BLOCK_SIZE)
+    ]
     with write_raster(
         target,
         grid.columns,
@@ -54,8 +56,8 @@ def write_map(
         crs=system.text,
         nodata=np.nan if floating else 0,
         tiled=True,
-        blockxsize=BLOCK,
-        blockysize=BLOCK,
+        blockxsize=BLOCK_SIZE,
+        blockysize=BLOCK_SIZE,
         transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
     ) as map_:
         if names:

@@ -7,18 +7,33 @@ An adjustment has its page here, and so has a refinement of scanner images (`ref
 calibrations, reconstructions and batches declare theirs in their subpackages.
 """
 
-from jaxbundle.report.page.adjustment import Addition as Addition
-from jaxbundle.report.page.adjustment import compose as compose
-from jaxbundle.report.page.adjustment import compose_failure as compose_failure
-from jaxbundle.report.page.document import Listing as Listing
-from jaxbundle.report.page.document import Page as Page
-from jaxbundle.report.page.document import Section as Section
-from jaxbundle.report.page.document import write as write
-from jaxbundle.report.page.origin import UNKNOWN as UNKNOWN
-from jaxbundle.report.page.origin import InputFile as InputFile
-from jaxbundle.report.page.origin import Origin as Origin
-from jaxbundle.report.page.origin import fingerprint_files as fingerprint_files
-from jaxbundle.report.page.origin import head_line as head_line
-from jaxbundle.report.page.origin import stamp as stamp
-from jaxbundle.report.page.overview import give_verdict as give_verdict
-from jaxbundle.report.verdict import Finding as Finding
+from jaxbundle.report.page.adjustment import Addition, compose, compose_failure
+from jaxbundle.report.page.document import Listing, Page, Section, write
+from jaxbundle.report.page.origin import (
+    UNKNOWN,
+    InputFile,
+    Origin,
+    fingerprint_files,
+    head_line,
+    stamp,
+)
+from jaxbundle.report.page.overview import give_verdict
+from jaxbundle.report.verdict import Finding
+
+__all__ = [
+    "Addition",
+    "Finding",
+    "InputFile",
+    "Listing",
+    "Origin",
+    "Page",
+    "Section",
+    "UNKNOWN",
+    "compose",
+    "compose_failure",
+    "fingerprint_files",
+    "give_verdict",
+    "head_line",
+    "stamp",
+    "write",
+]
