@@ -50,7 +50,8 @@ def test_broken_corners(tmp_path, old, new, message):
 
 
 @pytest.mark.parametrize("board", [
-    Board(9, 6, 0.03, row_spacing=0.0302), Board(6, 7, 0.06), Board(6, 7, 0.02, "circles"), Board(4, 11, 0.01, "asymmetric-circles"),
+    Board(9, 6, 0.03, row_spacing=0.0302), Board(6, 7, 0.06), Board(6, 7, 0.02, "circles"),
+    Board(4, 11, 0.01, "asymmetric-circles"),
     Board(6, 5, 0.0625, "aprilgrid", marker=0.05),
 ])  # fmt: skip
 def test_targets_there_and_back(tmp_path, board):
