@@ -93,8 +93,12 @@ class Replication(TableMethods):
         for number, split in enumerate(self.splits, 1):
             classical = np.sqrt(np.diag(split.classical))
             other = split.correlated
-            correlated = np.full(len(classical), np.nan) if other is None else np.sqrt(np.diag(other))
-            for (camera, name), d, s, m in zip(split.names, split.difference, classical, correlated):
+            correlated = (
+                np.full(len(classical), np.nan) if other is None else np.sqrt(np.diag(other))
+            )
+            for (camera, name), d, s, m in zip(
+                split.names, split.difference, classical, correlated
+            ):
                 rows.append((number, camera, name, float(d), float(s), float(m)))
         columns = zip(*rows) if rows else [()] * 6
         names = ("split", "camera", "parameter", "difference", "sigma", "sigma_correlated")
@@ -244,9 +248,7 @@ def _unit_rows(
     one: Adjustment, found: Solution, names: list[tuple[str, str]]
 ) -> dict[str, Float[np.ndarray, "n rows width"]]:
     """One for the parameter of each name, by table."""
-    rows = {
-        t.name: np.zeros((len(names), t.rows, t.space.width)) for t in found.problem.tables
-    }
+    rows = {t.name: np.zeros((len(names), t.rows, t.space.width)) for t in found.problem.tables}
     order = [camera.id for camera in one.problem.network.cameras]
     for k, (camera, name) in enumerate(names):
         table, row = one.problem.table_of_camera(order.index(camera))

@@ -140,15 +140,11 @@ def error_components(
             ("principal distance", [(x, y)]),
             ("affine", [(x, -y), (y, x)]),
         ):
-            roots = [
-                rays.root(rays.by_image(here * u), rays.by_image(here * v)) for u, v in pairs
-            ]
+            roots = [rays.root(rays.by_image(here * u), rays.by_image(here * v)) for u, v in pairs]
             import scipy.sparse as sp
 
             components.append(
-                ErrorComponent(
-                    f"{what} by photograph{name}", "image", sp.hstack(roots).tocsr()
-                )
+                ErrorComponent(f"{what} by photograph{name}", "image", sp.hstack(roots).tocsr())
             )
     if (track := _along_tracks(found, problem, rays, settings.reach)) is not None:
         components.append(track)

@@ -25,7 +25,6 @@ should show.
 """
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -111,7 +110,9 @@ class ErrorModel:
         root = np.sqrt(self.theta)
         # of √θ: σ_θ/(2√θ); at zero the size that one σ of θ would have
         sigma = np.where(root > 0, self.theta_sigma / np.where(root > 0, 2 * root, 1.0), 0.0)
-        sigma = np.where(root > 0, np.minimum(sigma, np.sqrt(self.theta_sigma)), np.sqrt(self.theta_sigma))
+        sigma = np.where(
+            root > 0, np.minimum(sigma, np.sqrt(self.theta_sigma)), np.sqrt(self.theta_sigma)
+        )
         return tuple(
             ErrorSize(name, unit, float(s), float(d), float(z))
             for (name, unit), s, d, z in zip(names, root, sigma, self.score)
@@ -181,7 +182,9 @@ def _columns(
             yield np.asarray(root @ signs).T / np.sqrt(total)
 
 
-def _nonnegative(T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+def _nonnegative(
+    T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
     """θ ≥ 0 of T·θ = q, in the metric of T itself (the covariance of q is 2·T for white errors)."""
     from scipy.optimize import nnls
 
@@ -258,7 +261,9 @@ def remove_fit(
         given = _unstack(found, wide[first : first + AT_ONCE])
         left, changed = _remove_fit(*found.arguments, found.factor, given)
         remaining.append(_stack(found, left))
-        changes.append({t.name: np.asarray(changed[t.name])[:, : t.rows] for t in found.problem.tables})
+        changes.append(
+            {t.name: np.asarray(changed[t.name])[:, : t.rows] for t in found.problem.tables}
+        )
     tables = {name: np.concatenate([x[name] for x in changes])[:k] for name in changes[0]}
     return np.concatenate(remaining)[:k], tables
 
