@@ -107,12 +107,10 @@ class ErrorModel:
     def sizes(self) -> tuple[ErrorSize, ...]:
         """√θ of the independent part, as a factor of the a priori σ, and of all components."""
         names = [("independent errors", "σ"), *((c.name, c.unit) for c in self.components)]
-        root = np.sqrt(self.theta)
-        # of √θ: σ_θ/(2√θ); at zero the size that one σ of θ would have
-        sigma = np.where(root > 0, self.theta_sigma / np.where(root > 0, 2 * root, 1.0), 0.0)
-        sigma = np.where(
-            root > 0, np.minimum(sigma, np.sqrt(self.theta_sigma)), np.sqrt(self.theta_sigma)
-        )
+        # σ of √θ: σ_θ/(2√θ); not more than the size that one σ of θ would have, as at zero
+        root, most = np.sqrt(self.theta), np.sqrt(self.theta_sigma)
+        sigma = np.minimum(self.theta_sigma, 2 * root * most) / np.where(root > 0, 2 * root, 1.0)
+        sigma = np.where(root > 0, sigma, most)
         return tuple(
             ErrorSize(name, unit, float(s), float(d), float(z))
             for (name, unit), s, d, z in zip(names, root, sigma, self.score)
