@@ -233,13 +233,14 @@ def with_error_model(
 ) -> Adjustment:
     """The same estimates with the σ of errors that image points share; unchanged, with a finding,
     where the network cannot show any."""
-    model = correlated_errors(result.cofactors.solution, result.problem, settings)
+    why = f"no camera has {settings.min_images} photographs, and no point two rays"
+    try:
+        model = correlated_errors(result.cofactors.solution, result.problem, settings)
+    except NotSolvedError as error:
+        model, why = None, str(error)
     if model is None:
-        why = (
-            "correlated errors were not looked for: no camera has "
-            f"{settings.min_images} photographs, and no point two rays"
-        )
-        return result.with_changes(findings=(*result.findings, why))
+        line = f"correlated errors were not looked for: {why}"
+        return result.with_changes(findings=(*result.findings, line))
     return result.with_changes(error_model=model)
 
 

@@ -10,30 +10,44 @@ errors d² shows how much too small classical σ are, with that of the error mod
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
 from jaxbundle.adjustment.quality.correlated_errors import CorrelationSettings, correlated_errors
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import REPLICATION
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.formats import as_network
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.leastsquares.quality.error_components import ErrorModel, effects, first_rows
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.network.columns import count
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
-from jaxbundle.results import TableMethods
+from jaxbundle.report.layout import heading, paragraph, significant, table
+from jaxbundle.results import TableMethods, rows_of
+from jaxbundle.types import Progress
 
 MIN_RAYS_OF_IMAGE = 8
 """Image points of a photograph in a half: four determine its orientation, as many are redundant."""
 MIN_IMAGES = 3
 """Photographs of a half: two determine no interior orientation."""
+
+
+LEGEND = (
+    "Differences of the interior orientations of two halves that share no image point. d² is their "
+    "square over its covariance; the mean of d²/n is 1 where σ are right. Halves by photographs of "
+    "one camera share the remainder of its lens model, halves by points all that belongs to "
+    "photographs: they cannot show these errors."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,57 +125,109 @@ class Replication(TableMethods):
             "dof": self.dof,
             "d2": [split.d2 for split in self.splits],
             "d2_correlated": [split.d2_correlated for split in self.splits],
+            "error_components": []
+            if self.model is None
+            else [size._asdict() for size in self.model.sizes],
+            "parameters": rows_of(self.table()),
             "failed": list(self.failed),
         }
 
     def __str__(self) -> str:
-        lines = [f"Halves by {self.by}: {len(self.splits)} splits, {self.dof} parameters"]
-        lines.append(f"d²/n with classical σ          {self.ratio:.2f}")
-        lines.append(f"d²/n with σ of the error model {self.ratio_correlated:.2f}")
-        return "\n".join([*lines, *self.failed])
+        number = count(len(self.splits), "split")
+        lines = [
+            f"Halves by {self.by}: {number}, {count(self.dof, 'parameter')}",
+            f"d²/n with classical σ              {self.ratio:.2f}",
+        ]
+        if self.model is not None:
+            lines.append(f"d²/n with σ of correlated errors   {self.ratio_correlated:.2f}")
+        return "\n".join([*lines, *(f"not adjusted: {why}" for why in self.failed)])
+
+    def report(self) -> str:
+        """The summary, every split, and the differences of its parameters."""
+        lines = [*str(self).splitlines()]
+        for number, split in enumerate(self.splits, 1):
+            n, classical = len(split.names), np.sqrt(np.diag(split.classical))
+            title = f"Split {number}: d²/n {split.d2 / n:.2f} with classical σ"
+            correlated = np.full(n, np.nan)
+            if split.correlated is not None:
+                correlated = np.sqrt(np.diag(split.correlated))
+                title += f", {split.d2_correlated / n:.2f} with those of correlated errors"
+            rows = [
+                (
+                    f"{camera} {name}",
+                    significant(d, 3),
+                    significant(s, 2),
+                    f"{d / s:.1f}",
+                    significant(m, 2),
+                    f"{d / m:.1f}",
+                )
+                for (camera, name), d, s, m in zip(
+                    split.names, split.difference, classical, correlated
+                )
+            ]
+            header = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+            lines += ["", *heading(title), *table(header, rows, "lrrrrr")]
+        lines += ["", *paragraph(LEGEND)]
+        return "\n".join(lines)
 
 
 def replicate(
-    result: Adjustment,
+    given: Adjustment | Network | str | Path,
     *,
     by: str = "photographs",
     repeat: int = 1,
     seed: int = 0,
-    settings: CorrelationSettings | None = None,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    control: str | Path | None = None,
+    snooping: str | None = None,
+    settings: CorrelationSettings = CORRELATIONS,
+    progress: Progress | None = None,
 ) -> Replication:
     """Adjust disjoint halves of a network and compare the interior orientations they give.
 
     **Arguments:**
 
-    - `by`: `"points"`, `"photographs"` (or `"views"`) in random halves; `"runs"`: the first half of
-      the photographs, in their order, against the second.
-    - `repeat`: number of random splits; runs have one.
+    - `given`: a result; or a network, or the path of one (`format`, `overrides` and `control` as of
+      `jaxbundle.read_network`), which is adjusted first, with `snooping` as of `jaxbundle.adjust`.
+    - `by`: `"points"`, `"photographs"` (of calibrations also called `"views"`): random halves;
+      `"runs"`: the first half of the photographs, in their order, against the second.
+    - `repeat`: number of random splits; runs have one. `seed`: of them.
     - `settings`: of the error components.
+    - `progress(stage, done, total)`: called before every split.
 
-    **Raises:** `InputError` for too few photographs, or where no half can be adjusted.
+    **Raises:** `InputError` for too few photographs; `NotSolvedError` if the network or no pair of
+    halves can be adjusted.
     """
     one_of("by", by, REPLICATION)
     repeat = 1 if by == "runs" else integer("repeat", repeat, least=1)
-    network = readjustable_network(result)
-    if len(network.images) < 2 * MIN_IMAGES:
+    seed = integer("seed", seed, least=0)
+    if not isinstance(given, Adjustment):
+        known = as_network(given, format=format, overrides=overrides, control=control)
+        given = adjust(known, snooping=snooping)
+    network = readjustable_network(given)
+    if len(network.images) < 2 * MIN_IMAGES and by != "points":
         raise InputError(
-            f"{len(network.images)} photographs: a replication needs {2 * MIN_IMAGES} or more"
+            f"{len(network.images)} photographs: halves of them need {2 * MIN_IMAGES} or more; "
+            'halves by "points" can be made'
         )
-    model = correlated_errors(
-        result.inspection.solution, result.problem, settings or CorrelationSettings()
-    )
+    if not any(given.camera_covariance(camera.id)[0] for camera in network.cameras):
+        raise InputError("no camera has a free parameter: there is nothing to compare")
+    model = correlated_errors(given.cofactors.solution, given.problem, settings)
     splits, failed = [], []
-    for number, second in enumerate(_splits(network, by, repeat, seed), 1):
+    for number, second in enumerate(_splits(network, by, repeat, seed)):
+        if progress is not None:
+            progress("adjusting halves", number, repeat)
         try:
             halves = [_half(network, rays) for rays in (~second, second)]
             alone = [adjust(half) for half, _ in halves]
             if not all(one.converged for one in alone):
                 raise NotSolvedError("a half did not converge")
-            splits.append(_difference(result, model, alone, [rays for _, rays in halves]))
+            splits.append(_difference(given, model, alone, [rays for _, rays in halves]))
         except (InputError, NotSolvedError) as error:
-            failed.append(f"split {number}: {error}")
+            failed.append(f"split {number + 1}: {error}")
     if not splits:
-        raise InputError(f"no half of the network can be adjusted alone: {failed[0]}")
+        raise NotSolvedError(f"no halves of the network can be adjusted alone: {failed[0]}")
     return Replication(by, tuple(splits), tuple(failed), model)
 
 

@@ -113,6 +113,8 @@ def error_components(
     found: Solution, problem: NetworkProblem, settings: CorrelationSettings = DEFAULTS
 ) -> list[ErrorComponent]:
     """The components that the image points of a network can show."""
+    import scipy.sparse as sp
+
     rays, network, components = image_rows(found, problem), problem.network, []
     several = len(network.cameras) > 1
     for c, camera in enumerate(network.cameras):
@@ -125,27 +127,25 @@ def error_components(
         at = (rays.xy - middle) / half
         here = of.astype(float)
         columns, rows = settings.knots
+        roots: list[tuple[str, list[Any]]] = []
         if of.sum() >= settings.min_points_of_knot * columns * rows:
-            import scipy.sparse as sp
-
-            B = splines(at, _aspect(rays.xy[of]), (columns, rows)) * here[:, None]
-            none = np.zeros_like(B)
-            root = sp.hstack([rays.root(B, none), rays.root(none, B)]).tocsr()
-            components.append(ErrorComponent(f"field on the sensor{name}", "image", root))
-        # displacements in the image unit; at the edge of the image (x or y = 1) of size 1
-        x, y = at.T
-        nothing = np.zeros(len(x))
+            B = sp.diags(here) @ _sparse_splines(at, _aspect(rays.xy[of]), (columns, rows))
+            # √θ is then the RMS of the field, not the σ of its coefficients
+            B = B / np.sqrt(B.power(2).sum() / of.sum())
+            roots.append(("field on the sensor", [rays.root(B, 0 * B), rays.root(0 * B, B)]))
+        # displacements at the edge of the measured area, x or y = 1, of size 1
+        (x, y), none = at.T, np.zeros(len(at))
         for what, pairs in (
-            ("principal point", [(here, nothing), (nothing, here)]),
-            ("principal distance", [(x, y)]),
-            ("affine", [(x, -y), (y, x)]),
+            ("principal point by photograph", [(here, none), (none, here)]),
+            ("principal distance by photograph", [(x, y)]),
+            ("affine by photograph", [(x, -y), (y, x)]),
         ):
-            roots = [rays.root(rays.by_image(here * u), rays.by_image(here * v)) for u, v in pairs]
-            import scipy.sparse as sp
-
-            components.append(
-                ErrorComponent(f"{what} by photograph{name}", "image", sp.hstack(roots).tocsr())
-            )
+            of_images = lambda u, here=here: rays.by_image(here * u)
+            roots.append((what, [rays.root(of_images(u), of_images(v)) for u, v in pairs]))
+        components += [
+            ErrorComponent(f"{what}{name}", "image", sp.hstack(parts).tocsr())
+            for what, parts in roots
+        ]
     if (track := _along_tracks(found, problem, rays, settings.reach)) is not None:
         components.append(track)
     return components
@@ -186,6 +186,17 @@ def splines(
     return (factors[1][:, :, None] * factors[0][:, None, :]).reshape(len(at), -1)
 
 
+def _sparse_splines(
+    at: Float[np.ndarray, "n 2"], half: Float[np.ndarray, "2"], knots: tuple[int, int]
+) -> Any:
+    """`splines` as a sparse matrix, of which 16 values a row are not zero; some rows at a time."""
+    import scipy.sparse as sp
+
+    step = 50_000  # 40 MB of a dense matrix
+    parts = [splines(at[k : k + step], half, knots) for k in range(0, len(at), step)]
+    return sp.vstack([sp.csr_matrix(part) for part in parts]).tocsr()
+
+
 def wendland(distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Wendland's C² function of compact support, positive definite in space: 1 at 0, 0 from 1."""
     return np.clip(1 - distance, 0, None) ** 4 * (4 * distance + 1)
@@ -198,13 +209,17 @@ def _along_tracks(
     a priori σ."""
     import scipy.sparse as sp
 
+    if "image" not in found.values or not len(rays.point):
+        return None
     order = np.argsort(rays.point, kind="stable")
     point, start, count = np.unique(rays.point[order], return_index=True, return_counts=True)
     if not (count > 1).any():
         return None
     station = np.asarray(found.values["image"].position)
     X = np.asarray(found.values["point"])[:, :3]
-    depth = float(np.median(np.linalg.norm(X[rays.point] - station[rays.image], axis=1)))
+    depth = float(np.nanmedian(np.linalg.norm(X[rays.point] - station[rays.image], axis=1)))
+    if not (np.isfinite(depth) and depth > 0):
+        return None
     K = wendland(np.linalg.norm(station[:, None] - station, axis=2) / (reach * depth))
     rows, columns, values, first = [], [], [], 0
     for k in np.unique(count[count > 1]):
