@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from scipy.optimize import nnls
 
 from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.quality.error_components import (
