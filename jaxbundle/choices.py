@@ -33,7 +33,8 @@ MODEL_FAMILIES = {
 FORMATS = (
     "project", "photo-list", "bal", "column-map", "colmap", "bingo", "metashape", "photomodeler",
     "bundler", "openmvg", "opensfm", "transforms", "kalibr", "micmac", "jaicov", "mrcal",
-    "opencv-stereo", "ros-stereo", "rig", "rig-line",
+    "opencv-stereo", "orb-slam", "vins", "euroc", "ros-stereo", "rig", "rig-line", "nvm",
+    "alicevision",
 )  # fmt: skip
 """Kinds of inputs that are networks."""
 TARGETS = (

@@ -14,6 +14,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
 from jaxbundle.io.cameras.opencv_file import YAML, write_opencv, write_ros
+from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
 from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
 from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
@@ -31,9 +32,12 @@ from jaxbundle.io.networks.micmac import FILES as MICMAC_FILES
 from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
 from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
 from jaxbundle.io.networks.micmac_camera import write_autocal
+from jaxbundle.io.networks.mounted_files import is_euroc, is_vins, read_euroc, read_vins
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
 from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
+from jaxbundle.io.networks.nvm import is_nvm, read_nvm
+from jaxbundle.io.networks.opencv_rigs import is_opencv_rig, read_opencv_rig
 from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
 from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
 from jaxbundle.io.networks.opensfm import (
@@ -42,6 +46,7 @@ from jaxbundle.io.networks.opensfm import (
     read_opensfm,
     write_opensfm_cameras,
 )
+from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
@@ -57,10 +62,8 @@ from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.networks.stereo import (
     ROS_FILES,
     fill_ros_stereo,
-    is_opencv_stereo,
     is_ros_stereo,
     opencv_stereo_files,
-    read_opencv_stereo,
     read_ros_stereo,
     ros_stereo_folders,
     write_opencv_stereo,
@@ -79,13 +82,15 @@ from jaxbundle.system.file_content import is_plain
 class Format:
     """A kind of input: how it is recognised, how it is read, and a description;
     `adjusted` if its control points have adjusted coordinates and a posteriori σ; `names_models`
-    if cameras name their models, and `read` takes own ones."""
+    if cameras name their models, and `read` takes own ones; `takes_image_size`: `read` takes the
+    image size of cameras that have none and need it."""
 
     recognises: Callable[[Path], bool]
     read: Callable[..., Network]
     looks: str
     adjusted: bool = False
     names_models: bool = False
+    takes_image_size: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,20 +173,34 @@ FORMATS: dict[str, Format] = {
         is_opensfm, read_opensfm, "OpenSfM's reconstruction.json, or a folder that has it"
     ),
     "transforms": Format(
-        is_transforms, read_transforms, "transforms.json of nerfstudio or instant-ngp"
+        is_transforms,
+        read_transforms,
+        "transforms.json of nerfstudio or instant-ngp",
+        takes_image_size=True,
     ),
     "kalibr": Format(is_kalibr, read_kalibr, "a .yaml file of Kalibr with cam0: …"),
     "micmac": Format(is_micmac, read_micmac, "a folder of MicMac with Orientation-….xml"),
     "jaicov": Format(is_jaicov, read_jaicov, "a .phc file of AICON, with .ior beside it"),
     "mrcal": Format(is_mrcal, read_mrcal, "a .cameramodel of mrcal, or a folder of them"),
     "opencv-stereo": Format(
-        is_opencv_stereo, read_opencv_stereo, "a .yaml or .json file of OpenCV with M1, M2, R, T"
+        is_opencv_rig,
+        read_opencv_rig,
+        "a .yaml, .json or .xml file in OpenCV's style with two cameras or more: K1, K2, R, T",
     ),
+    "orb-slam": Format(
+        is_orb_slam_pair,
+        read_orb_slam_pair,
+        "a .yaml of ORB-SLAM with two cameras, Camera1.fx … and Camera2.fx …",
+    ),
+    "vins": Format(is_vins, read_vins, "a .yaml of VINS-Fusion with cam0_calib and body_T_cam0"),
+    "euroc": Format(is_euroc, read_euroc, "a folder of EuRoC with cam0/sensor.yaml"),
     "ros-stereo": Format(
         is_ros_stereo, read_ros_stereo, "a folder with two camera_info files of ROS"
     ),
     "rig": Format(is_rig_result, read_rig_result, "result.json of jaxbundle calibrate --rig"),
     "rig-line": Format(is_rig_line, read_rig_line, "a line of jaxbundle batch: FILE.jsonl#KEY"),
+    "nvm": Format(is_nvm, read_nvm, "an .nvm file of VisualSFM"),
+    "alicevision": Format(is_alicevision, read_alicevision, "an .sfm or .json of AliceVision"),
 }
 
 
@@ -379,6 +398,7 @@ def read_network(
     overrides: Sequence[str] = (),
     control: str | Path | None = None,
     models: Sequence[CameraModel] = (),
+    image_size: Sequence[float] | None = None,
 ) -> Network:
     """The network of an input in any known format.
 
@@ -389,6 +409,8 @@ def read_network(
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
     - `control`: a table whose control points replace those of the input (`networks.control`).
     - `models`: own `CameraModel`s that a project, or a column map, may name.
+    - `image_size`: width and height in pixels, of cameras that have none and need it to be read
+      (`transforms.json` with an angle of view).
 
     **Raises:** `InputError`.
     """
@@ -421,7 +443,9 @@ def read_network(
     control_points = None if control is None else read_control(control)
     # other formats have names of their own for their models
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
-    network = FORMATS[format].read(path, overrides, *own)
+    sized = image_size is not None and FORMATS[format].takes_image_size
+    sizes = {"image_size": image_size} if sized else {}
+    network = FORMATS[format].read(path, overrides, *own, **sizes)
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network

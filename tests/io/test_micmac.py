@@ -152,7 +152,8 @@ BROKEN = {
     "no F": ("AutoCal_cam.xml", "F>", "G>", "F is missing; a calibration of MicMac"),
     "NaN": ("AutoCal_cam.xml", "<P1>", "<P1>x", "P1 is 'x"),
     "size": ("AutoCal_cam.xml", "6000 4000", "6000", "SzIm has 1 numbers; 2"),
-    "entity": ("AutoCal_cam.xml", "<ExportAPERO>", "<!ENTITY a 'b'><ExportAPERO>", "entities"),
+    "entity": ("AutoCal_cam.xml", "<ExportAPERO>", "<!DOCTYPE x [<!ENTITY a 'b'>]><ExportAPERO>",
+               "entities"),
 }  # fmt: skip
 
 

@@ -224,8 +224,9 @@ def test_what_a_pair_is_not(tmp_path):
     net, _ = rig()
     path = convert_network(net, tmp_path / "stereo.yaml")
     text = path.read_text()
-    path.write_text(text.replace("\nT:", "\nt:"))
-    assert recognise_format(path) is None
+    path.write_text(text.replace("\nT:", "\nx:"))
+    with pytest.raises(InputError, match="stereo.yaml: R without the other of R and T"):
+        read_network(path)
     path.write_text(re.sub(r"(\nR:.*?data: \[ )[^,]+", r"\g<1>7", text, count=1, flags=re.S))
     with pytest.raises(InputError, match="stereo.yaml: R is not a rotation"):
         read_network(path)

@@ -15,11 +15,25 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.sections import refuse_unknown
 from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.measure.boards import Board
 from jaxbundle.network.columns import show
 
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
+KEYS = (
+    *("target_type", "targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),
+    *(
+        "spacingMeters",
+        "asymmetricGrid",
+        "tagCols",
+        "tagRows",
+        "tagSize",
+        "tagSpacing",
+        "tagFamily",
+    ),
+    "codeOffset",
+)
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
 
 
@@ -30,6 +44,8 @@ def read_target(path: str | Path) -> Board:
     """
     fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
     kind = fields.text("target_type")
+    for key in fields.document:
+        refuse_unknown(key, KEYS, f"{path}: ")
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
     if kind == "aprilgrid":

@@ -44,6 +44,7 @@ from jaxbundle.io.cameras.nearest_camera import (
     fit_camera,
     fit_messages,
     root,
+    with_messages,
 )
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.networks.losses import (
@@ -61,6 +62,7 @@ from jaxbundle.io.networks.poses import (
 )
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import TextRows
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.columns import Columns, count, list_some
@@ -89,6 +91,47 @@ KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 }
 """Our model, focal lengths, coefficients."""
 PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
+CAMERA_KEYS = Keys(
+    (
+        *("projection_type", "width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y"),
+        *(*PRISM, "transition", "aspect_ratio"),
+    ),
+    {
+        "*_prior": "start values of a reconstruction",
+        "*_sigma": "of the start values",
+        **dict.fromkeys(("focal_ratio", "name", "make", "model", "rig*"), "names of the camera"),
+    },
+)
+SHOT_KEYS = Keys(
+    ("camera", "rotation", "translation", "gps_position", "gps_dop"),
+    {
+        "orientation": "how the photograph is displayed",
+        **dict.fromkeys(
+            ("capture_time", "vertices", "faces", "merge_cc", "skey", "is_interpolated", "color",
+             "name", "exif*"),
+            "time, mesh and names",
+        ),
+        **dict.fromkeys(
+            ("rig_camera_id", "rig_instance_id", "covariance", "scale"),
+            "every shot has its own pose",
+        ),
+        **dict.fromkeys(
+            ("compass", "opk*", "gravity*", "accelerometer"), "measured angles of the start",
+        ),
+    },
+)  # fmt: skip
+POINT_KEYS = Keys(
+    ("coordinates",),
+    dict.fromkeys(("color", "reprojection_errors", "reprojection_error", "rig*"), "colours"),
+)
+SCENE_KEYS = Keys(
+    ("cameras", "shots", "points"),
+    {
+        **dict.fromkeys(("biases", "rig_cameras", "rig_instances", "main_shots", "pano_shots"),
+                        "every shot has its own pose"),
+        "reference_lla": "as in its own file",
+    },
+)  # fmt: skip
 FITTED_KINDS = ("fisheye62", "fisheye624", "dual")
 SPHERICAL = ("spherical", "equirectangular")
 
@@ -106,8 +149,12 @@ def is_opensfm_cameras(path: Path) -> bool:
 
 
 def _has_cameras(path: Path, begin: bytes) -> bool:
-    head = beginning(path, 100_000).lstrip() if path.suffix.lower() == ".json" else b""
-    return head.startswith(begin) and b'"projection_type"' in head
+    head = beginning(path, 1_000_000).lstrip() if path.suffix.lower() == ".json" else b""
+    if not head.startswith(begin) or b'"transform_matrix"' in head or b'"viewId"' in head:
+        return False
+    # models of 2015 and before have no projection_type: all were perspective
+    old = b'"focal_prior"' in head or (begin == b"[" and b'"shots"' in head)
+    return b'"projection_type"' in head or old
 
 
 def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
@@ -117,7 +164,12 @@ def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
     """
     path = Path(path)
     document = JsonFields(path, {"": read_object(path, read_text(path), "OpenSfM's cameras")})
-    return tuple(_camera(id, fields) for id, fields in document.objects("").items())
+    unknown = UnknownKeys()
+    cameras = []
+    for id, fields in document.objects("").items():
+        unknown.check(fields.document, CAMERA_KEYS, fields.path)
+        cameras.append(_camera(id, fields))
+    return tuple(with_messages(camera, *unknown.messages()) for camera in cameras)
 
 
 def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -131,9 +183,14 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     file = path / RECONSTRUCTION if path.is_dir() else path
     scene, told = _largest(file)
+    unknown = UnknownKeys()
+    unknown.check(scene.document, SCENE_KEYS, file)
+    for fields in scene.objects("cameras").values():
+        unknown.check(fields.document, CAMERA_KEYS, fields.path)
     cameras, refused = _cameras(scene)
     shots, lost = {}, []
     for id, shot in scene.objects("shots").items():
+        unknown.check(shot.document, SHOT_KEYS, shot.path)
         camera = shot.text("camera")
         if camera in cameras:
             shots[id] = shot
@@ -148,6 +205,8 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         told.append(f"{why}; left out {count(len(lost), 'shot')}: {list_some(lost)}")
     gps = _positions(shots)
     points = scene.objects("points")
+    for point in points.values():
+        unknown.check(point.document, POINT_KEYS, point.path)
     at = stack_rows(
         [p.get("coordinates") for p in points.values()],
         3,
@@ -171,7 +230,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             Source(str(file), None, "point"),
         ),
         rays,
-        (*told, *fit_messages(cameras.values())),
+        (*told, *fit_messages(cameras.values()), *unknown.messages()),
     )
     return network.replace(further=gps)
 

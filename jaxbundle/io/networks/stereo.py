@@ -31,8 +31,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.cameras.opencv_file import (
-    SUFFIXES,
     YAML,
     file_text,
     matrix_in,
@@ -52,13 +52,8 @@ from jaxbundle.system.file_content import beginning
 
 ROS_FILES = ("*.yaml", "*/*.yaml")
 FISHEYE_ENTRIES = "fisheye_model", "distortion_model"
-NAMES = (
-    ("M1", "D1", "M2", "D2"),
-    ("K1", "D1", "K2", "D2"),
-    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
-    ("camera_matrix_1", "dist_coeffs_1", "camera_matrix_2", "dist_coeffs_2"),
-)
-"""Names of matrices and coefficients; the first are written."""
+NAMES = ("M1", "D1", "M2", "D2")
+"""Written names of matrices and coefficients; read ones are in `opencv_rigs`."""
 
 
 class Rectification(NamedTuple):
@@ -211,45 +206,12 @@ def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for k, camera in enumerate(pair.cameras, 1):
         own = opencv_entries(camera)
-        names = NAMES[0][2 * k - 2 : 2 * k]
+        names = NAMES[2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
         entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
     return entries | {"R": (3, 3, pair.R.ravel()), "T": (3, 1, pair.T)}
-
-
-def is_opencv_stereo(path: Path) -> bool:
-    """Whether a YAML or JSON file has R, T and two camera matrices."""
-    text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    has = lambda name: re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) is not None
-    return has("R") and has("T") and any(has(row[0]) and has(row[2]) for row in NAMES)
-
-
-def read_opencv_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """Both cameras of a stereo file, on one mounting; nothing can be adjusted.
-
-    **Raises:** `InputError` naming file and entry.
-    """
-    path = Path(path)
-    entries = read_entries(path)
-    names = next((row for row in NAMES if row[0] in entries and row[2] in entries), NAMES[0])
-    cameras = []
-    for k in (1, 2):
-        matrix, coefficients = names[2 * k - 2 : 2 * k]
-        own = {name: entries[name] for name in FISHEYE_ENTRIES if name in entries}
-        for size in ("image_width", "image_height"):
-            if (value := entries.get(f"{size}_{k}", entries.get(size))) is not None:
-                own[size] = value
-        own |= {"camera_matrix": entries.get(matrix)}
-        if coefficients in entries:
-            own["distortion_coefficients"] = entries[coefficients]
-        id = entries.get(f"camera_name_{k}", ("left", "right")[k - 1])
-        cameras.append(read_opencv(path, own, str(id)))
-    R = matrix_in(path, entries, ("R",), (3, 3))
-    T = matrix_in(path, entries, ("T",), (3, 1))[:, 0]
-    check_rotations(R, f"{path}: R")
-    return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), T], overrides)
 
 
 def ros_stereo_folders(network: Network, folder: Path) -> tuple[Path, ...]:
@@ -319,6 +281,5 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             f"{path}: expected the projection_matrix of one camera with and of the other without "
             f"a shift in its last column, got {'two' if none.any() else 'none'} with"
         )
-    return rig_network(
-        path, [left, right], [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift], overrides
-    )
+    turns, shifts = [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift]
+    return rig_network(path, [left, right], turns, shifts, overrides, fit_messages([left, right]))

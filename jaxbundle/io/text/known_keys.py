@@ -7,6 +7,7 @@ wrong.
 """
 
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -49,22 +50,26 @@ def may_change_geometry(name: str) -> bool:
 
 
 class Keys:
-    """The keys of one kind of object: those a reader uses, and those it may leave, with the reason.
+    """The keys of one kind of object: those a reader uses, and those it may leave.
 
-    `left`: names, or patterns with *, and why they may be left; `fold`: capital letters do not
-    count.
+    **Arguments:**
+
+    - `left`: names, or patterns with *, that do not concern the result, and why.
+    - `warned`: the same for what would concern it and is not read: each is a warning.
     """
 
     def __init__(
-        self, used: Iterable[str], left: Mapping[str, str] | None = None, fold: bool = False
+        self,
+        used: Iterable[str],
+        left: Mapping[str, str] | None = None,
+        warned: Mapping[str, str] | None = None,
     ):
-        self.used, self.left, self.fold = tuple(used), dict(left or {}), fold
+        self.used, self.left, self.warned = tuple(used), dict(left or {}), dict(warned or {})
 
     @cached_property
     def known(self) -> frozenset[str]:
-        """The names without patterns."""
-        names = (*self.used, *self.left)
-        return frozenset(name.lower() if self.fold else name for name in names)
+        """All names and patterns."""
+        return frozenset((*self.used, *self.left, *self.warned))
 
     @cached_property
     def patterns(self) -> tuple[str, ...]:
@@ -72,29 +77,33 @@ class Keys:
         return tuple(name for name in self.known if "*" in name)
 
     def unknown(self, names: Iterable[str]) -> list[str]:
-        """The names that are neither used nor may be left."""
+        """The names that are not known."""
         return [name for name in names if not self._has(name)]
 
     def _has(self, name: str) -> bool:
-        name = name.lower() if self.fold else name
         return name in self.known or any(fnmatchcase(name, part) for part in self.patterns)
 
     def __or__(self, other: "Keys") -> "Keys":
-        return Keys((*self.used, *other.used), self.left | other.left, self.fold or other.fold)
+        return Keys((*self.used, *other.used), self.left | other.left, self.warned | other.warned)
 
 
 class UnknownKeys:
-    """The unknown keys met while a file is read; one message a key, however often it stands there.
-    """
+    """The keys met while a file is read that are not understood, or understood and not read; one
+    message a key, however often it stands there."""
 
     def __init__(self):
-        self._places: dict[str, list[str]] = {}
+        self._places: dict[tuple[str, str], list[str]] = {}
 
     def check(self, names: Iterable[str], keys: Keys, where: object) -> None:
         """Notice the unknown names of an object; `where`: its file and place.
 
         **Raises:** `InputError` for a name that may change the geometry.
         """
+        names = tuple(names)
+        if not keys.warned and keys.known.issuperset(names):
+            return  # millions of points have the same few keys
+        for name in keys.warned.keys() & {*names}:
+            self._places.setdefault((name, keys.warned[name]), []).append(str(where))
         for name in keys.unknown(names):
             if may_change_geometry(name):
                 # a name of the list is near enough to be meant: "Distortion" for "distortion"
@@ -105,12 +114,18 @@ class UnknownKeys:
                     "geometry; expected a key that is known here. If it does not, delete it from a "
                     "copy of the file"
                 )
-            self._places.setdefault(name, []).append(str(where))
+            self._places.setdefault((name, ""), []).append(str(where))
+
+    def check_element(self, element: ET.Element, keys: Keys, where: object) -> None:
+        """The same for the children and attributes of an element of XML."""
+        children = (child.tag for child in element if isinstance(child.tag, str))
+        self.check((*dict.fromkeys(children), *element.attrib), keys, where)
 
     def messages(self) -> tuple[str, ...]:
         """Warnings about the unknown keys."""
         return tuple(
-            f"{places[0]}: unknown key {show(name)} is not read"
+            f"{places[0]}: "
+            + (f"{name} is not read: {why}" if why else f"unknown key {show(name)} is not read")
             + (f" (there, and in {len(places) - 1} more places)" if len(places) > 1 else "")
-            for name, places in self._places.items()
+            for (name, why), places in self._places.items()
         )

@@ -1,9 +1,9 @@
 """YAML documents, by PyYAML: dictionaries, lists, numbers and texts.
 
-The types are those of YAML 1.2 (core schema), which calibration files mean: `1e-3` is a number and
-`on`, `010` and `2020-01-01` are no Booleans, octal numbers and dates as in YAML 1.1. Tags of programs
-(`!!opencv-matrix`, `!!python/tuple`) are dropped, their content is read. OpenCV writes `%YAML:1.0`
-for `%YAML 1.0`, and reads `key:1`.
+The types are those of YAML 1.2 (core schema), which calibration files mean: `1e-3` is a number;
+`on`, `010` and `2020-01-01` are no Booleans, octal numbers and dates as in YAML 1.1. Tags of
+programs (`!!opencv-matrix`, `!!python/tuple`) are dropped, their content is read. OpenCV writes
+`%YAML:1.0` for `%YAML 1.0`, and reads `key:1`.
 
 A document is looked through as a stream of events before it is built: levels of nesting, what
 aliases unfold to, a second document.
@@ -156,9 +156,7 @@ def _loader() -> Any:
                 seen.add(key.value)
             self.flatten_mapping(node)
             # the keys as texts, as in JSON: 0 and on are names
-            return {
-                key.value: self.construct_object(value, deep=True) for key, value in node.value
-            }
+            return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
 
         def get_single_data(self) -> Any:
             # the second document, if there is one, is empty (_look_through)

@@ -1,0 +1,105 @@
+"""Cameras as ROS's camera_calibration prints them, `ost.ini` or `ost.txt`.
+
+    # oST version 5.0 parameters
+    [image]
+    width
+    640
+    height
+    480
+    [narrow_stereo]
+    camera matrix
+    fx 0 cx
+    0 fy cy
+    0 0 1
+    distortion
+    k1 k2 p1 p2 k3
+    rectification
+    projection
+
+The name of a camera is that of its section. Five coefficients are of plumb_bob, eight of
+rational_polynomial. Rectification and projection are of the rectified image and are not read.
+
+Source: ROS, camera_calibration_parsers, parse_ini.cpp.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import with_messages
+from jaxbundle.io.cameras.opencv_file import camera_of
+from jaxbundle.io.cameras.spellings import Found
+from jaxbundle.io.text.known_keys import Keys, UnknownKeys
+from jaxbundle.io.text.rows import TextRow, TextRows
+from jaxbundle.network.tables import Camera
+from jaxbundle.system.file_content import beginning
+
+SUFFIXES = (".ini", ".txt")
+IMAGE = "image"
+KEYS = Keys(
+    ("camera matrix", "distortion"),
+    dict.fromkeys(
+        ("rectification", "projection"), "of the rectified image, which is another camera's"
+    ),
+)
+"""Of a camera."""
+SIZES = Keys(("width", "height"))
+Section = dict[str, list[float]]
+
+
+def is_ros_ini(path: Path) -> bool:
+    """Whether a text has the camera of ROS."""
+    head = beginning(path, 10_000) if path.suffix.lower() in SUFFIXES else b""
+    return re.search(rb"(?m)^\s*camera matrix\s*$", head) is not None and b"[" in head
+
+
+def read_ros_ini(path: str | Path) -> tuple[Camera, ...]:
+    """The cameras of a file, two of a stereo calibration.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    unknown, size = UnknownKeys(), {}
+    cameras: list[Camera] = []
+    for name, section in _sections(path):
+        if name == IMAGE:
+            unknown.check(section, SIZES, f"{path}, [{name}]")
+            size = {f"image_{key}": (key, *values[:1]) for key, values in section.items()}
+            continue
+        unknown.check(section, KEYS, f"{path}, [{name}]")
+        found: Found = dict(size)  # type: ignore[arg-type]
+        for key, kind in zip(KEYS.used, ("camera_matrix", "distortion_coefficients")):
+            if key not in section:
+                raise InputError(f"{path}, [{name}]: {key} is missing; expected it in a camera")
+            found[kind] = key, section[key]
+        cameras.append(camera_of(f"{path}, [{name}]", found, name))
+    if not cameras:
+        raise InputError(f"{path}: there is no camera in it; expected a section [NAME]")
+    return tuple(with_messages(camera, *unknown.messages()) for camera in cameras)
+
+
+def _sections(path: Path) -> Iterator[tuple[str, Section]]:
+    """The sections in their order: for every key the numbers of the lines below it."""
+    name, section, key = "", {}, ""
+    for row in TextRows(path, "#"):
+        text = row.text.strip()
+        if text.startswith("["):
+            if section:
+                yield name, section
+            name, section, key = text.strip("[]"), {}, ""
+        elif re.match(r"[A-Za-z]", text) and not re.match(r"(nan|inf)\b", text, re.I):
+            if text in section:
+                raise row.error(f"{text} occurs twice in [{name}]")
+            key = text
+            section[key] = []
+        elif not key:
+            raise row.error(f"{text[:40]!r} without a key; expected width, camera matrix, …")
+        else:
+            section[key] += _numbers(row)
+    if section:
+        yield name, section
+
+
+def _numbers(row: TextRow) -> list[float]:
+    return row.all_numbers("a value").tolist()
