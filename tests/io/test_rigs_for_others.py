@@ -20,7 +20,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of, rays_of
 from jaxbundle.errors import InputError
 from jaxbundle.io.exchange import convert
-from jaxbundle.io.formats import read_network, recognise_format
+from jaxbundle.io.formats import read_network
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.kalibr import write_kalibr
 from jaxbundle.io.networks.poses import angles_of

@@ -23,17 +23,10 @@ from jaxbundle.network.columns import show
 TYPES = ("checkerboard", "circlegrid", "aprilgrid")
 KEYS = (
     *("target_type", "targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),
-    *(
-        "spacingMeters",
-        "asymmetricGrid",
-        "tagCols",
-        "tagRows",
-        "tagSize",
-        "tagSpacing",
-        "tagFamily",
-    ),
+    *("spacingMeters", "asymmetricGrid", "tagCols", "tagRows", "tagSize", "tagSpacing"),
     "codeOffset",
 )
+"""All are geometry: a board has no place for a warning, so that any other key is refused."""
 CIRCLES = {False: "circles", True: "asymmetric-circles"}
 
 
@@ -46,6 +39,8 @@ def read_target(path: str | Path) -> Board:
     kind = fields.text("target_type")
     for key in fields.document:
         refuse_unknown(key, KEYS, f"{path}: ")
+    if fields.integer("codeOffset", 0):
+        raise InputError(f"{path}: codeOffset is not 0; expected a board whose first tag is tag 0")
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: {' or '.join(TYPES)} is expected")
     if kind == "aprilgrid":

@@ -87,8 +87,7 @@ FOREIGN_MODELS = re.compile(
 )
 """Parts of the names of lens models that are none of OpenCV's; what has none of them under the key
 `model` names a product, "HERO7 Black"."""
-LENS_KEYS = ("distortion", "distort", "dist", "lens", "projection")
-"""Beginnings of the keys whose value is a lens model and nothing else."""
+MODEL_KEYS = ("distortion_model", "camera_model")
 FILE_STORAGE = b"<opencv_storage"
 LARGEST_FILE = 20_000_000
 """Bytes of a file that is looked into: calibrations with all their measurements have a megabyte,
@@ -255,25 +254,32 @@ def _is_fisheye(path: str | Path, found: Found) -> bool:
     """Whether the model is that of `cv2.fisheye`.
 
     **Raises:** `InputError` for a lens model that is not OpenCV's."""
-    name, flag = found.get("fisheye_model", ("", False))
+    _, flag = found.get("fisheye_model", ("", False))
     if isinstance(flag, str):
         flag = flag.strip().lower() in ("1", "true", "yes")
-    key, kind = found.get("distortion_model", ("", ""))
-    folded = fold(str(kind))
-    model = MODEL_NAMES.get(folded)
-    lens = fold(key.rpartition(".")[2]).startswith(LENS_KEYS)
-    if kind and model is None and (lens or FOREIGN_MODELS.search(folded)):
-        # without any distortion all of them are the same
-        if not _all_zero(path, found) or FOREIGN_MODELS.search(folded):
+    models = [flag is True or (_is_number(flag) and flag == 1)]
+    for meaning in MODEL_KEYS:
+        key, kind = found.get(meaning, ("", ""))
+        if not kind:
+            continue
+        folded = fold(str(kind))
+        model = MODEL_NAMES.get(folded)
+        foreign = model is None and FOREIGN_MODELS.search(folded)
+        # `model` may be a product's name; without any distortion all models are the same
+        named = model is None and meaning == "distortion_model"
+        if foreign or (named and not _all_zero(path, found)):
             raise InputError(
                 f"{path}: {key} {show(kind)} is not known here; expected plumb_bob, "
                 "rational_polynomial (OpenCV's), equidistant or fisheye"
             )
-    return model == "kannala-brandt" or flag is True or (_is_number(flag) and flag == 1)
+        models.append(model == "kannala-brandt")
+    return any(models)
 
 
 def _all_zero(path: str | Path, found: Found) -> bool:
-    return not any(_coefficients(path, found, False))
+    """Whether coefficients are given and are all 0."""
+    given = not found.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
+    return given and not any(_coefficients(path, found, False))
 
 
 def _coefficients(path: str | Path, found: Found, fisheye: bool) -> list[float]:

@@ -7,7 +7,7 @@ is spelled. Any other entry is subject to the rule of keys (`text.known_keys`).
     camera_matrix              3 × 3, or fx, fy, cx, cy by name, or [fx, fy, cx, cy] of `intrinsics`
     distortion_coefficients    a vector of any shape, or k1, k2, p1, p2, k3 … by name
     image_size                 [w, h], or image_width and image_height
-    distortion_model           a word of MODEL_NAMES
+    distortion_model           a word of MODEL_NAMES; camera_model the same, or a product's name
 
 Source: OpenCV's samples and documentation, ROS's messages, public calibration files.
 """
@@ -35,8 +35,8 @@ SPELLINGS = {
     "image_width": "imagewidth width w imgwidth imgw framewidth",
     "image_height": "imageheight height h imgheight imgh frameheight",
     "image_size": "imagesize resolution imgsize imageresolution dim framesize imsize size",
-    "distortion_model": "distortionmodel distortiontype distmodel distortmodel lensmodel lenstype "
-    "projectionmodel cameramodel cameratype modeltype model",
+    "distortion_model": "distortionmodel distortiontype distmodel distortmodel lensmodel lenstype",
+    "camera_model": "projectionmodel projectiontype cameramodel cameratype modeltype model",
     "fisheye_model": "fisheyemodel fisheye isfisheye usefisheye",
     "skew": "skew skewness",
     "roi": "roi regionofinterest",
@@ -79,15 +79,15 @@ LEFT = Keys(
             "how well it was calibrated",
         ),
         **dict.fromkeys(
-            ("*time*", "*date*", "comment*", "*note*", "description*", "version*", "*software*",
-             "header", "stamp", "seq", "frameid", "*serial*", "*path*", "*topic*", "fps",
-             "framerate", "*file*", "name", "info*", "metadata", "*vendor*", "author*", "*id",
-             "rateHz", "ratehz", "sensortype", "operationaltag*"),
+            ("calibrationtime", "calibrationdate", "date", "time", "timestamp", "datetime",
+             "createdat", "comment", "header", "stamp", "seq", "frameid", "cameraserial",
+             "serialnumber", "serial", "imagetopic", "fps", "ratehz", "framerate", "name",
+             "metadata", "sensortype", "software", "version", "imagepath", "sourcefile"),
             "where the file comes from",
         ),
         **dict.fromkeys(
-            ("nframes", "n*frames", "nrofframes", "num*", "*count*", "flags", "flag*", "fix*",
-             "aspectratio", "*samples*", "criteria*", "*zerotangent*", "maxiter*", "calib*flags"),
+            ("nframes", "n*frames", "nrofframes", "num*", "flags", "flag*", "fix*", "aspectratio",
+             "criteria*", "*zerotangent*", "maxiter*", "calib*flags", "imagecount", "framecount"),
             "the settings of the calibration",
         ),
         **dict.fromkeys(
@@ -128,7 +128,8 @@ def meaning_of(name: str, value: Any) -> str | None:
         return kind if _is_scalar(value) or kind not in SCALARS else None
     if name.startswith("undist"):
         return None
-    distortion = name == "d" or "distort" in name or re.match(r"dist(?!ance)", name) is not None
+    distortion = name == "d" or "distort" in name or name.endswith("dist")
+    distortion |= re.match(r"dist(?!ance)", name) is not None
     coefficients = re.fullmatch(r"(lens|camera)?coef\w*|kc", name) is not None
     return "distortion_coefficients" if distortion or coefficients else None
 
@@ -153,7 +154,14 @@ def camera_entries(
             rest.append(name)
         elif kind in ("camera_matrix", "distortion_coefficients") and _is_named(value):
             inner = {f"{name}.{own}": part for own, part in value.items()}
-            for own, part in camera_entries(_bare(inner, name), where, unknown, left).items():
+            own_entries = camera_entries(_bare(inner, name), where, unknown, left)
+            if kind == "distortion_coefficients" and own_entries.keys().isdisjoint(
+                ("distortion_coefficients", *COEFFICIENTS, *TILT)
+            ):
+                raise InputError(
+                    f"{where}: {name} is {show(value)}; expected the coefficients of distortion"
+                )
+            for own, part in own_entries.items():
                 _put(found, own, (f"{name}.{part[0]}", part[1]), where)
         else:
             _put(found, kind, (name, value), where)

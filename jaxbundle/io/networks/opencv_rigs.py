@@ -57,7 +57,14 @@ POSES = {
     **dict.fromkeys(TRANSLATION.split(), "T"),
     **dict.fromkeys(POSE.split(), "pose"),
 }
-SHARED = ("image_size", "image_width", "image_height", "distortion_model", "fisheye_model")
+SHARED = (
+    "image_size",
+    "image_width",
+    "image_height",
+    "distortion_model",
+    "camera_model",
+    "fisheye_model",
+)
 """Entries that stand once for both cameras."""
 UNKNOWN = np.full((3, 3), np.nan), np.full(3, np.nan)
 RECTIFIED = Keys((), {
