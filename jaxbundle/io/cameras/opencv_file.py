@@ -226,7 +226,7 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
             raise InputError(
                 f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; {wanted} is expected"
             )
-    core = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
+    core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
         # programs that write both round one of them
         if key in found and abs(_number(path, found, key) - core[key]) > 1e-3:

@@ -14,7 +14,7 @@ Source: OpenCV's samples and documentation, ROS's messages, public calibration f
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
@@ -23,7 +23,7 @@ from jaxbundle.network.columns import show
 Found = dict[str, tuple[str, Any]]
 """The entries of a camera by meaning: the spelling in the file, and the value."""
 
-CORE = ("fx", "fy", "cx", "cy")
+CORE: tuple[str, ...] = ("fx", "fy", "cx", "cy")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 TILT = ("taux", "tauy")
 SPELLINGS = {
@@ -153,16 +153,15 @@ def camera_entries(
         if kind is None:
             rest.append(name)
         elif kind in ("camera_matrix", "distortion_coefficients") and _is_named(value):
-            inner = {f"{name}.{own}": part for own, part in value.items()}
-            own_entries = camera_entries(_bare(inner, name), where, unknown, left)
-            if kind == "distortion_coefficients" and own_entries.keys().isdisjoint(
-                ("distortion_coefficients", *COEFFICIENTS, *TILT)
+            own = camera_entries(value, where, unknown, left)
+            if kind == "distortion_coefficients" and own.keys().isdisjoint(
+                (kind, *COEFFICIENTS, *TILT)
             ):
                 raise InputError(
                     f"{where}: {name} is {show(value)}; expected the coefficients of distortion"
                 )
-            for own, part in own_entries.items():
-                _put(found, own, (f"{name}.{part[0]}", part[1]), where)
+            for meaning, (spelled, part) in own.items():
+                _put(found, meaning, (f"{name}.{spelled}", part), where)
         else:
             _put(found, kind, (name, value), where)
     if "roi" in found and not isinstance(found["roi"][1], Mapping):
@@ -179,10 +178,6 @@ def camera_entries(
     return found
 
 
-def _bare(inner: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {key.removeprefix(f"{name}."): value for key, value in inner.items()}
-
-
 def _put(found: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
     if kind in found and found[kind][1] != entry[1]:
         raise InputError(
@@ -192,7 +187,7 @@ def _put(found: Found, kind: str, entry: tuple[str, Any], where: object) -> None
     found.setdefault(kind, entry)
 
 
-def _is_named(value: Any) -> bool:
+def _is_named(value: Any) -> TypeGuard[Mapping[str, Any]]:
     """Whether a value is numbers by their names, not a matrix of OpenCV."""
     return isinstance(value, Mapping) and not {"rows", "data"} <= value.keys()
 

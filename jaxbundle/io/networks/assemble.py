@@ -134,7 +134,7 @@ def rig_network(
     """
     names = [camera.id for camera in cameras]
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
-    known = np.isfinite(X0).all(1) & np.isfinite(M).all((1, 2))
+    known = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
     if known.sum() < 2 and len(names) > 1:
         # a pose relative to nothing
         known[:] = False

@@ -76,7 +76,8 @@ def rigs_of_frames(
             rows += [(str(frame.rig), str(frame.id), names[image]) for image in images]
     if not rows:
         return ()
-    columns = dict(zip(("rig", "epoch", "image"), map(list, zip(*rows))))
+    rigs, epochs, images = map(list, zip(*rows))
+    columns = {"rig": rigs, "epoch": epochs, "image": images}
     return (Rigs.from_columns(Columns(columns, Source(str(path), None, "frame")), {}, 1.0),)
 
 

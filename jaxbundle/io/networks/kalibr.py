@@ -125,7 +125,12 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     cameras = [_camera(id, fields) for id, fields in chain.items()]
     poses, told = _poses(list(chain.values()))
     return rig_network(
-        path, cameras, poses[:, :3, :3], poses[:, :3, 3], overrides, (*told, *unknown.messages())
+        path,
+        cameras,
+        [*poses[:, :3, :3]],
+        [*poses[:, :3, 3]],
+        overrides,
+        (*told, *unknown.messages()),
     )
 
 
@@ -143,10 +148,15 @@ def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"
         if fields.get("T_cn_cnm1") is not None:
             poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
     for k, mine in enumerate(body):
-        known = (j for j, other in enumerate(body) if other is not None and j != k
-                 and np.isfinite(poses[j]).all())  # fmt: skip
-        if mine is not None and np.isnan(poses[k]).any() and (j := next(known, None)) is not None:
-            poses[k] = mine @ np.linalg.inv(body[j]) @ poses[j]
+        known = (
+            (other, poses[j])
+            for j, other in enumerate(body)
+            if other is not None and j != k and np.isfinite(poses[j]).all()
+        )
+        if mine is not None and np.isnan(poses[k]).any():
+            for other, place in known:
+                poses[k] = mine @ np.linalg.inv(other) @ place
+                break
     for k, fields in enumerate(chain[1:], 1):
         if fields.get("T_cn_cnm1") is not None and np.isnan(poses[k]).any():
             poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]

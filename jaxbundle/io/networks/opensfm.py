@@ -1,4 +1,5 @@
-"""Reconstructions of OpenSfM: `reconstruction.json`, with `tracks.csv` and `reference_lla.json`.
+"""Reconstructions of OpenSfM: `reconstruction.json`, with `tracks.csv`, `reference_lla.json` and
+`ground_control_points.json` (`opensfm_control`).
 
     [{"cameras": {id: {projection_type, width, height, …}},
       "shots": {image: {camera, rotation, translation, gps_position, gps_dop}},
@@ -25,6 +26,7 @@ Source: OpenSfM documentation, "Geometric Models", "Dataset Structure"; its form
 the tangential part, where the page has 2x, 2y.
 """
 
+import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -47,6 +49,7 @@ from jaxbundle.io.cameras.nearest_camera import (
     with_messages,
 )
 from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
     GREY,
     check_others_zero,
@@ -55,11 +58,13 @@ from jaxbundle.io.networks.losses import (
     one_focal_length,
     size_of,
 )
+from jaxbundle.io.networks.opensfm_control import CONTROL, GroundControl, read_ground_control
 from jaxbundle.io.networks.poses import (
     matrices_of,
     matrices_of_rotation_vectors,
     rotation_vectors_of,
 )
+from jaxbundle.io.networks.settings import choose_datum
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.io.text.json_fields import JsonFields, read_object, stack_rows
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
@@ -215,6 +220,12 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
     if missing:
         told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    names, control = list(points), None
+    if (file.parent / CONTROL).is_file():
+        used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
+        control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, used)
+        told += control.messages
+        names, at, rays = _add_control(file, control, names, at, rays)
     if (file.parent / REFERENCE).is_file():
         told.append(_reference(file.parent / REFERENCE))
     datum = {"datum": "control"} if gps else {}
@@ -226,13 +237,42 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides,
         _images(file, shots),
         Columns(
-            {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
+            {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", at.T))},
             Source(str(file), None, "point"),
         ),
         rays,
         (*told, *fit_messages(cameras.values()), *unknown.messages()),
     )
-    return network.replace(further=gps)
+    network = network.replace(further=gps)
+    if control is None or control.points is None or not len(network.points):
+        return network
+    return with_control(network, control.points, datum=not choose_datum(overrides))
+
+
+def _add_control(
+    file: Path,
+    control: GroundControl,
+    names: Sequence[str],
+    at: Float[np.ndarray, "n 3"],
+    rays: Columns | None,
+) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
+    """Points and image points with those of ground control.
+
+    **Raises:** `InputError` for a control point called as a tie point."""
+    added = [*(control.points.id if control.points else ()), *control.unknown]
+    if twice := next((id for id in added if id in {*names}), None):
+        raise InputError(f"{file.parent / CONTROL}: {twice!r} is also a point of {file.name}")
+    columns: dict[str, list] = {}
+    for k, name in enumerate(("image", "point", "x", "y")):
+        tracked = () if rays is None else rays.values[name]
+        columns[name] = [*tracked, *(row[k] for row in control.rays)]
+    unknown = np.full((len(added), 3), np.nan)
+    source = Source(str(file.parent / CONTROL), None, "observation")
+    if rays is not None and rays.source.numbers is not None:
+        # lines of the tracks; the image points of control have none
+        lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
+        source = dataclasses.replace(rays.source, numbers=lines)
+    return [*names, *added], np.concatenate([at, unknown]), Columns(columns, source)
 
 
 def _largest(file: Path) -> tuple[JsonFields, list[str]]:
