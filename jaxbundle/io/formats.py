@@ -10,6 +10,7 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
+from jaxbundle.choices import NETWORK_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
@@ -148,59 +149,51 @@ def _is_photo_list(path: Path) -> bool:
 # The order is that of recognition: a .toml is a project unless it maps columns, a .txt is a list of
 # photographs if its first line is one number, and so on. Each test reads only the beginning.
 FORMATS: dict[str, Format] = {
-    "project": Format(
-        _is_project, read_project, "a .toml file, or a folder with project.toml", names_models=True
-    ),
-    "photo-list": Format(
-        _is_photo_list, read_photo_list, "a .txt file whose first line is the focal length"
-    ),
-    "bal": Format(is_bal, read_bal, "a text file (.gz, .bz2) whose first line is three numbers"),
+    "project": Format(_is_project, read_project, NETWORK_FILES["project"], names_models=True),
+    "photo-list": Format(_is_photo_list, read_photo_list, NETWORK_FILES["photo-list"]),
+    "bal": Format(is_bal, read_bal, NETWORK_FILES["bal"]),
     "column-map": Format(
-        is_column_map, read_column_map, "a .toml file with [table.…] sections", names_models=True
+        is_column_map, read_column_map, NETWORK_FILES["column-map"], names_models=True
     ),
-    "colmap": Format(is_colmap, read_colmap, "a folder with cameras.bin or cameras.txt"),
-    "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
-    "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
+    "colmap": Format(is_colmap, read_colmap, NETWORK_FILES["colmap"]),
+    "bingo": Format(is_bingo, read_bingo, NETWORK_FILES["bingo"]),
+    "metashape": Format(is_metashape, read_metashape, NETWORK_FILES["metashape"]),
     "photomodeler": Format(
         is_photomodeler,
         read_photomodeler,
-        'a .txt file that begins with "Bundle Soln"',
+        NETWORK_FILES["photomodeler"],
         adjusted=True,
     ),
-    "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
-    "openmvg": Format(is_openmvg, read_openmvg, "openMVG's sfm_data.json"),
-    "opensfm": Format(
-        is_opensfm, read_opensfm, "OpenSfM's reconstruction.json, or a folder that has it"
-    ),
+    "bundler": Format(is_bundler, read_bundler, NETWORK_FILES["bundler"]),
+    "openmvg": Format(is_openmvg, read_openmvg, NETWORK_FILES["openmvg"]),
+    "opensfm": Format(is_opensfm, read_opensfm, NETWORK_FILES["opensfm"]),
     "transforms": Format(
         is_transforms,
         read_transforms,
-        "transforms.json of nerfstudio or instant-ngp",
+        NETWORK_FILES["transforms"],
         takes_image_size=True,
     ),
-    "kalibr": Format(is_kalibr, read_kalibr, "a .yaml file of Kalibr with cam0: …"),
-    "micmac": Format(is_micmac, read_micmac, "a folder of MicMac with Orientation-….xml"),
-    "jaicov": Format(is_jaicov, read_jaicov, "a .phc file of AICON, with .ior beside it"),
-    "mrcal": Format(is_mrcal, read_mrcal, "a .cameramodel of mrcal, or a folder of them"),
+    "kalibr": Format(is_kalibr, read_kalibr, NETWORK_FILES["kalibr"]),
+    "micmac": Format(is_micmac, read_micmac, NETWORK_FILES["micmac"]),
+    "jaicov": Format(is_jaicov, read_jaicov, NETWORK_FILES["jaicov"]),
+    "mrcal": Format(is_mrcal, read_mrcal, NETWORK_FILES["mrcal"]),
     "opencv-stereo": Format(
         is_opencv_rig,
         read_opencv_rig,
-        "a .yaml, .json or .xml file in OpenCV's style with two cameras or more: K1, K2, R, T",
+        NETWORK_FILES["opencv-stereo"],
     ),
     "orb-slam": Format(
         is_orb_slam_pair,
         read_orb_slam_pair,
-        "a .yaml of ORB-SLAM with two cameras, Camera1.fx … and Camera2.fx …",
+        NETWORK_FILES["orb-slam"],
     ),
-    "vins": Format(is_vins, read_vins, "a .yaml of VINS-Fusion with cam0_calib and body_T_cam0"),
-    "euroc": Format(is_euroc, read_euroc, "a folder of EuRoC with cam0/sensor.yaml"),
-    "ros-stereo": Format(
-        is_ros_stereo, read_ros_stereo, "a folder with two camera_info files of ROS"
-    ),
-    "rig": Format(is_rig_result, read_rig_result, "result.json of jaxbundle calibrate --rig"),
-    "rig-line": Format(is_rig_line, read_rig_line, "a line of jaxbundle batch: FILE.jsonl#KEY"),
-    "nvm": Format(is_nvm, read_nvm, "an .nvm file of VisualSFM"),
-    "alicevision": Format(is_alicevision, read_alicevision, "an .sfm or .json of AliceVision"),
+    "vins": Format(is_vins, read_vins, NETWORK_FILES["vins"]),
+    "euroc": Format(is_euroc, read_euroc, NETWORK_FILES["euroc"]),
+    "ros-stereo": Format(is_ros_stereo, read_ros_stereo, NETWORK_FILES["ros-stereo"]),
+    "rig": Format(is_rig_result, read_rig_result, NETWORK_FILES["rig"]),
+    "rig-line": Format(is_rig_line, read_rig_line, NETWORK_FILES["rig-line"]),
+    "nvm": Format(is_nvm, read_nvm, NETWORK_FILES["nvm"]),
+    "alicevision": Format(is_alicevision, read_alicevision, NETWORK_FILES["alicevision"]),
 }
 
 

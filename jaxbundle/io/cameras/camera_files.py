@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxbundle.cameras import CameraModel
+from jaxbundle.choices import CAMERA_INPUTS
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.metashape_lens import is_metashape_lens, read_metashape_lens
 from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
@@ -54,30 +55,30 @@ def _is_toml_cameras(path: Path) -> bool:
 # In the order of recognition: OpenCV's habits, which many programs share, come last.
 CAMERA_FORMATS: dict[str, CameraFormat] = {
     "colmap-cameras": CameraFormat(
-        _is_colmap_cameras, read_colmap_cameras, "cameras.txt or cameras.bin of COLMAP"
+        _is_colmap_cameras, read_colmap_cameras, CAMERA_INPUTS["colmap-cameras"]
     ),
     "cameras": CameraFormat(
-        _is_toml_cameras, lambda path: _read_toml_cameras(path), "a .toml with [[camera]] entries"
+        _is_toml_cameras, lambda path: _read_toml_cameras(path), CAMERA_INPUTS["cameras"]
     ),
     "opensfm-cameras": CameraFormat(
-        is_opensfm_cameras, read_opensfm_cameras, "camera_models.json of OpenSfM"
+        is_opensfm_cameras, read_opensfm_cameras, CAMERA_INPUTS["opensfm-cameras"]
     ),
-    "autocal": CameraFormat(is_autocal, _single(read_autocal), "AutoCal….xml of MicMac"),
+    "autocal": CameraFormat(is_autocal, _single(read_autocal), CAMERA_INPUTS["autocal"]),
     "metashape-lens": CameraFormat(
         is_metashape_lens,
         _single(read_metashape_lens),
-        "an .xml of Metashape's camera calibration (<calibration><projection>…)",
+        CAMERA_INPUTS["metashape-lens"],
     ),
-    "ros-ini": CameraFormat(is_ros_ini, read_ros_ini, "ost.ini or ost.txt of ROS"),
+    "ros-ini": CameraFormat(is_ros_ini, read_ros_ini, CAMERA_INPUTS["ros-ini"]),
     "slam-yaml": CameraFormat(
         lambda path: is_slam_yaml(path) and not is_orb_slam_pair(path),
         _single(read_slam_yaml),
-        "a .yaml of camodocal or VINS (model_type: …), of ORB-SLAM (Camera.fx: …)",
+        CAMERA_INPUTS["slam-yaml"],
     ),
     "opencv": CameraFormat(
         lambda path: is_opencv(path) and not is_opencv_rig(path),
         _single(read_opencv),
-        "a .yaml, .yml, .json or .xml of OpenCV, of ROS or EuRoC (camera_matrix, intrinsics, …)",
+        CAMERA_INPUTS["opencv"],
     ),
 }
 LOOKS = "; ".join(kind.looks for kind in CAMERA_FORMATS.values())
