@@ -21,9 +21,9 @@ from jaxbundle.cameras.field_of_view import (
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
-from jaxbundle.io.cameras.camera_files import LOOKS, choose_camera, is_camera_file, read_cameras
+from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import with_messages
-from jaxbundle.io.formats import FORMATS, read_network, recognise_format
+from jaxbundle.io.formats import expected_inputs, read_network, recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.tables import Camera
@@ -78,8 +78,8 @@ def open_calibration(
         cameras = read_cameras(path)
     elif path.exists() and recognise_format(path) is None:
         raise InputError(
-            f"{path}: not recognised; expected a camera file ({LOOKS}), the result.json "
-            f"of calibrate or adjust, or a network ({', '.join(FORMATS)})"
+            f"{path}: not recognised; expected a camera file, the result.json of calibrate or "
+            f"adjust, or a network; {expected_inputs(path)}"
         )
     else:
         network = read_network(path, image_size=image_size)

@@ -10,7 +10,7 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
-from jaxbundle.choices import NETWORK_FILES
+from jaxbundle.choices import CAMERA_INPUTS, NETWORK_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
 from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
@@ -430,8 +430,7 @@ def read_network(
             "network, is expected (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
-        known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
-        raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
+        raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
     # read before the network, which may take long: its errors come at once
     control_points = None if control is None else read_control(control)
     # other formats have names of their own for their models
@@ -442,6 +441,16 @@ def read_network(
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
+
+
+def expected_inputs(path: Path) -> str:
+    """The kinds of inputs with the suffix of a path, or of folders, for a message; if there are
+    none, the names of all."""
+    word = "folder" if path.is_dir() else path.suffix.lower() or "…"
+    looks = [look for look in (CAMERA_INPUTS | NETWORK_FILES).values() if word in look.lower()]
+    if looks:
+        return f"known formats of this name: {'; '.join(looks)}"
+    return f"known formats: {', '.join(FORMATS)} (jaxbundle convert --help describes them)"
 
 
 def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:

@@ -81,8 +81,6 @@ CAMERA_FORMATS: dict[str, CameraFormat] = {
         CAMERA_INPUTS["opencv"],
     ),
 }
-LOOKS = "; ".join(kind.looks for kind in CAMERA_FORMATS.values())
-"""Description of camera files."""
 
 
 def is_camera_file(path: Path) -> bool:
@@ -102,7 +100,8 @@ def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[
         return _read_toml_cameras(path, models)
     kind = next((kind for kind in CAMERA_FORMATS.values() if kind.recognises(path)), None)
     if kind is None:
-        raise InputError(f"{path}: not recognised as a camera file; expected {LOOKS}")
+        looks = "; ".join(kind.looks for kind in CAMERA_FORMATS.values())
+        raise InputError(f"{path}: not recognised as a camera file; expected {looks}")
     cameras = tuple(kind.read(path))
     if not cameras:
         raise InputError(f"{path}: there is no camera in it")

@@ -60,15 +60,21 @@ def read_ros_ini(path: str | Path) -> tuple[Camera, ...]:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    unknown, size = UnknownKeys(), {}
+    unknown = UnknownKeys()
+    size: Found = {}
     cameras: list[Camera] = []
     for name, section in _sections(path):
         if name == IMAGE:
             unknown.check(section, SIZES, f"{path}, [{name}]")
-            size = {f"image_{key}": (key, *values[:1]) for key, values in section.items()}
+            for key, values in section.items():
+                if len(values) != 1:
+                    raise InputError(
+                        f"{path}, [{name}]: {key} has {len(values)} numbers; expected one"
+                    )
+                size[f"image_{key}"] = key, values[0]
             continue
         unknown.check(section, KEYS, f"{path}, [{name}]")
-        found: Found = dict(size)  # type: ignore[arg-type]
+        found: Found = dict(size)
         for key, kind in zip(KEYS.used, ("camera_matrix", "distortion_coefficients")):
             if key not in section:
                 raise InputError(f"{path}, [{name}]: {key} is missing; expected it in a camera")
