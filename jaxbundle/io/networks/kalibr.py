@@ -66,10 +66,15 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 """Our model, intrinsics and coefficients; the first of a model is written."""
 DISTORTION_NAMES = {
     **dict.fromkeys(("equidistant", "equidist"), "equi"),
-    **dict.fromkeys(("radial-tangential", "plumb_bob"), "radtan"),
+    **dict.fromkeys(("radial-tangential",), "radtan"),
 }
 """Names in files of other programs."""
 COEFFICIENT_KEYS = ("distortion_coeffs", "distortion_coefficients")
+READ_MODELS = MODELS | {
+    ("pinhole", "plumb_bob"): ("opencv", CORE, (*RADTAN, "k3")),
+    ("pinhole", "rational_polynomial"): ("opencv", CORE, (*RADTAN, "k3", "k4", "k5", "k6")),
+}
+"""Also those of chains that others write, with OpenCV's coefficients."""
 CAMERA_KEY = re.compile(r"cam\d+")
 BODY = {
     **dict.fromkeys(("T_cam_imu", "T_C_B", "T_cam_body", "T_C_I"), "to camera"),
@@ -100,7 +105,8 @@ def is_kalibr(path: Path) -> bool:
     if path.suffix.lower() not in (".yaml", ".yml"):
         return False
     head = beginning(path, 100_000)
-    return re.search(rb"^cam\d+\s*:", head, re.M) is not None and b"camera_model" in head
+    chain = b"camera_model" in head or b"T_cn_cnm1" in head
+    return re.search(rb"^cam\d+\s*:", head, re.M) is not None and chain
 
 
 def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -197,15 +203,15 @@ def _number(id: str) -> int:
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
-    kind = fields.text("camera_model"), fields.text("distortion_model", "none").lower()
+    kind = fields.text("camera_model", "pinhole"), fields.text("distortion_model", "none").lower()
     kind = kind[0], DISTORTION_NAMES.get(kind[1], kind[1])
-    if kind not in MODELS:
-        known = ", ".join("-".join(names) for names in MODELS)
+    if kind not in READ_MODELS:
+        known = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
             f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; one of "
             f"{known} is expected"
         )
-    model, core, coefficients = MODELS[kind]
+    model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))
     spelled = next((k for k in COEFFICIENT_KEYS if fields.get(k) is not None), COEFFICIENT_KEYS[0])
     more = fields.array(spelled, (len(coefficients),)) if coefficients else ()

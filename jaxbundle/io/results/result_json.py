@@ -21,6 +21,7 @@ from jaxbundle.types import present
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
+    from jaxbundle.network.tables import Camera
     from jaxbundle.report.verdict import Verdict
 
 
@@ -61,7 +62,10 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
     head |= {"robust_scale": adjustment.robust_scale, "global_test": adjustment.global_test()}
     head |= {
-        "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
+        "cameras": {
+            given.id: _camera(adjustment.cameras[given.id], given)
+            for given in adjustment.problem.network.cameras
+        },
         "images": _images(adjustment),
         "further_unknowns": adjustment.further_unknowns,
         "far_points": _far_points(adjustment),
@@ -147,13 +151,15 @@ def verdict_dict(verdict: "Verdict") -> dict:
     }
 
 
-def _camera(table: dict) -> dict:
+def _camera(table: dict, given: "Camera") -> dict:
     free, C = table["free"], table["correlations"]
     correlations = {
         a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
     }
     return {
         "model": table["model"],
+        "image_size": given.image_size and list(given.image_size),
+        "pixel_size": given.pixel_size and list(given.pixel_size),
         "parameters": table["parameters"],
         "correlations": correlations,
     }

@@ -42,7 +42,8 @@ def may_change_geometry(name: str) -> bool:
     words = {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
     joined = "".join(tokens).lower()
     return (
-        any(stem in joined for stem in STEMS)
+        re.search(r"(?:^|_)T_[A-Za-z]", name) is not None  # T_cam_imu, body_T_cam0: a pose
+        or any(stem in joined for stem in STEMS)
         or not WORDS.isdisjoint(words)
         or joined.endswith(ENDINGS)
         or any(COEFFICIENT.fullmatch(word) for word in (*tokens, name))
