@@ -252,6 +252,12 @@ def test_orb_slam(tmp_path):
     path.write_text(text.replace("KannalaBrandt8", "Spline"))
     with pytest.raises(InputError, match="Camera.type is Spline, of ORB-SLAM"):
         read_network(path)
+    # before rectification: other cameras, whose images are not those of Camera.fx
+    path = write_sample(tmp_path, "orb-slam")
+    raw = "".join(f"{side}.K: {sum(K, [])}\n{side}.D:{D}\n" for side in ("LEFT", "RIGHT"))
+    path.write_text(path.read_text() + "Camera.bFishEye: 0\n" + raw)
+    (camera,) = read_cameras(path)
+    assert camera.parameters["fx"] == 458.654 and "LEFT and RIGHT" in fit_messages([camera])[0]
 
 
 def test_cameras_in_a_body(tmp_path):

@@ -151,6 +151,20 @@ def test_a_camera_file_becomes_a_chain(tmp_path):
     assert "distortion_model: \"equidistant\"" in (tmp_path / "camera_info.yaml").read_text()
 
 
+@pytest.mark.parametrize("name, values", [
+    ("plumb_bob", [0.1, -0.2, 1e-3, 2e-3, 0.05]),
+    ("rational_polynomial", [1.3, 0.35, 6e-5, 5e-5, 0.007, 1.7, 0.75, 0.05]),
+])  # fmt: skip
+def test_chains_with_the_coefficients_of_opencv(tmp_path, name, values):
+    """Written by other programs, also without a camera_model."""
+    text = chain(("pinhole", "radtan"), ("pinhole", "radtan"))
+    text = text.replace("radtan", name).replace(str(COEFFICIENTS["radtan"]), str(values))
+    net = read(tmp_path, text.replace("  camera_model: pinhole\n", ""))
+    order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    assert [net.cameras[1].parameters[k] for k in order[: len(values)]] == values
+    assert len(net.further) == 1
+
+
 BROKEN = {
     "model": ("camera_model: pinhole", "camera_model: x", "camchain.yaml, cam0: camera_model x"),
     "missing": ("  intrinsics", "  intrinsic", "cam0: unknown key 'intrinsic'"),

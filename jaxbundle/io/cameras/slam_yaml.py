@@ -124,7 +124,7 @@ PREFIXES = ("Camera", "Camera1")
 ORB_KEYS = Keys(
     (
         *("Camera.type", "Camera.model", "Camera.width", "Camera.height", "Camera.cols"),
-        *("Camera.rows", "Stereo.T_c1_c2", "Tlr"),
+        *("Camera.rows", "Camera.bFishEye", "Stereo.T_c1_c2", "Tlr"),
     ),
     {
         **dict.fromkeys(
@@ -214,6 +214,8 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
     document = fields.document
     text = next((str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)), "")
     kind = re.sub(r"[\W_]+", "", text).lower() or "pinhole"
+    if document.get("Camera.bFishEye") and ORB_SLAM.get(kind, ("",))[0] != "kannala-brandt":
+        raise InputError(f"{path}: Camera.bFishEye of ORB-SLAM without Camera.type KannalaBrandt8")
     if kind not in ORB_SLAM:
         raise InputError(
             f"{path}: Camera.type is {text}, of ORB-SLAM; expected PinHole, Rectified or "

@@ -56,7 +56,9 @@ def read_vins(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     fields, unknown = read_yaml_fields(path), UnknownKeys()
     unknown.check(fields.document, BODY_KEYS, path)
     cameras, poses = [], []
-    for key in sorted(filter(CALIB.fullmatch, fields.document)):
+    keys = sorted(filter(CALIB.fullmatch, fields.document))
+    # a monocular setting may still name the second camera, without its place
+    for key in keys[: fields.integer("num_of_cam", len(keys))]:
         file = path.parent / fields.text(key)
         if not file.is_file():
             raise InputError(f"{path}: {key}: no such file {file}; expected it beside this one")

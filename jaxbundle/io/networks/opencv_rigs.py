@@ -31,6 +31,7 @@ from jaxbundle.io.cameras.opencv_file import (
     matrix_of,
     read_document,
 )
+from jaxbundle.io.cameras.slam_yaml import is_slam_yaml
 from jaxbundle.io.cameras.spellings import (
     LEFT,
     Found,
@@ -83,6 +84,9 @@ class Pose(NamedTuple):
 
 def is_opencv_rig(path: Path) -> bool:
     """Whether a file has the entries of two cameras or more."""
+    # ORB-SLAM's LEFT.K, RIGHT.K stand beside the camera of the rectified images
+    if is_slam_yaml(path):
+        return False
     found = find_cameras(path)
     if len(found) > 1:
         return True

@@ -24,7 +24,7 @@ MOST_VALUES = 10_000_000
 """Values of a document with its aliases unfolded: some gigabytes. Without aliases a file of 20 MB
 has as many; nested aliases ("billion laughs") have any number."""
 DIRECTIVE = re.compile(r"^\ufeff?%YAML.*$", re.M)
-TIGHT_KEY = re.compile(r"^(\s*[\w.]+):(?=[-+.\d])", re.M)
+TIGHT_KEY = re.compile(r"^(\s*[\w.]+):(?=[-+.\d\[\"'])", re.M)
 CORE_SCHEMA = (
     ("null", r"~|null|Null|NULL|", ("~", "n", "N", "")),
     ("bool", r"true|True|TRUE|false|False|FALSE", tuple("tTfF")),
