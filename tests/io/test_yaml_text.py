@@ -45,7 +45,8 @@ braces: {x: &here [7], y: *here}
 def test_what_is_read():
     assert parse_yaml("f", TEXT) == {
         "name": "a # b", "word": "/cam0/image_raw", "none": None, "flag": True, "number": -1.5e-3,
-        "whole": 12, "tight": 517.3, "list": [1, 2], "matrix": {"rows": 2, "data": [1.0, 2, 3.5, -40.0]},
+        "whole": 12, "tight": 517.3, "list": [1, 2],
+        "matrix": {"rows": 2, "data": [1.0, 2, 3.5, -40.0]},
         "rows": [[1, 2], [[3, "a"], []]],
         "deep": [{"x": 1, "y": 2}, [5, 6], {"z": "q: w"}], "time: [s]": 3, "small": 1e-3,
         "on": "off", "octal": 10, "date": "2020-01-01", "pair": [1, 2],
