@@ -51,7 +51,7 @@ NETWORK_FILES = {
     "orb-slam": "a .yaml of ORB-SLAM with two cameras, Camera1.fx … and Camera2.fx …",
     "vins": "a .yaml of VINS-Fusion with cam0_calib and body_T_cam0",
     "euroc": "a folder of EuRoC with cam0/sensor.yaml",
-    "ros-stereo": "a folder with two camera_info files of ROS",
+    "ros-stereo": "a folder with two camera_info files of ROS, or ost.txt with two cameras",
     "rig": "result.json of jaxbundle calibrate --rig",
     "rig-line": "a line of jaxbundle batch: FILE.jsonl#KEY",
     "nvm": "an .nvm file of VisualSFM",

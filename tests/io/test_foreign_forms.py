@@ -119,13 +119,28 @@ def test_region_and_binning_of_ros(tmp_path):
 
 
 def test_ost_of_two_cameras(tmp_path):
-    text = OST.replace("@", "") + "\n[right]\n" + OST.split("[narrow_stereo]")[1].replace("@", "")
+    """Their mounting follows from rectification and projection, as in camera_info."""
+    R = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix()
+    turn = "\n".join(" ".join(map(repr, row)) for row in R.tolist())
+    projection = "\nprojection\n480.0 0.0 320.0 {}\n0.0 480.0 240.0 0.0\n0.0 0.0 1.0 0.0\n"
+    head, own = OST.replace("@", "").split("[narrow_stereo]")
+    level = own.split("rectification\n")[1].strip()
+    one = f"[left]{own}{projection.format(0.0)}"
+    two = f"[right]{own.replace(level, turn)}{projection.format(-57.6)}".replace("501.0", "502.0")
     for name in ("ost.ini", "ost.txt"):
-        (tmp_path / name).write_text(text.replace("501.000000", "502.000000", 1))
-        left, right = read_cameras(tmp_path / name)
-        assert (left.id, right.id, left.image_size) == ("narrow_stereo", "right", (640, 480))
-        assert (left.parameters["fy"], right.parameters["fy"]) == (502, 501)
-        assert left.parameters["k2"] == 0.1
+        path = tmp_path / name
+        # the program prints both twice
+        path.write_text(head + one + "\n" + two + head + one + "\n" + two)
+        assert not is_camera_file(path)
+        net = read_network(path)
+        assert [c.id for c in net.cameras] == ["left", "right"]
+        assert [c.parameters["fy"] for c in net.cameras] == [501, 502]
+        found = pose(net, "right")
+        assert_allclose(found[0], R.T, atol=1e-12)
+        assert_allclose(found[1], R.T @ [-0.12, 0, 0], atol=1e-12)
+    path.write_text(head + one + "\n" + two.replace("projection", "projected"))
+    with pytest.raises(InputError, match="right.*projection_matrix is missing"):
+        read_network(path)
 
 
 RENAMED = [

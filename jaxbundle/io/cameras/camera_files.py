@@ -13,7 +13,7 @@ from jaxbundle.choices import CAMERA_INPUTS
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.metashape_lens import is_metashape_lens, read_metashape_lens
 from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
-from jaxbundle.io.cameras.ros_ini import is_ros_ini, read_ros_ini
+from jaxbundle.io.cameras.ros_ini import is_ros_ini, is_ros_ini_pair, read_ros_ini
 from jaxbundle.io.cameras.slam_yaml import is_slam_yaml, read_slam_yaml
 from jaxbundle.io.networks.colmap import read_colmap_cameras
 from jaxbundle.io.networks.column_map import is_column_map
@@ -69,7 +69,11 @@ CAMERA_FORMATS: dict[str, CameraFormat] = {
         _single(read_metashape_lens),
         CAMERA_INPUTS["metashape-lens"],
     ),
-    "ros-ini": CameraFormat(is_ros_ini, read_ros_ini, CAMERA_INPUTS["ros-ini"]),
+    "ros-ini": CameraFormat(
+        lambda path: is_ros_ini(path) and not is_ros_ini_pair(path),
+        read_ros_ini,
+        CAMERA_INPUTS["ros-ini"],
+    ),
     "slam-yaml": CameraFormat(
         lambda path: is_slam_yaml(path) and not is_orb_slam_pair(path),
         _single(read_slam_yaml),

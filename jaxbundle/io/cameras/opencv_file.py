@@ -139,7 +139,7 @@ def read_entries(path: Path) -> dict[str, Any]:
 
 
 def matrix_in(
-    path: Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int]
+    path: str | Path, entries: Mapping, names: Sequence[str], shape: tuple[int, int]
 ) -> Float[np.ndarray, "rows columns"]:
     """A matrix by the first of these names.
 

@@ -17,7 +17,8 @@
     projection
 
 The name of a camera is that of its section. Five coefficients are of plumb_bob, eight of
-rational_polynomial. Rectification and projection are of the rectified image and are not read.
+rational_polynomial. Rectification and projection are of the rectified image; of two cameras they
+give the mounting (`networks.stereo`).
 
 Source: ROS, camera_calibration_parsers, parse_ini.cpp.
 """
@@ -40,7 +41,7 @@ IMAGE = "image"
 KEYS = Keys(
     ("camera matrix", "distortion"),
     dict.fromkeys(
-        ("rectification", "projection"), "of the rectified image, which is another camera's"
+        ("rectification", "projection"), "of the rectified image; the mounting of a pair"
     ),
 )
 """Of a camera."""
@@ -54,15 +55,29 @@ def is_ros_ini(path: Path) -> bool:
     return re.search(rb"(?m)^\s*camera matrix\s*$", head) is not None and b"[" in head
 
 
+def is_ros_ini_pair(path: Path) -> bool:
+    """Whether a text has two cameras of ROS."""
+    names = re.findall(rb"(?m)^\s*\[([^\]]+)\]\s*$", beginning(path, 100_000))
+    return is_ros_ini(path) and len({*names} - {IMAGE.encode()}) == 2
+
+
 def read_ros_ini(path: str | Path) -> tuple[Camera, ...]:
     """The cameras of a file, two of a stereo calibration.
 
     **Raises:** `InputError` naming file and line.
     """
-    path = Path(path)
+    return tuple(camera for camera, _ in read_ros_sections(Path(path)))
+
+
+def read_ros_sections(path: Path) -> list[tuple[Camera, Section]]:
+    """The cameras of a file, with the numbers of their sections; a camera that is printed again
+    replaces the one before.
+
+    **Raises:** `InputError` naming file and line.
+    """
     unknown = UnknownKeys()
     size: Found = {}
-    cameras: list[Camera] = []
+    cameras: dict[str, tuple[Camera, Section]] = {}
     for name, section in _sections(path):
         if name == IMAGE:
             unknown.check(section, SIZES, f"{path}, [{name}]")
@@ -79,10 +94,11 @@ def read_ros_ini(path: str | Path) -> tuple[Camera, ...]:
             if key not in section:
                 raise InputError(f"{path}, [{name}]: {key} is missing; expected it in a camera")
             found[kind] = key, section[key]
-        cameras.append(camera_of(f"{path}, [{name}]", found, name))
+        cameras[name] = camera_of(f"{path}, [{name}]", found, name), section
     if not cameras:
         raise InputError(f"{path}: there is no camera in it; expected a section [NAME]")
-    return tuple(with_messages(camera, *unknown.messages()) for camera in cameras)
+    told = unknown.messages()
+    return [(with_messages(camera, *told), section) for camera, section in cameras.values()]
 
 
 def _sections(path: Path) -> Iterator[tuple[str, Section]]:
