@@ -447,10 +447,15 @@ def expected_inputs(path: Path) -> str:
     """The kinds of inputs with the suffix of a path, or of folders, for a message; if there are
     none, the names of all."""
     word = "folder" if path.is_dir() else path.suffix.lower() or "…"
-    looks = [look for look in (CAMERA_INPUTS | NETWORK_FILES).values() if word in look.lower()]
-    if looks:
-        return f"known formats of this name: {'; '.join(looks)}"
-    return f"known formats: {', '.join(FORMATS)} (jaxbundle convert --help describes them)"
+    kinds = {k: look for k, look in (CAMERA_INPUTS | NETWORK_FILES).items() if word in look.lower()}
+    looks = "; ".join(kinds.values())
+    # a message is one line: 200 characters are two lines of a terminal
+    if kinds and len(looks) < 200:
+        return f"known formats of this name: {looks}"
+    names = (
+        f"formats of this name: {', '.join(kinds)}" if kinds else f"formats: {', '.join(FORMATS)}"
+    )
+    return f"known {names} (jaxbundle convert --help describes them)"
 
 
 def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:

@@ -12,7 +12,7 @@ from jaxbundle.cameras import CameraModel
 from jaxbundle.choices import CAMERA_INPUTS
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.metashape_lens import is_metashape_lens, read_metashape_lens
-from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
+from jaxbundle.io.cameras.opencv_file import READ_SUFFIXES, is_opencv, read_opencv
 from jaxbundle.io.cameras.ros_ini import is_ros_ini, is_ros_ini_pair, read_ros_ini
 from jaxbundle.io.cameras.slam_yaml import is_slam_yaml, read_slam_yaml
 from jaxbundle.io.networks.colmap import read_colmap_cameras
@@ -103,9 +103,11 @@ def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[
     if _is_toml(path):
         return _read_toml_cameras(path, models)
     kind = next((kind for kind in CAMERA_FORMATS.values() if kind.recognises(path)), None)
+    if kind is None and path.suffix.lower() in READ_SUFFIXES:
+        return (read_opencv(path),)  # says what is missing of a camera
     if kind is None:
-        looks = "; ".join(kind.looks for kind in CAMERA_FORMATS.values())
-        raise InputError(f"{path}: not recognised as a camera file; expected {looks}")
+        names = ", ".join(CAMERA_FORMATS)
+        raise InputError(f"{path}: not recognised as a camera file; known formats: {names}")
     cameras = tuple(kind.read(path))
     if not cameras:
         raise InputError(f"{path}: there is no camera in it")
