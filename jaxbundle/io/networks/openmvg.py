@@ -31,7 +31,7 @@ Source: openMVG documentation, "SfM_Data", "cameras"; the serialisation of its c
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -172,13 +172,19 @@ def _check_keys(scene: JsonFields, unknown: UnknownKeys) -> None:
             unknown.check(data.document, keys, data.path)
     for pose in _entries(scene, "extrinsics").values():
         unknown.check(pose.document, POSE_KEYS, pose.path)
+    # millions of points and image points: plain dictionaries, looked at once
     for name in ("structure", "control_points"):
-        for value in _entries(scene, name).values():
-            unknown.check(value.document, POINT_KEYS, value.path)
-            for row in value.rows("observations"):
-                ray = row.document.get("value")
-                if isinstance(ray, dict):
-                    unknown.check(ray, RAY_KEYS, row.path)
+        for value in _plain_values(scene.get(name)):
+            unknown.check(value, POINT_KEYS, f"{scene.path}, {name}")
+            for ray in _plain_values(value.get("observations")):
+                unknown.check(ray, RAY_KEYS, f"{scene.path}, {name}, observations")
+
+
+def _plain_values(rows: Any) -> Iterator[dict[str, Any]]:
+    """The values of rows of keys and values; what is none is reported by its reader."""
+    for row in rows if isinstance(rows, list) else ():
+        if isinstance(row, dict) and isinstance(row.get("value"), dict):
+            yield row["value"]
 
 
 def _describe_unread(
