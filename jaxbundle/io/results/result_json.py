@@ -79,6 +79,9 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         ],
     }
     head |= {"check_points": _checks(adjustment)}
+    if adjustment.error_model is not None:
+        head |= {"error_components": [size._asdict() for size in adjustment.error_model.sizes]}
+        head |= {"sigma_ratio": adjustment.sigma_ratio}
     if brief:
         return head
     return head | {
@@ -171,8 +174,16 @@ def _estimate(value: float, sigma: float) -> dict:
 
 def _images(adjustment: "Adjustment") -> dict:
     columns = {name: column.tolist() for name, column in adjustment.images.items()}
+    correlated = lambda name, i: (
+        {"sigma_correlated": columns[f"s{name}_correlated"][i]}
+        if f"s{name}_correlated" in columns
+        else {}
+    )
     return {
-        image: {name: _estimate(columns[name][i], columns[f"s{name}"][i]) for name in EXTERIOR}
+        image: {
+            name: _estimate(columns[name][i], columns[f"s{name}"][i]) | correlated(name, i)
+            for name in EXTERIOR
+        }
         | {"rays": columns["rays"][i], "rms": columns["rms"][i]}
         for i, image in enumerate(columns["id"])
     }
@@ -196,6 +207,9 @@ def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
     for row in table_rows(table):
         point = dict(zip(table, row))
         estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
+        if "sX_correlated" in point:
+            for axis, entry in estimates.items():
+                entry["sigma_correlated"] = point[f"s{axis}_correlated"]
         yield (
             point["id"],
             {"role": point["role"]} | estimates | {"rays": point["rays"], "rms": point["rms"]},
